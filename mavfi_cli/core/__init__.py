@@ -1,0 +1,1 @@
+"""Types, frames, states table, seeds, errors and configuration; needs numpy only."""

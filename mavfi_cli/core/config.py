@@ -1,0 +1,139 @@
+"""TOML into frozen dataclasses: strict types, and an unknown key is an error."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import cattrs
+from cattrs import AttributeValidationNote, IterableValidationNote
+from cattrs.gen import make_dict_structure_fn
+
+from mavfi_cli.core.errors import ConfigError, UnknownKey
+
+T = TypeVar("T")
+
+
+def load_toml(path: Path, cls: type[T]) -> T:
+    """Read a TOML file into the frozen dataclass `cls`.
+
+    Raises:
+        ConfigError: the file cannot be read or parsed, a key is missing or has the wrong type,
+            or `cls` itself refuses a value (a ValueError from `__post_init__`); names file,
+            line and key.
+        UnknownKey: a key that `cls` does not have; names the nearest.
+    """
+    text = _read(path)
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(str(error), path=path) from None
+    return structure(data, cls, path=path, text=text)
+
+
+def structure(
+    data: Mapping[str, Any], cls: type[T], *, path: Path | None = None, text: str = ""
+) -> T:
+    """The dataclass `cls` from a plain mapping, under the same rules as `load_toml`."""
+    _refuse_unknown(data, cls, path, text, prefix="")
+    try:
+        return _CONVERTER.structure(data, cls)
+    except cattrs.BaseValidationError as error:
+        key, problem = _first_problem(error, "")
+        raise ConfigError(problem, path=path, line=_line_of(text, key), key=key) from None
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(error.strerror or str(error), path=path) from None
+    except UnicodeDecodeError:
+        raise ConfigError("not a UTF-8 text file", path=path) from None
+
+
+def _strict(kind: type, *accepted: type) -> Any:
+    def hook(value: Any, _cls: Any) -> Any:
+        if isinstance(value, bool) is not (kind is bool) or not isinstance(
+            value, (kind, *accepted)
+        ):
+            raise TypeError(f"expected {kind.__name__}, got {value!r}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"expected a finite number, got {value!r}")
+        return kind(value)
+
+    return hook
+
+
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter()
+    converter.register_structure_hook(float, _strict(float, int))
+    converter.register_structure_hook(int, _strict(int))
+    converter.register_structure_hook(bool, _strict(bool))
+    converter.register_structure_hook(str, _strict(str))
+    converter.register_structure_hook_factory(
+        dataclasses.is_dataclass, lambda cls: make_dict_structure_fn(cls, converter)
+    )
+    return converter
+
+
+_CONVERTER = _converter()
+
+
+def _refuse_unknown(
+    data: Mapping[str, Any], cls: Any, path: Path | None, text: str, prefix: str
+) -> None:
+    """Walk nested dataclass fields and refuse any key that none of them has."""
+    if not dataclasses.is_dataclass(cls) or not isinstance(data, Mapping):
+        return
+    hints = get_type_hints(cls)
+    for key, value in data.items():
+        full = f"{prefix}{key}"
+        if key not in hints:
+            raise UnknownKey(full, hints, path=path, line=_line_of(text, full))
+        for item in value if isinstance(value, list) else [value]:
+            for nested in _dataclasses_in(hints[key]):
+                _refuse_unknown(item, nested, path, text, prefix=f"{full}.")
+
+
+def _dataclasses_in(hint: Any) -> list[Any]:
+    if dataclasses.is_dataclass(hint):
+        return [hint]
+    return [found for arg in get_args(hint) for found in _dataclasses_in(arg)]
+
+
+def _first_problem(error: BaseException, key: str) -> tuple[str, str]:
+    """The key and the message of the innermost first failure of a cattrs error group."""
+    if isinstance(error, BaseExceptionGroup):
+        inner = error.exceptions[0]
+        for note in getattr(inner, "__notes__", []):
+            if isinstance(note, AttributeValidationNote):
+                key = f"{key}.{note.name}" if key else note.name
+            elif isinstance(note, IterableValidationNote):
+                key = f"{key}[{note.index}]"
+        return _first_problem(inner, key)
+    return key, "is missing" if isinstance(error, KeyError) else str(error)
+
+
+def _line_of(text: str, key: str) -> int | None:
+    """The line on which the last part of a dotted key is set, as well as text alone can tell."""
+    parts = [part for part in key.replace("[", ".[").split(".") if part and part[0] != "["]
+    if not text or not parts:
+        return None
+    section = ".".join(parts[:-1])
+    current, fallback = "", None
+    for number, line in enumerate(text.splitlines(), start=1):
+        stripped = line.strip()
+        if stripped.startswith("["):
+            current = stripped.strip("[] ").split("]")[0]
+            if current == key:
+                return number
+        elif stripped.split("=")[0].strip().strip('"') == parts[-1]:
+            if current == section:
+                return number
+            fallback = fallback or number
+    return fallback

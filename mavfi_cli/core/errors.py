@@ -1,0 +1,121 @@
+"""The error tree. Each error takes the objects it is about and composes its own line.
+
+MavfiError                      one known error, one line, exit code 1
+├── UnknownName                 a world, planner, vehicle ... that does not exist
+├── ConfigError                 a file or value that cannot be used
+│   └── UnknownKey              a TOML key that no setting has
+├── WorldError                  start or goal blocked or outside, boxes that make no world
+├── LinkError                   the MAVLink side
+│   ├── EndpointError           a URL that cannot be opened
+│   ├── NoAutopilot             nothing answered
+│   ├── CommandRefused          the autopilot said no, in its own words
+│   └── LinkLost                the peer fell silent or closed the connection
+├── VehicleProcessError         the simulated vehicle could not start or ended early
+├── RecordError                 a run folder that cannot be written or read
+└── Interrupted                 the user asked to stop
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class MavfiError(Exception):
+    """A known error: the command line prints it in one line and exits with 1."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name most like `name`, or None where none is close."""
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return matches[0] if matches else None
+
+
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    names = sorted(known)
+    match = nearest(name, names)
+    hint = f"did you mean {match!r}? " if match else ""
+    return f"{hint}Known: {', '.join(names)}"
+
+
+class UnknownName(MavfiError):
+    """A name that does not exist; names the nearest one that does."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        super().__init__(f"unknown {kind} {name!r}: {_suggestion(name, known)}")
+
+
+class ConfigError(MavfiError):
+    """A file or a value that cannot be used: says where (file, line, key) and why."""
+
+    def __init__(
+        self, problem: str, *, path: Path | None = None, line: int | None = None, key: str = ""
+    ) -> None:
+        place = ""
+        if path is not None:
+            place = f"{path}:{line}: " if line is not None else f"{path}: "
+        named = f"{key}: " if key else ""
+        super().__init__(f"{place}{named}{problem}")
+
+
+class UnknownKey(ConfigError):
+    """A TOML key that no setting has; names the nearest known one."""
+
+    def __init__(
+        self, key: str, known: Iterable[str], *, path: Path | None = None, line: int | None = None
+    ) -> None:
+        super().__init__(
+            f"unknown key; {_suggestion(key.rsplit('.', 1)[-1], known)}",
+            path=path,
+            line=line,
+            key=key,
+        )
+
+
+class WorldError(MavfiError):
+    """Start or goal blocked or outside, or boxes that make no world."""
+
+
+class LinkError(MavfiError):
+    """The MAVLink side failed."""
+
+
+class EndpointError(LinkError):
+    """A URL that is malformed or cannot be opened (port in use, no such device)."""
+
+    def __init__(self, url: str, problem: str) -> None:
+        super().__init__(f"{url}: {problem}")
+
+
+class NoAutopilot(LinkError):
+    """No autopilot heartbeat arrived."""
+
+    def __init__(self, url: str, waited_s: float) -> None:
+        super().__init__(f"no autopilot at {url}: no heartbeat within {waited_s:g} s")
+
+
+class CommandRefused(LinkError):
+    """The autopilot refused a command; carries its own words."""
+
+    def __init__(self, command: str, result: str, texts: Iterable[str] = ()) -> None:
+        words = "; ".join(texts)
+        super().__init__(
+            f"autopilot refused {command}: {result}" + (f" ({words})" if words else "")
+        )
+
+
+class LinkLost(LinkError):
+    """The peer fell silent or closed the connection."""
+
+
+class VehicleProcessError(MavfiError):
+    """The simulated vehicle could not start, or ended early."""
+
+
+class RecordError(MavfiError):
+    """A run folder that cannot be written or read."""
+
+
+class Interrupted(MavfiError):
+    """The user asked to stop."""

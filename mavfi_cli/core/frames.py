@@ -1,0 +1,92 @@
+"""Frames: ENU and FLU inside mavfi (ROS REP-103), NED and FRD on the MAVLink wire.
+
+World frame: x east, y north, z up (ENU). Body frame: x forward, y left, z up (FLU).
+Yaw is measured from east, counter-clockwise; the wire's heading from north, clockwise.
+Quaternions are Hamilton, scalar first (w, x, y, z), and rotate body into world.
+
+The conversions are involutions: applying one twice gives the input back.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+def enu_from_ned(vector: Vector) -> Vector:
+    """ENU components (..., 3) of NED components (..., 3), any unit; its own inverse."""
+    swapped = vector[..., [1, 0, 2]].copy()
+    swapped[..., 2] *= -1.0
+    return swapped
+
+
+ned_from_enu = enu_from_ned
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """The same angle in [-pi, pi), rad; NaN and infinities give NaN."""
+    if not math.isfinite(angle_rad):
+        return math.nan
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def enu_yaw_from_ned(heading_rad: float) -> float:
+    """ENU yaw in [-pi, pi) of an NED heading, rad; its own inverse."""
+    return wrap_angle(math.pi / 2.0 - heading_rad)
+
+
+ned_yaw_from_enu = enu_yaw_from_ned
+
+_HALF_SQRT2 = math.sqrt(0.5)
+
+
+def flu_enu_from_frd_ned(quaternion: Vector) -> Vector:
+    """Body-FLU-to-ENU quaternion (4,) of a body-FRD-to-NED quaternion (4,), and back.
+
+    q_enu = q(ENU<-NED) * q_ned * q(FRD<-FLU), with q(ENU<-NED) = (0, s, s, 0), s = sqrt(1/2),
+    and q(FRD<-FLU) = (0, 1, 0, 0). Unit quaternions, sign normalised to w >= 0.
+    """
+    w, x, y, z = (float(c) for c in quaternion)
+    # (0, s, s, 0) * (w, x, y, z)
+    s = _HALF_SQRT2
+    aw, ax, ay, az = -s * (x + y), s * (w + z), s * (w - z), s * (y - x)
+    # (aw, ax, ay, az) * (0, 1, 0, 0)
+    out = np.array([-ax, aw, az, -ay])
+    return out if out[0] >= 0.0 else -out
+
+
+def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Vector:
+    """Quaternion (4,) of the z-y-x rotation yaw, pitch, roll, rad."""
+    cr, sr = math.cos(roll_rad / 2.0), math.sin(roll_rad / 2.0)
+    cp, sp = math.cos(pitch_rad / 2.0), math.sin(pitch_rad / 2.0)
+    cy, sy = math.cos(yaw_rad / 2.0), math.sin(yaw_rad / 2.0)
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def yaw_from_quaternion(quaternion: Vector) -> float:
+    """Yaw in [-pi, pi], rad, of a quaternion (4,)."""
+    w, x, y, z = (float(c) for c in quaternion)
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def rotation_matrix(quaternion: Vector) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) of a unit quaternion (4,): world = R @ body."""
+    w, x, y, z = (float(c) for c in quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,103 @@
+"""What travels between kernels: frozen records in SI units, ENU world and FLU body frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class Stage(Enum):
+    """The three stages of the perception-planning-control pipeline."""
+
+    PERCEPTION = "perception"
+    PLANNING = "planning"
+    CONTROL = "control"
+
+
+class Outcome(Enum):
+    """How a mission ends."""
+
+    SUCCESS = "success"
+    COLLISION = "collision"
+    NO_PATH = "no_path"
+    TIMEOUT = "timeout"
+    FAILSAFE = "failsafe"
+    LINK_LOST = "link_lost"
+    CRASH = "crash"
+    HANG = "hang"
+    INTERRUPTED = "interrupted"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleState:
+    """The vehicle as its MAVLink messages tell it, at one stamp."""
+
+    stamp_s: float  # vehicle boot clock
+    position_enu_m: FloatArray  # (3,)
+    velocity_enu_mps: FloatArray  # (3,)
+    quaternion: FloatArray  # (4,) w x y z, body FLU -> ENU
+    yaw_rad: float  # from east, counter-clockwise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthFrame:
+    """One depth image with the camera's pose when it was taken."""
+
+    stamp_s: float
+    depth_m: FloatArray  # (rows, columns) along the optical axis; inf where nothing was in range
+    hfov_rad: float
+    position_enu_m: FloatArray  # (3,) of the optical centre
+    quaternion: FloatArray  # (4,) camera FLU -> ENU
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointCloud:
+    """Points that a sensor saw, in the world frame."""
+
+    stamp_s: float
+    points_enu_m: FloatArray  # (n, 3)
+    origin_enu_m: FloatArray  # (3,) sensor position, where the rays start
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollisionReport:
+    """The verdict of the collision check on the whole remaining trajectory."""
+
+    stamp_s: float
+    collision: bool
+    time_to_collision_s: float  # inf where the trajectory is free
+    future_collision_seq: int  # counts the collisions foreseen so far
+
+
+WAYPOINT_FIELDS = ("x", "y", "z", "yaw", "vx", "vy", "vz", "ax", "ay", "az")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trajectory:
+    """A time-parametrised path, sampled at equal or unequal durations."""
+
+    stamp_s: float  # when its first waypoint is due
+    waypoints: FloatArray  # (n, 10) in the order of WAYPOINT_FIELDS; m, rad, m/s, m/s^2, ENU
+    durations_s: FloatArray  # (n,) how long each waypoint is followed
+    trajectory_seq: int
+    future_collision_seq: int  # the newest foreseen collision that this plan knows of
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first waypoint to the end of the last, s."""
+        return float(self.durations_s.sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """What the control stage asks of the flight controller."""
+
+    stamp_s: float
+    velocity_enu_mps: FloatArray  # (3,)
+    yaw_rad: float
+    acceleration_enu_mps2: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,)
