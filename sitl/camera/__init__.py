@@ -1,0 +1,1 @@
+"""The depth camera: ray casting against the world's boxes, served as a MAVLink camera."""

@@ -1,0 +1,182 @@
+"""Planar depth of a world of boxes, as a depth camera's 8-bit image.
+
+Model (AirSim's DepthPlanner in the reference, facts 4.2): a pinhole camera looking along its
+forward axis, square pixels, depth measured along the optical axis, 0.1 m a grey level rounded
+down, and 255 (25.5 m) for nothing within range.
+
+The ray of pixel (row, column) passes through the pixel's centre. In the camera frame (forward,
+left, up), with focal length f = (columns / 2) / tan(hfov / 2) in pixels:
+
+    direction = (1, (columns / 2 - column - 0.5) / f, (rows / 2 - row - 0.5) / f)
+
+so the ray's parameter is the planar depth itself.
+
+Each box is projected first: its part in front of the camera bounds the pixels that can see it,
+and only these are tested, so a frame costs what it shows.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mavfi_cli.core.frames import rotation_matrix
+
+Vector = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+LEVELS_PER_M = 10.0
+NOTHING = 255
+MAX_RANGE_M = 25.5
+
+_NEAR_M = 1e-6
+_INFINITY = math.inf
+_EDGES = np.array(
+    [[a, a | bit] for bit in (1, 2, 4) for a in range(8) if not a & bit], dtype=np.int64
+)  # (12, 2) corners of a box that share an edge; bit 0 is x, 1 is y, 2 is z
+
+
+def render_depth(
+    boxes_enu_m: Vector,
+    position_enu_m: Vector,
+    quaternion_flu_enu: Vector,
+    columns: int,
+    rows: int,
+    hfov_rad: float,
+    max_range_m: float = MAX_RANGE_M,
+) -> Image:
+    """The depth image (rows, columns), uint8, 0.1 m a level, 255 where nothing is in range.
+
+    Args:
+        boxes_enu_m: (n, 6) xmin ymin zmin xmax ymax zmax; the ground z = 0 is always there.
+        position_enu_m: (3,) the optical centre. Inside a box, or under the ground and looking
+            down, everything is at depth zero. A pose that is not finite sees nothing.
+        quaternion_flu_enu: (4,) unit, w x y z, camera forward-left-up to ENU.
+        columns: image width, at least 1.
+        rows: image height, at least 1.
+        hfov_rad: horizontal field of view, between 0 and pi, rad.
+        max_range_m: planar depth from which on nothing is seen; 25.5 m at most.
+
+    Raises:
+        ValueError: an image size or field of view that no camera has.
+    """
+    if columns < 1 or rows < 1 or not 0.0 < hfov_rad < math.pi:
+        raise ValueError(f"no camera has {columns} x {rows} pixels and {hfov_rad} rad")
+    focal_px = focal_length_px(columns, hfov_rad)
+    depth = np.empty((rows, columns))
+    image = np.empty((rows, columns), dtype=np.uint8)
+    boxes = np.ascontiguousarray(boxes_enu_m, dtype=np.float64)
+    rotation = rotation_matrix(quaternion_flu_enu)
+    _render(boxes, position_enu_m, rotation, focal_px, max_range_m, _EDGES, depth, image)
+    return image
+
+
+def focal_length_px(columns: int, hfov_rad: float) -> float:
+    """Focal length in pixels of a camera with square pixels."""
+    return columns / 2.0 / math.tan(hfov_rad / 2.0)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _render(  # noqa: D103
+    boxes, position, rotation, focal_px, max_range_m, edges, depth, image
+):  # type: ignore[no-untyped-def]
+    if not np.isfinite(position).all() or not np.isfinite(rotation).all():
+        image[:] = NOTHING
+        return
+    _ground(position, rotation, focal_px, depth)
+    corners = np.empty((8, 3))
+    window = np.empty(4, np.int64)
+    for box in range(boxes.shape[0]):
+        _corners_in_camera(boxes[box], position, rotation, corners)
+        if corners[:, 0].max() >= 0.0 and corners[:, 0].min() <= max_range_m:
+            _window(corners, edges, focal_px, depth.shape, window)
+            _paint(boxes[box], position, rotation, focal_px, window, depth)
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            level = math.inf
+            if depth[row, column] < max_range_m:
+                level = math.floor(depth[row, column] * LEVELS_PER_M)
+            image[row, column] = NOTHING if level >= NOTHING else np.uint8(level)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _ground(position, rotation, focal_px, depth):  # type: ignore[no-untyped-def]
+    rows, columns = depth.shape
+    for row in range(rows):
+        up = (rows / 2.0 - row - 0.5) / focal_px
+        for column in range(columns):
+            left = (columns / 2.0 - column - 0.5) / focal_px
+            dz = rotation[2, 0] + rotation[2, 1] * left + rotation[2, 2] * up
+            depth[row, column] = max(0.0, position[2]) / -dz if dz < 0.0 else _INFINITY
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _corners_in_camera(box, position, rotation, corners):  # type: ignore[no-untyped-def]
+    for corner in range(8):
+        x = box[3 if corner & 1 else 0] - position[0]
+        y = box[4 if corner & 2 else 1] - position[1]
+        z = box[5 if corner & 4 else 2] - position[2]
+        for axis in range(3):
+            corners[corner, axis] = (
+                rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis] * z
+            )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _window(corners, edges, focal_px, shape, window):  # type: ignore[no-untyped-def]
+    """Rows and columns (first, end, first, end) that can see the box; a pixel to spare.
+
+    The box's part beyond the near plane is convex, with corners in front and cut edges as its
+    vertices, so their projections bound it.
+    """
+    rows, columns = shape
+    top, bottom, first, last = _INFINITY, -_INFINITY, _INFINITY, -_INFINITY
+    for edge in range(edges.shape[0]):
+        a, b = corners[edges[edge, 0]], corners[edges[edge, 1]]
+        if a[0] < _NEAR_M and b[0] < _NEAR_M:
+            continue
+        for end in range(2):
+            here, there = (a, b) if end == 0 else (b, a)
+            forward, left, up = here[0], here[1], here[2]
+            if forward < _NEAR_M:
+                share = (_NEAR_M - forward) / (there[0] - forward)
+                left += share * (there[1] - left)
+                up += share * (there[2] - up)
+                forward = _NEAR_M
+            column = columns / 2.0 - focal_px * left / forward
+            row = rows / 2.0 - focal_px * up / forward
+            first, last = min(first, column), max(last, column)
+            top, bottom = min(top, row), max(bottom, row)
+    window[0] = int(min(max(top - 1.0, 0.0), rows))
+    window[1] = int(min(max(bottom + 2.0, 0.0), rows))
+    window[2] = int(min(max(first - 1.0, 0.0), columns))
+    window[3] = int(min(max(last + 2.0, 0.0), columns))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _paint(box, position, rotation, focal_px, window, depth):  # type: ignore[no-untyped-def]
+    rows, columns = depth.shape
+    for row in range(window[0], window[1]):
+        up = (rows / 2.0 - row - 0.5) / focal_px
+        for column in range(window[2], window[3]):
+            left = (columns / 2.0 - column - 0.5) / focal_px
+            enter, leave = 0.0, depth[row, column]
+            for axis in range(3):
+                slope = rotation[axis, 0] + rotation[axis, 1] * left + rotation[axis, 2] * up
+                below, above = box[axis] - position[axis], box[axis + 3] - position[axis]
+                if slope == 0.0:
+                    if below > 0.0 or above < 0.0:
+                        enter = _INFINITY
+                        break
+                    continue
+                near, far = below / slope, above / slope
+                if slope < 0.0:
+                    near, far = far, near
+                enter, leave = max(enter, near), min(leave, far)
+                if enter > leave:
+                    break
+            if enter <= leave and enter < depth[row, column]:
+                depth[row, column] = enter

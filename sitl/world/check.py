@@ -1,0 +1,131 @@
+"""Whether a world can be flown: clear start and goal, and a path with a given clearance.
+
+The path is searched on a flat grid at the goal's height, 8-connected. A cell is free where its
+centre keeps the clearance from every box that reaches into the slab of that height; so the
+answer is as fine as the grid, and flying over or under an obstacle is not counted on.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.world.world import World, distance_to_boxes, plan_distance_to_boxes
+
+Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+DEFAULT_CLEARANCE_M = 2.0
+"""Half-width of the planner's drone box (reference facts, section 4.1)."""
+
+_STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldCheck:
+    """What `check_world` found; lengths in m."""
+
+    clearance_m: float  # asked for
+    start_clearance_m: float  # in plan, inf where there is no box
+    goal_clearance_m: float
+    straight_m: float  # from start to goal in plan
+    path_m: float | None  # shortest on the grid, None where there is none
+    path_enu_m: Vector  # (n, 3) at flight height, empty where there is none
+
+    @property
+    def path_exists(self) -> bool:
+        """Whether a path with the clearance was found."""
+        return self.path_m is not None
+
+
+def check_world(
+    world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M, cell_m: float = 0.5
+) -> WorldCheck:
+    """Search a path from start to goal that keeps `clearance_m` from every box."""
+    height = float(world.goal_enu_m[2])
+    free, origin = free_grid(world, height, clearance_m, cell_m)
+    cells = [_cell(p, origin, cell_m) for p in (world.start_enu_m, world.goal_enu_m)]
+    found = _shortest(free, cells[0], cells[1])
+    plan = world.goal_enu_m[:2] - world.start_enu_m[:2]
+    path = np.zeros((0, 3))
+    if found is not None:
+        centres = origin + (np.array(found[1]) + 0.5) * cell_m
+        path = np.column_stack([centres, np.full(len(centres), height)])
+    start_gaps = plan_distance_to_boxes(world.boxes_enu_m, world.start_enu_m)
+    goal_gaps = distance_to_boxes(world.boxes_enu_m, world.goal_enu_m)
+    return WorldCheck(
+        clearance_m=clearance_m,
+        start_clearance_m=float(start_gaps.min(initial=math.inf)),
+        goal_clearance_m=float(goal_gaps.min(initial=math.inf)),
+        straight_m=float(np.hypot(*plan)),
+        path_m=None if found is None else found[0] * cell_m,
+        path_enu_m=path,
+    )
+
+
+def free_grid(
+    world: World, height_m: float, clearance_m: float, cell_m: float
+) -> tuple[Mask, Vector]:
+    """Free cells (columns, rows) at a height, and the grid's lower corner (2,), ENU m."""
+    origin = world.bounds_enu_m[:2]
+    count = np.maximum(1, np.ceil((world.bounds_enu_m[3:5] - origin) / cell_m)).astype(int)
+    x = origin[0] + (np.arange(count[0]) + 0.5) * cell_m
+    y = origin[1] + (np.arange(count[1]) + 0.5) * cell_m
+    free = np.ones((count[0], count[1]), dtype=np.bool_)
+    for box in world.boxes_enu_m:
+        dz = max(box[2] - height_m, height_m - box[5], 0.0)
+        dx = np.maximum(0.0, np.maximum(box[0] - x, x - box[3]))[:, None]
+        dy = np.maximum(0.0, np.maximum(box[1] - y, y - box[4]))[None, :]
+        gap = np.sqrt(dx * dx + dy * dy + dz * dz)
+        free &= (gap > 0.0) & (gap >= clearance_m)
+    return free, origin
+
+
+def _cell(place: Vector, origin: Vector, cell_m: float) -> tuple[int, int]:
+    i, j = np.floor((place[:2] - origin) / cell_m).astype(int)
+    return int(i), int(j)
+
+
+def _shortest(
+    free: Mask, start: tuple[int, int], goal: tuple[int, int]
+) -> tuple[float, list[tuple[int, int]]] | None:
+    """Dijkstra with the straight line as heuristic (A*): length in cells, and the cells."""
+    shape = free.shape
+    start = (min(start[0], shape[0] - 1), min(start[1], shape[1] - 1))
+    goal = (min(goal[0], shape[0] - 1), min(goal[1], shape[1] - 1))
+    if not (free[start] and free[goal]):
+        return None
+    best = {start: 0.0}
+    parent: dict[tuple[int, int], tuple[int, int]] = {}
+    queue = [(math.dist(start, goal), start)]
+    closed: set[tuple[int, int]] = set()
+    while queue:
+        _, here = heapq.heappop(queue)
+        if here == goal:
+            return best[goal], _trace(parent, goal)
+        if here in closed:
+            continue
+        closed.add(here)
+        for i, j, length in _STEPS:
+            there = (here[0] + i, here[1] + j)
+            if not (0 <= there[0] < shape[0] and 0 <= there[1] < shape[1] and free[there]):
+                continue
+            cost = best[here] + length
+            if cost < best.get(there, math.inf):
+                best[there] = cost
+                parent[there] = here
+                heapq.heappush(queue, (cost + math.dist(there, goal), there))
+    return None
+
+
+def _trace(
+    parent: dict[tuple[int, int], tuple[int, int]], goal: tuple[int, int]
+) -> list[tuple[int, int]]:
+    cells = [goal]
+    while cells[-1] in parent:
+        cells.append(parent[cells[-1]])
+    return cells[::-1]

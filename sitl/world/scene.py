@@ -1,0 +1,211 @@
+"""Fixed scenes: a TOML file of boxes, ours (`factory`, `farm`) or a user's.
+
+    name = "yard"                          # optional, else the file's name
+    bounds_enu_m = [-20, -20, 0, 40, 40, 50]
+    start_enu_m = [0, 0, 0]                # optional
+    goal_enu_m = [30, 30, 5]               # optional
+
+    [[box]]
+    min_enu_m = [10, 10, 0]
+    max_enu_m = [12, 20, 8]
+
+Where start or goal is not given, the seed chooses it: a place with nothing within 4 m in plan,
+the goal at `flight_height_m` and within `goal_distance_m` of the start. So each seed of a fixed
+scene is a mission of its own.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError, WorldError
+from mavfi_cli.core.seeds import Stream, generator
+from sitl.world.generate import CLEAR_RADIUS_M
+from sitl.world.world import (
+    World,
+    inside,
+    plan_distance_to_boxes,
+    refuse_bad_goal,
+    refuse_bad_start,
+)
+
+Vector = NDArray[np.float64]
+
+_TRIES = 2000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Box:
+    """One obstacle; corners in ENU, m."""
+
+    min_enu_m: list[float]
+    max_enu_m: list[float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """What a world file says."""
+
+    bounds_enu_m: list[float]
+    name: str = ""
+    description: str = ""
+    start_enu_m: list[float] | None = None
+    goal_enu_m: list[float] | None = None
+    flight_height_m: float = 5.0
+    goal_distance_m: list[float] | None = None  # least and most, start to goal, in plan
+    box: list[Box] | None = None
+
+
+def read_scene(path: Path) -> Scene:
+    """Read a world file.
+
+    Raises:
+        ConfigError: unreadable, malformed, a missing or unknown key, a wrong number of
+            coordinates, or a box whose max is not beyond its min; with file, line and key.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = tomllib.loads(text)
+    except OSError as error:
+        raise ConfigError(error.strerror or str(error), path=path) from None
+    except UnicodeDecodeError:
+        raise ConfigError("not a UTF-8 text file", path=path) from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(str(error), path=path) from None
+    scene = structure(data, Scene, path=path, text=text)
+    _refuse_bad_lengths(scene, path, text)
+    return scene
+
+
+def _refuse_bad_lengths(scene: Scene, path: Path, text: str) -> None:
+    lengths = {"bounds_enu_m": 6, "start_enu_m": 3, "goal_enu_m": 3, "goal_distance_m": 2}
+    for key, length in lengths.items():
+        value = getattr(scene, key)
+        if value is not None and len(value) != length:
+            line = _line_of_key(text, key)
+            problem = f"expected {length} numbers, got {len(value)}"
+            raise ConfigError(problem, path=path, line=line, key=key)
+    for index, box in enumerate(scene.box or []):
+        line = _line_of_box(text, index)
+        for key in ("min_enu_m", "max_enu_m"):
+            count = len(getattr(box, key))
+            if count != 3:
+                problem = f"expected 3 numbers, got {count}"
+                raise ConfigError(problem, path=path, line=line, key=f"box[{index}].{key}")
+        if any(high <= low for low, high in zip(box.min_enu_m, box.max_enu_m, strict=True)):
+            problem = "must be beyond min_enu_m along each axis"
+            raise ConfigError(problem, path=path, line=line, key=f"box[{index}].max_enu_m")
+
+
+def _line_of_key(text: str, key: str) -> int | None:
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.split("=")[0].strip() == key:
+            return number
+    return None
+
+
+def _line_of_box(text: str, index: int) -> int | None:
+    lines = enumerate(text.splitlines(), start=1)
+    headers = [number for number, line in lines if line.replace(" ", "").startswith("[[box]]")]
+    return headers[index] if index < len(headers) else None
+
+
+def world_of_scene(
+    scene: Scene, name: str, seed: int, start_enu_m: Vector | None, goal_enu_m: Vector | None
+) -> World:
+    """The world of a scene; a start or goal that is given wins over the scene's own.
+
+    Raises:
+        WorldError: start or goal is unusable, or the seed finds no clear place for it.
+    """
+    boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box or []]).reshape(-1, 6)
+    bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
+    if (bounds[3:] <= bounds[:3]).any():
+        raise WorldError(f"world {name!r}: bounds_enu_m has max <= min")
+    start = _given(start_enu_m, scene.start_enu_m)
+    goal = _given(goal_enu_m, scene.goal_enu_m)
+    if start is None or goal is None:
+        if start is not None:
+            refuse_bad_start(name, boxes, bounds, start)
+        if goal is not None:
+            refuse_bad_goal(name, boxes, bounds, goal)
+        start, goal = _choose(scene, name, seed, boxes, bounds, start, goal)
+    return World(
+        name=name,
+        seed=seed,
+        boxes_enu_m=boxes,
+        bounds_enu_m=bounds,
+        start_enu_m=start,
+        goal_enu_m=goal,
+    )
+
+
+def _given(asked: Vector | None, own: list[float] | None) -> Vector | None:
+    if asked is not None:
+        return np.asarray(asked, dtype=np.float64)
+    return None if own is None else np.array(own, dtype=np.float64)
+
+
+def _choose(
+    scene: Scene,
+    name: str,
+    seed: int,
+    boxes: Vector,
+    bounds: Vector,
+    start: Vector | None,
+    goal: Vector | None,
+) -> tuple[Vector, Vector]:
+    """Draw what is not given until the pair is clear and as far apart as the scene asks."""
+    stream = generator(seed, Stream.WORLD, "places", scene.name)
+    least, most = scene.goal_distance_m or [45.0, 55.0]
+    low, high = bounds[:2] + CLEAR_RADIUS_M, bounds[3:5] - CLEAR_RADIUS_M
+    for _ in range(_TRIES):
+        plan = np.round(stream.uniform(low, np.maximum(low, high), size=(2, 2)), 1)
+        from_ = start if start is not None else np.array([*plan[0], bounds[2]])
+        to = goal if goal is not None else np.array([*plan[1], scene.flight_height_m])
+        drawn = [p for p, known in ((from_, start), (to, goal)) if known is None]
+        if least <= float(np.hypot(*(to - from_)[:2])) <= most and all(
+            _is_clear(boxes, bounds, place) for place in drawn
+        ):
+            return from_, to
+    raise WorldError(
+        f"world {name!r}, seed {seed}: no clear start and goal {least:g} to {most:g} m apart; "
+        "give start_enu_m and goal_enu_m"
+    )
+
+
+def _is_clear(boxes: Vector, bounds: Vector, place: Vector) -> bool:
+    gaps = plan_distance_to_boxes(boxes, place)
+    return inside(bounds, place) and bool((gaps >= CLEAR_RADIUS_M).all())
+
+
+def scene_toml(world: World) -> str:
+    """A world as the text of a world file; reading it back gives the same world."""
+    lines = [
+        f"name = {_quoted(world.name)}",
+        f"bounds_enu_m = {_numbers(world.bounds_enu_m)}",
+        f"start_enu_m = {_numbers(world.start_enu_m)}",
+        f"goal_enu_m = {_numbers(world.goal_enu_m)}",
+    ]
+    for box in world.boxes_enu_m:
+        lines += [
+            "",
+            "[[box]]",
+            f"min_enu_m = {_numbers(box[:3])}",
+            f"max_enu_m = {_numbers(box[3:])}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(values: Vector) -> str:
+    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
