@@ -1,0 +1,259 @@
+"""MAVLink frames to messages and back, on pymavlink's `common` dialect.
+
+The frame layer (markers, lengths, checksum, signature) is done here, because pymavlink's generic
+parser is slower and, after a false marker in noise, swallows the whole frames behind it. What a
+field means is pymavlink's: its message classes, layouts and constructors.
+Source of the frame layout: https://mavlink.io/en/guide/serialization.html.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import struct
+from collections.abc import Callable, Sequence
+from operator import attrgetter, itemgetter
+from typing import Any
+
+from pymavlink.dialects.v20 import common as dialect
+
+from mavfi_cli.link.signing import SIGNATURE_LENGTH, Signing
+
+__all__ = ["MAX_FRAME_LENGTH", "Codec", "Message", "Signing", "dialect"]
+
+Message = Any  # an instance of one of pymavlink's generated message classes
+
+MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
+
+_V1, _V2 = 0xFE, 0xFD
+_MARKER = re.compile(rb"[\xfd\xfe]")
+_SIGNED = 0x01
+_HEADER = struct.Struct("<BBBBBBBHB")
+_INCOMPLETE = -1
+
+
+def _slow_crc(data: bytes, initial: int = 0xFFFF) -> int:
+    crc = dialect.x25crc()
+    crc.crc = initial
+    crc.accumulate(data)
+    return int(crc.crc)
+
+
+# CRC-16/MCRF4XX; pymavlink depends on the compiled one, but can do without.
+_crc: Callable[..., int] = dialect.mcrf4xx or _slow_crc
+
+# One more byte x changes a checksum c to (c >> 8) ^ table[(c ^ x) & 0xFF]; these are the entries.
+_CRC_TABLE = frozenset(_crc(bytes([x]), 0) for x in range(256))
+
+
+class _Kind:
+    """One message class and how it lies on the wire."""
+
+    __slots__ = ("build", "crc_extra", "message_id", "pack", "read", "size", "unpack", "values")
+
+    def __init__(self, cls: Any) -> None:
+        self.build: Callable[..., Message] = cls
+        self.message_id: int = cls.id
+        self.crc_extra = bytes([cls.crc_extra])
+        self.size: int = cls.unpacker.size
+        self.unpack: Callable[[bytes], tuple[Any, ...]] = cls.unpacker.unpack
+        self.pack: Callable[..., bytes] = cls.unpacker.pack
+        self.read = _reader(cls)
+        self.values = _writer(cls)
+
+
+def _reader(cls: Any) -> Callable[[tuple[Any, ...]], Sequence[Any]]:
+    """Turns unpacked wire values into the constructor's arguments."""
+    starts = [0, *itertools.accumulate(cls.lengths)]
+    spans = [(starts[order], cls.lengths[order]) for order in cls.orders]
+    has_text = "char" in cls.fieldtypes
+    if not has_text and len(spans) > 1 and all(length == 1 for _, length in spans):
+        getter: Callable[[tuple[Any, ...]], Sequence[Any]] = itemgetter(*(s for s, _ in spans))
+        return getter
+
+    def read(values: tuple[Any, ...]) -> Sequence[Any]:
+        fields = [
+            values[start] if length == 1 else list(values[start : start + length])
+            for start, length in spans
+        ]
+        if has_text:
+            return [f.rstrip(b"\0") if isinstance(f, bytes) else f for f in fields]
+        return fields
+
+    return read
+
+
+def _writer(cls: Any) -> Callable[[Message], Sequence[Any]]:
+    """Turns a message into the values of its wire layout."""
+    texts = {n for n, t in zip(cls.fieldnames, cls.fieldtypes, strict=True) if t == "char"}
+    names = [f"_{name}_raw" if name in texts else name for name in cls.ordered_fieldnames]
+    if len(names) > 1 and all(length == 1 for length in cls.lengths):
+        getter: Callable[[Message], Sequence[Any]] = attrgetter(*names)
+        return getter
+    fields = list(zip(names, cls.lengths, strict=True))
+
+    def values(message: Message) -> Sequence[Any]:
+        flat: list[Any] = []
+        for name, length in fields:
+            value = getattr(message, name)
+            if length == 1:
+                flat.append(value)
+            else:
+                flat.extend(value[:length])
+        return flat
+
+    return values
+
+
+_KINDS: dict[int, _Kind] = {}
+
+
+def _kind(message_id: int) -> _Kind | None:
+    kind = _KINDS.get(message_id)
+    if kind is None and message_id in dialect.mavlink_map:
+        kind = _KINDS[message_id] = _Kind(dialect.mavlink_map[message_id])
+    return kind
+
+
+class Codec:
+    """One end of one link: numbers what it sends, finds the messages in what it receives.
+
+    Args:
+        system: own system id, written into every frame.
+        component: own component id.
+        signing: sign what goes out and refuse what is not genuine; None for neither.
+
+    Attributes:
+        decoded: messages delivered so far.
+        bad_bytes: received bytes that belong to no frame.
+        unknown: whole frames with an id that the dialect lacks; skipped.
+        refused: whole frames that signing turned away.
+    """
+
+    __slots__ = (
+        "_rest", "_sequence", "_signing", "bad_bytes", "component", "decoded", "refused", "system",
+        "unknown",
+    )  # fmt: skip
+
+    def __init__(self, system: int, component: int, *, signing: Signing | None = None) -> None:
+        self.system = system
+        self.component = component
+        self._signing = signing
+        self._sequence = 0
+        self._rest = b""
+        self.decoded = 0
+        self.bad_bytes = 0
+        self.unknown = 0
+        self.refused = 0
+
+    def encode(self, message: Message) -> bytes:
+        """The MAVLink 2 frame of a message; the message itself is left as it was.
+
+        Raises:
+            struct.error, OverflowError: a field does not fit its type.
+        """
+        kind = _KINDS.get(type(message).id) or _kind(type(message).id)
+        if kind is None:
+            raise ValueError(f"{type(message).__name__} is not a message of the dialect")
+        payload = kind.pack(*kind.values(message)).rstrip(b"\0") or b"\0"
+        flags = 0 if self._signing is None else _SIGNED
+        number = kind.message_id
+        head = _HEADER.pack(
+            _V2, len(payload), flags, 0, self._sequence, self.system, self.component,
+            number & 0xFFFF, number >> 16,
+        )  # fmt: skip
+        self._sequence = (self._sequence + 1) & 0xFF
+        frame = head + payload
+        frame += _crc(frame[1:] + kind.crc_extra).to_bytes(2, "little")
+        return frame if self._signing is None else frame + self._signing.sign(frame)
+
+    def decode(self, data: bytes, *, datagram: bool = False) -> list[Message]:
+        """The messages that `data` completes, oldest first; never raises, whatever the bytes.
+
+        A false marker costs one byte, not the frames behind it. A frame may continue in the next
+        call, unless `datagram` says that frames end where the data ends.
+        """
+        buffer = self._rest + data if self._rest else bytes(data)
+        messages: list[Message] = []
+        position, end = 0, len(buffer)
+        while position < end:
+            if buffer[position] not in (_V2, _V1):
+                marker = _MARKER.search(buffer, position)
+                following = marker.start() if marker else end
+                self.bad_bytes += following - position
+                position = following
+                continue
+            length = _frame_length(buffer, position, end)
+            if length == _INCOMPLETE and not datagram:
+                break
+            if length <= 0 or not self._take(buffer[position : position + length], messages):
+                self.bad_bytes += 1
+                position += 1
+            else:
+                position += length
+        self._rest = buffer[position:]
+        self.decoded += len(messages)
+        return messages
+
+    def _take(self, frame: bytes, messages: list[Message]) -> bool:
+        """Append the message of a candidate frame; False where the checksum says it is none."""
+        header = 10 if frame[0] == _V2 else 6
+        signed = header == 10 and bool(frame[2] & _SIGNED)
+        crc_at = header + frame[1]
+        crc = frame[crc_at] | frame[crc_at + 1] << 8
+        number = frame[5] if header == 6 else frame[7] | frame[8] << 8 | frame[9] << 16
+        kind = _KINDS.get(number) or _kind(number)
+        if kind is None:
+            # Without the message's extra byte: is there any that makes the checksum right?
+            if crc ^ (_crc(frame[1:crc_at]) >> 8) not in _CRC_TABLE:
+                return False
+            self.unknown += 1
+            return True
+        if _crc(frame[1:crc_at] + kind.crc_extra) != crc:
+            return False
+        if self._signing is not None and not self._genuine(frame, header, number, signed):
+            self.refused += 1
+            return True
+        message = _build(kind, frame, header, crc)
+        if signed and self._signing is not None:
+            message._signed = True
+            message._link_id = frame[-SIGNATURE_LENGTH]
+        messages.append(message)
+        return True
+
+    def _genuine(self, frame: bytes, header: int, number: int, signed: bool) -> bool:
+        assert self._signing is not None
+        if not signed:
+            return self._signing.accept_plain(number)
+        return self._signing.accept(frame, frame[header - 5], frame[header - 4])
+
+
+def _frame_length(buffer: bytes, position: int, end: int) -> int:
+    """Bytes of the frame that would start here; _INCOMPLETE, or 0 where none can."""
+    if end - position < 3:
+        return _INCOMPLETE
+    length = buffer[position + 1] + 8
+    if buffer[position] == _V2:
+        flags = buffer[position + 2]
+        if flags & ~_SIGNED:
+            return 0
+        length += 4 + (SIGNATURE_LENGTH if flags else 0)
+    return length if position + length <= end else _INCOMPLETE
+
+
+def _build(kind: _Kind, frame: bytes, header: int, crc: int) -> Message:
+    payload = frame[header : header + frame[1]]
+    size = kind.size
+    values = kind.unpack(payload.ljust(size, b"\0")[:size])
+    message = kind.build(*kind.read(values))
+    head = message._header
+    head.mlen = frame[1]
+    if header == 10:
+        head.incompat_flags, head.compat_flags, *source = frame[2:7]
+    else:
+        source = list(frame[2:5])
+    head.seq, head.srcSystem, head.srcComponent = source
+    message._msgbuf = frame
+    message._payload = payload
+    message._crc = crc
+    return message

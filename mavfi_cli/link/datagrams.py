@@ -1,0 +1,243 @@
+"""UDP: one peer at a known address, the newest caller of a port, or every caller of a port."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import deque
+from typing import Any
+
+from mavfi_cli.core.errors import LinkLost
+from mavfi_cli.link.endpoint import Endpoint
+from mavfi_cli.link.streams import bind
+from mavfi_cli.link.waiting import readable
+
+MAX_PEERS = 64
+MAX_WAITING = 4096  # datagrams a peer may leave unread before the oldest go
+_MTU_PAYLOAD = 1400  # whole frames are gathered up to this many bytes a datagram
+_CHUNK = 1 << 16
+_MARKERS = (0xFD, 0xFE)
+
+
+def split_frames(data: bytes) -> list[bytes]:
+    """Well-formed frames, gathered into datagrams that fit an Ethernet packet."""
+    if len(data) <= _MTU_PAYLOAD:
+        return [data]
+    datagrams, start, position = [], 0, 0
+    while position < len(data):
+        length = data[position + 1] + 8
+        if data[position] == 0xFD:
+            length += 4 + (13 if data[position + 2] & 1 else 0)
+        if position > start and position + length - start > _MTU_PAYLOAD:
+            datagrams.append(data[start:position])
+            start = position
+        position += length
+    datagrams.append(data[start:])
+    return datagrams
+
+
+class UdpTransport:
+    """A UDP socket with one peer.
+
+    Connected, it hears that peer only. Bound, it answers whoever sent MAVLink last, and until
+    somebody did, what it sends is lost.
+    """
+
+    datagram = True
+
+    def __init__(self, opened: socket.socket, url: str, *, peer: Any = None) -> None:
+        opened.settimeout(0.0)
+        self._socket = opened
+        self._peer = peer
+        self._follow = peer is None
+        self.url = url
+
+    @property
+    def port(self) -> int:
+        """The local port, chosen by the system when the URL says 0."""
+        return int(self._socket.getsockname()[1])
+
+    def send(self, data: bytes) -> None:
+        """Send whole frames; see `Transport`."""
+        if self._peer is not None:
+            _send(self._socket, data, self._peer if self._follow else None)
+
+    def receive(self, timeout_s: float) -> bytes:
+        """The next bytes, or b"" after `timeout_s`; see `Transport`."""
+        data = self._pull()
+        if not data and timeout_s > 0 and readable(self._socket.fileno(), timeout_s):
+            data = self._pull()
+        return data
+
+    def _pull(self) -> bytes:
+        """The next datagram; empty when none waits."""
+        received = _receive(self._socket)
+        if received is None:
+            return b""
+        data, sender = received
+        if self._follow and data[:1] and data[0] in _MARKERS:
+            self._peer = sender
+        return data
+
+    def fileno(self) -> int:
+        """The descriptor to wait on."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Release it; harmless when repeated."""
+        self._socket.close()
+
+
+def _receive(opened: socket.socket) -> tuple[bytes, Any] | None:
+    """A datagram and its sender; None when there is none.
+
+    A connected socket hears that nobody listens at the other end (ECONNREFUSED): for UDP this is
+    no loss, the peer may start later.
+    """
+    try:
+        return opened.recvfrom(_CHUNK)
+    except OSError:
+        return None
+
+
+def _send(opened: socket.socket, data: bytes, peer: Any) -> None:
+    """Send to `peer`, or where the socket is connected to; what does not go is lost, as UDP is."""
+    for datagram in split_frames(data):
+        for _attempt in range(2):  # the first may only report an earlier datagram's refusal
+            try:
+                if peer is None:
+                    opened.send(datagram)
+                else:
+                    opened.sendto(datagram, peer)
+                break
+            except OSError:
+                continue
+
+
+def bound(endpoint: Endpoint, where: tuple[int, str]) -> UdpTransport:
+    """A transport that waits for its peer on a port; EndpointError where the port is taken."""
+    return UdpTransport(_bound_socket(endpoint, where), endpoint.url)
+
+
+def connected(endpoint: Endpoint, where: tuple[int, str]) -> UdpTransport:
+    """A transport that calls the endpoint, resolved to family and address `where`."""
+    family, address = where
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    opened.connect((address, endpoint.port))
+    return UdpTransport(opened, endpoint.url, peer=(address, endpoint.port))
+
+
+def _bound_socket(endpoint: Endpoint, where: tuple[int, str]) -> socket.socket:
+    family, address = where
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    bind(opened, endpoint, address)
+    opened.settimeout(0.0)
+    return opened
+
+
+class UdpListener:
+    """Every address that sends MAVLink to a port becomes a peer, all on one socket.
+
+    At most MAX_PEERS are kept; one more pushes out the one heard longest ago.
+
+    Raises:
+        EndpointError: the port is in use, or the address is not this machine's.
+    """
+
+    def __init__(self, endpoint: Endpoint, where: tuple[int, str]) -> None:
+        self.url = endpoint.url
+        self._socket = _bound_socket(endpoint, where)
+        self._peers: dict[Any, UdpPeer] = {}  # the one heard longest ago comes first
+        self._fresh: list[UdpPeer] = []
+
+    @property
+    def port(self) -> int:
+        """The bound port, chosen by the system when the URL says 0."""
+        return int(self._socket.getsockname()[1])
+
+    def accept_ready(self) -> list[UdpPeer]:
+        """The peers that appeared since the last call."""
+        self.pump()
+        fresh, self._fresh = [peer for peer in self._fresh if not peer.lost], []
+        return fresh
+
+    def pump(self) -> None:
+        """Hand every waiting datagram to its peer."""
+        for _ in range(MAX_WAITING):
+            received = _receive(self._socket)
+            if received is None:
+                return
+            data, sender = received
+            peer = self._peers.pop(sender, None)
+            if peer is None:
+                if not data[:1] or data[0] not in _MARKERS:
+                    continue
+                peer = self._welcome(sender)
+            self._peers[sender] = peer
+            peer.waiting.append(data)
+
+    def _welcome(self, sender: Any) -> UdpPeer:
+        if len(self._peers) >= MAX_PEERS:
+            oldest = next(iter(self._peers))
+            self._peers.pop(oldest).lost = True
+        peer = UdpPeer(self, sender)
+        self._fresh.append(peer)
+        return peer
+
+    def send_to(self, data: bytes, address: Any) -> None:
+        """Send frames to one peer's address."""
+        _send(self._socket, data, address)
+
+    def forget(self, address: Any) -> None:
+        """Drop a peer; it is new again when it sends again."""
+        self._peers.pop(address, None)
+
+    def fileno(self) -> int:
+        """The descriptor to wait on."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Release it; harmless when repeated."""
+        for peer in self._peers.values():
+            peer.lost = True
+        self._socket.close()
+
+
+class UdpPeer:
+    """One caller of a UDP listener."""
+
+    datagram = True
+
+    def __init__(self, listener: UdpListener, address: Any) -> None:
+        self._listener = listener
+        self._address = address
+        self.url = listener.url
+        self.waiting: deque[bytes] = deque(maxlen=MAX_WAITING)
+        self.lost = False
+
+    def send(self, data: bytes) -> None:
+        """Send whole frames; see `Transport`."""
+        if self.lost:
+            raise LinkLost(f"{self.url}: this peer was dropped")
+        self._listener.send_to(data, self._address)
+
+    def receive(self, timeout_s: float) -> bytes:
+        """The next bytes, or b"" after `timeout_s`; see `Transport`."""
+        deadline_s = time.monotonic() + timeout_s if timeout_s > 0 else 0.0
+        while not self.waiting:
+            if self.lost:
+                raise LinkLost(f"{self.url}: this peer was dropped")
+            self._listener.pump()
+            left_s = deadline_s - time.monotonic() if timeout_s > 0 else 0.0
+            if self.waiting or left_s <= 0 or not readable(self.fileno(), left_s):
+                break
+        return self.waiting.popleft() if self.waiting else b""
+
+    def fileno(self) -> int:
+        """The descriptor to wait on."""
+        return self._listener.fileno()
+
+    def close(self) -> None:
+        """Release it; harmless when repeated."""
+        self.lost = True
+        self._listener.forget(self._address)

@@ -1,0 +1,130 @@
+"""Endpoint URLs: what they say, and which of them need signing."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+from dataclasses import dataclass
+from enum import Enum
+
+from mavfi_cli.core.errors import EndpointError
+
+LOOPBACK = "127.0.0.1"
+DEFAULT_BAUD = 57_600
+
+
+class Scheme(Enum):
+    """The kinds of endpoint, by the word before the first colon."""
+
+    UDP_IN = "udpin"
+    UDP_OUT = "udpout"
+    TCP = "tcp"
+    TCP_IN = "tcpin"
+    SERIAL = "serial"
+    FD = "fd"
+
+
+_FORMS = {
+    Scheme.UDP_IN: "udpin:[host]:port",
+    Scheme.UDP_OUT: "udpout:host:port",
+    Scheme.TCP: "tcp:host:port",
+    Scheme.TCP_IN: "tcpin:[host]:port",
+    Scheme.SERIAL: "serial:device[:baud]",
+    Scheme.FD: "fd:number",
+}
+# `udp` listens, as in pymavlink and MAVSDK; `tcpout` is MAVSDK's word for tcp.
+_ALIASES = {"udp": Scheme.UDP_IN, "tcpout": Scheme.TCP}
+_LISTENING = (Scheme.UDP_IN, Scheme.TCP_IN)
+_HOST_PORT = re.compile(r"(?:(?P<host>\[[^\]]*\]|[^:\[\]]*):)?(?P<port>[0-9]+)", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Endpoint:
+    """A parsed endpoint URL; only the fields of its scheme mean something."""
+
+    url: str
+    scheme: Scheme
+    host: str = ""
+    port: int = 0
+    device: str = ""
+    baud: int = DEFAULT_BAUD
+    fd: int = -1
+
+    @property
+    def listens(self) -> bool:
+        """Whether it waits for peers instead of calling one."""
+        return self.scheme in _LISTENING
+
+
+def parse_endpoint(url: str) -> Endpoint:
+    """The endpoint of a URL, in the form `scheme:rest` or `scheme://rest`.
+
+    Raises:
+        EndpointError: unknown scheme (names the known ones), or a rest that does not fit it.
+    """
+    word, _, rest = url.partition(":")
+    rest = rest.removeprefix("//")
+    scheme = _ALIASES.get(word) or next((s for s in Scheme if s.value == word), None)
+    if scheme is None:
+        raise EndpointError(url, f"unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
+    if scheme is Scheme.FD:
+        return Endpoint(url=url, scheme=scheme, fd=_number(url, scheme, rest, 2**31 - 1))
+    if scheme is Scheme.SERIAL:
+        return _serial(url, rest)
+    match = _HOST_PORT.fullmatch(rest)
+    host = (match["host"] or "").strip("[]") if match else ""
+    if not match or not (host or scheme in _LISTENING):
+        raise EndpointError(url, f"not of the form {_FORMS[scheme]}")
+    port = _number(url, scheme, match["port"], 65_535)
+    if port == 0 and scheme not in _LISTENING:
+        raise EndpointError(url, "port 0 cannot be called")
+    return Endpoint(url=url, scheme=scheme, host=host or LOOPBACK, port=port)
+
+
+def _number(url: str, scheme: Scheme, text: str, largest: int) -> int:
+    if not re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
+        raise EndpointError(url, f"not of the form {_FORMS[scheme]}")
+    if int(text) > largest:
+        raise EndpointError(url, f"{text} is more than {largest}")
+    return int(text)
+
+
+def _serial(url: str, rest: str) -> Endpoint:
+    device, colon, baud = rest.rpartition(":")
+    if not colon:
+        device, baud = rest, str(DEFAULT_BAUD)
+    if not device:
+        raise EndpointError(url, f"not of the form {_FORMS[Scheme.SERIAL]}")
+    number = _number(url, Scheme.SERIAL, baud, 12_500_000)
+    return Endpoint(url=url, scheme=Scheme.SERIAL, device=device, baud=number)
+
+
+def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> tuple[socket.AddressFamily, str]:
+    """Address family and numeric address of the endpoint's host, IPv4 first.
+
+    Raises:
+        EndpointError: no such host.
+    """
+    try:
+        found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)
+    except (OSError, UnicodeError) as error:
+        raise EndpointError(endpoint.url, f"no such host: {error}") from None
+    found.sort(key=lambda entry: entry[0] != socket.AF_INET)
+    family, _, _, _, address = found[0]
+    return family, str(address[0])
+
+
+def check_reach(endpoint: Endpoint, address: str, *, signed: bool, allow_unsigned: bool) -> None:
+    """Refuse an unsigned link that reaches beyond this machine.
+
+    Raises:
+        EndpointError: `address` is not a loopback one, and neither flag is set.
+    """
+    if signed or allow_unsigned or ipaddress.ip_address(address.partition("%")[0]).is_loopback:
+        return
+    raise EndpointError(
+        endpoint.url,
+        f"{address} is beyond this machine, where MAVLink signing is required: "
+        "give a signing passphrase, or allow unsigned links by name",
+    )
