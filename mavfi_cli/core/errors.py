@@ -12,6 +12,12 @@ MavfiError                      one known error, one line, exit code 1
 │   └── LinkLost                the peer fell silent or closed the connection
 ├── VehicleProcessError         the simulated vehicle could not start or ended early
 ├── RecordError                 a run folder that cannot be written or read
+├── FaultError                  a fault that cannot be described, placed or repeated
+│   ├── BitOutsideWidth         a bit that the type or register does not have
+│   ├── FieldUnavailable        a field (sign, exponent, mantissa) that the type has not
+│   ├── TracingForbidden        ptrace refused; says how to allow it
+│   ├── TargetError             a program that cannot be started, or ends before the trigger
+│   └── BuildMismatch           a fault record of another build; says what differs
 └── Interrupted                 the user asked to stop
 """
 
@@ -115,6 +121,45 @@ class VehicleProcessError(MavfiError):
 
 class RecordError(MavfiError):
     """A run folder that cannot be written or read."""
+
+
+class FaultError(MavfiError):
+    """A fault that cannot be described, placed or repeated."""
+
+
+class BitOutsideWidth(FaultError):
+    """A bit that the type or register does not have."""
+
+    def __init__(self, bit: int, kind: str, width: int) -> None:
+        super().__init__(f"bit {bit} is outside {kind}, which has bits 0 to {width - 1}")
+
+
+class FieldUnavailable(FaultError):
+    """A field that the type has not, or that has too few bits for the fault."""
+
+    def __init__(self, field: str, kind: str, known: Iterable[str]) -> None:
+        super().__init__(f"{kind} has no field {field!r}; it has: {', '.join(known)}")
+
+
+class TracingForbidden(FaultError):
+    """The operating system refuses to trace; says how to allow it."""
+
+    def __init__(self, what: str, problem: str, remedy: str) -> None:
+        super().__init__(f"{what} is not possible here ({problem}): {remedy}")
+
+
+class TargetError(FaultError):
+    """A target program that cannot be started, or that ends before the trigger."""
+
+    def __init__(self, program: str, problem: str) -> None:
+        super().__init__(f"{program}: {problem}")
+
+
+class BuildMismatch(FaultError):
+    """A fault record of another build; names each object that differs."""
+
+    def __init__(self, differences: Iterable[str]) -> None:
+        super().__init__(f"the record is of another build: {'; '.join(differences)}")
 
 
 class Interrupted(MavfiError):

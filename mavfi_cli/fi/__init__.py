@@ -1,0 +1,1 @@
+"""Fault injection: bit operations, fault records, and the instruction-level injector."""

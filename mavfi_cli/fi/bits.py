@@ -1,0 +1,175 @@
+"""Every bit operation of the project: one module, one set of laws.
+
+A value is handled as its *pattern*, an unsigned Python integer with bit 0 the least significant.
+Layouts of binary32 and binary64: IEEE 754-2019, section 3.4.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from mavfi_cli.core.errors import BitOutsideWidth, FieldUnavailable
+
+Scalar = float | int | bool
+
+
+class Field(Enum):
+    """Which part of a value is attacked."""
+
+    SIGN = "sign"
+    EXPONENT = "exponent"
+    MANTISSA = "mantissa"
+    ANY = "any"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BitType:
+    """A type as bits: its name, its width, and the bits of each of its fields."""
+
+    name: str
+    width: int
+    fields: dict[Field, range]
+
+    def field_bits(self, field: Field) -> range:
+        """The bits of `field`.
+
+        Raises:
+            FieldUnavailable: the type has no such field.
+        """
+        try:
+            return self.fields[field]
+        except KeyError:
+            known = [known.value for known in self.fields]
+            raise FieldUnavailable(field.value, self.name, known) from None
+
+
+def _float_type(name: str, mantissa: int, exponent: int) -> BitType:
+    width = mantissa + exponent + 1
+    return BitType(
+        name=name,
+        width=width,
+        fields={
+            Field.SIGN: range(width - 1, width),
+            Field.EXPONENT: range(mantissa, width - 1),
+            Field.MANTISSA: range(mantissa),
+            Field.ANY: range(width),
+        },
+    )
+
+
+FLOAT64 = _float_type("float64", 52, 11)
+FLOAT32 = _float_type("float32", 23, 8)
+INT32 = BitType(name="int32", width=32, fields={Field.SIGN: range(31, 32), Field.ANY: range(32)})
+INT64 = BitType(name="int64", width=64, fields={Field.SIGN: range(63, 64), Field.ANY: range(64)})
+BOOL = BitType(name="bool", width=1, fields={Field.ANY: range(1)})
+
+
+def raw(size_bytes: int) -> BitType:
+    """A register or memory operand of `size_bytes` bytes, without fields."""
+    width = 8 * size_bytes
+    return BitType(name=f"raw{width}", width=width, fields={Field.ANY: range(width)})
+
+
+def mask_of(bits: Iterable[int], kind: BitType) -> int:
+    """The xor mask of distinct bits.
+
+    Raises:
+        BitOutsideWidth: a bit that `kind` does not have.
+    """
+    mask = 0
+    for bit in bits:
+        if not 0 <= bit < kind.width:
+            raise BitOutsideWidth(bit, kind.name, kind.width)
+        mask |= 1 << bit
+    return mask
+
+
+def bits_of(mask: int) -> tuple[int, ...]:
+    """The set bits of a mask, ascending."""
+    return tuple(bit for bit in range(mask.bit_length()) if mask >> bit & 1)
+
+
+def draw_bits(
+    rng: np.random.Generator, kind: BitType, *, field: Field = Field.ANY, count: int = 1
+) -> tuple[int, ...]:
+    """`count` distinct bits of a field, uniformly, ascending.
+
+    Raises:
+        FieldUnavailable: the type has no such field, or the field has fewer than `count` bits.
+    """
+    candidates = kind.field_bits(field)
+    if not 1 <= count <= len(candidates):
+        wanted = f"{field.value} of at least {count} bits"
+        known = [f"{name.value} ({len(bits)})" for name, bits in kind.fields.items()]
+        raise FieldUnavailable(wanted, kind.name, known)
+    chosen = rng.choice(len(candidates), size=count, replace=False)
+    return tuple(sorted(candidates[int(index)] for index in chosen))
+
+
+def flip_pattern(pattern: int, bits: Iterable[int], kind: BitType) -> int:
+    """The pattern with `bits` inverted; flipping twice gives the pattern back."""
+    return pattern ^ mask_of(bits, kind)
+
+
+@dataclass(frozen=True, slots=True)
+class _Coding:
+    to_pattern: Callable[[Scalar], int]
+    to_value: Callable[[int], Scalar]
+
+
+def _struct_coding(value_format: str, pattern_format: str) -> _Coding:
+    def to_pattern(value: Scalar) -> int:
+        return int(struct.unpack(pattern_format, struct.pack(value_format, value))[0])
+
+    def to_value(pattern: int) -> Scalar:
+        value: Scalar = struct.unpack(value_format, struct.pack(pattern_format, pattern))[0]
+        return value
+
+    return _Coding(to_pattern, to_value)
+
+
+_CODINGS = {
+    FLOAT64.name: _struct_coding("<d", "<Q"),
+    FLOAT32.name: _struct_coding("<f", "<I"),
+    INT32.name: _struct_coding("<i", "<I"),
+    INT64.name: _struct_coding("<q", "<Q"),
+    BOOL.name: _Coding(int, bool),
+}
+
+
+def pattern_of(value: Scalar, kind: BitType) -> int:
+    """The bits of a value; a float32 is rounded to the nearest representable first."""
+    return _CODINGS[kind.name].to_pattern(value)
+
+
+def value_of(pattern: int, kind: BitType) -> Scalar:
+    """The value of a pattern.
+
+    A signalling float32 NaN may come back quiet, because Python holds every float as binary64.
+    """
+    return _CODINGS[kind.name].to_value(pattern)
+
+
+def flip(value: Scalar, bits: Iterable[int], kind: BitType) -> Scalar:
+    """The value with `bits` of its pattern inverted."""
+    return value_of(flip_pattern(pattern_of(value, kind), bits, kind), kind)
+
+
+def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
+    """Raw little-endian bytes with `bits` inverted (bit 8 is bit 0 of the second byte)."""
+    pattern = flip_pattern(int.from_bytes(data, "little"), bits, raw(len(data)))
+    return pattern.to_bytes(len(data), "little")
+
+
+NUMPY_TYPES: dict[str, BitType] = {
+    "float64": FLOAT64,
+    "float32": FLOAT32,
+    "int32": INT32,
+    "int64": INT64,
+    "bool": BOOL,
+}
