@@ -1,0 +1,365 @@
+"""The mission state machine: when to plan, to fly on, to slow down, to stop, and to give up.
+
+It sees only messages: collision reports, planned trajectories, and the vehicle's state. What it
+puts out is a directive: which trajectory to track, at which point of it, how fast its clock runs,
+and whether a new plan is wanted.
+
+Slowing down and stopping run the trajectory's own clock slower, so the vehicle stays on the path
+that was checked. The rate of that clock is ramped within the braking limit: along a path flown
+at speed v, a rate r gives the velocity r v and a ramp dr/dt the acceleration v dr/dt.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
+
+
+class Mode(Enum):
+    """What the pilot is doing."""
+
+    WAITING = "waiting"  # hovering, a plan is wanted
+    FLYING = "flying"  # on a trajectory, nothing foreseen on it
+    EVADING = "evading"  # on a blocked trajectory, with time to go on while a new one is planned
+    SLOWING = "slowing"  # the same, with less time: at reduced speed
+    STOPPING = "stopping"  # no time left: braking, then planning from a hover
+    ARRIVED = "arrived"
+    GAVE_UP = "gave_up"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PilotParams:
+    """Limits and patience of the mission.
+
+    Sources: v_max, a_max, the 0.25 s planning lead and the 40 attempts are those of the released
+    package_delivery application (reference facts, sections 4.1, 4.5 and 4.8).
+    """
+
+    v_max_mps: float = 3.0
+    a_max_mps2: float = 5.0
+    goal_tolerance_m: float = 1.0
+    plan_lead_s: float = 0.25  # a plan made in flight starts this far ahead of now
+    late_plan_s: float = 0.5  # a plan that comes later than this after its start is not used
+    brake_mps2: float = 3.0  # deceleration that stopping counts on
+    margin_s: float = 0.4  # reserve on top of braking before a foreseen collision
+    slow_rate: float = 0.5  # share of the planned speed while slowing
+    attempts_max: int = 40  # failed plans in a row before giving up
+    retry_s: float = 0.1  # pause after a failed plan
+    look_round_after: int = 3  # failed plans in a row before looking all round
+    tracking_error_max_m: float = 2.0  # farther than this from the reference: stop and plan anew
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanRequest:
+    """What a plan must connect, and what its maker must know."""
+
+    stamp_s: float  # when the trajectory shall begin
+    position_enu_m: FloatArray  # (3,)
+    velocity_enu_mps: FloatArray  # (3,)
+    yaw_rad: float
+    goal_enu_m: FloatArray  # (3,)
+    attempt: int  # counts all plans of the mission; seeds the planner
+    trajectory_seq: int  # newest one known; the plan's own comes after it
+    future_collision_seq: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanFailure:
+    """A planner that found nothing."""
+
+    stamp_s: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Directive:
+    """What the control stage shall do in this tick."""
+
+    mode: Mode
+    trajectory: Trajectory | None  # None: hold `hold_enu_m`
+    time_s: float  # point on the trajectory, from its first waypoint
+    rate: float  # trajectory seconds per second, 0..1
+    rate_change_per_s: float
+    hold_enu_m: FloatArray  # (3,)
+    hold_yaw_rad: float
+    plan: PlanRequest | None = None
+
+
+@dataclass(slots=True)
+class Counters:
+    """What the record of the mission counts."""
+
+    plans_requested: int = 0
+    plans_failed: int = 0
+    plans_ignored: int = 0  # stale, late, or out of order
+    replans: int = 0  # plans adopted after the first
+    collisions_foreseen: int = 0
+    reports_ignored: int = 0  # stale future_collision_seq
+    stops: int = 0
+    slowdowns: int = 0
+    look_rounds: int = 0
+
+
+class Pilot:
+    """The state machine. Drive it with the messages, then ask `update` once a control tick."""
+
+    def __init__(self, params: PilotParams, goal_enu_m: FloatArray) -> None:
+        self.params = params
+        self.goal_enu_m = goal_enu_m
+        self.counters = Counters()
+        self.mode = Mode.WAITING
+        self.trajectory: Trajectory | None = None
+        self.time_s = 0.0
+        self._rate = 0.0
+        self._rate_change = 0.0
+        self._next: Trajectory | None = None
+        self._hold: FloatArray | None = None
+        self._hold_yaw = 0.0
+        self._trajectory_seq = 0
+        self._collision_seq = 0
+        self._awaiting_plan = False
+        self._wanted = True
+        self._not_before_s = 0.0
+        self._failures = 0
+        self._stamp_s = 0.0
+        self._look_started_s: float | None = None
+
+    def on_report(self, report: CollisionReport) -> None:
+        """Take the verdict of the collision check.
+
+        A report whose future_collision_seq is older than the newest known is ignored.
+        """
+        if report.future_collision_seq < self._collision_seq:
+            self.counters.reports_ignored += 1
+            return
+        if not report.collision or self.trajectory is None:
+            return
+        if report.future_collision_seq > self._collision_seq:
+            self.counters.collisions_foreseen += 1
+        self._collision_seq = report.future_collision_seq
+        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.WAITING):
+            return
+        self._next = None
+        if not self._awaiting_plan:
+            self._wanted = True
+        self._react(report)
+
+    def _react(self, report: CollisionReport) -> None:
+        """Go on, slow down or stop: whichever the time to the collision still allows."""
+        p = self.params
+        left_s = report.time_to_collision_s - (self._stamp_s - report.stamp_s)
+        brake_s = self._rate * self._planned_speed() / p.brake_mps2 + p.margin_s
+        if not left_s > brake_s:  # a NaN is no time at all
+            mode = Mode.STOPPING
+        elif left_s <= brake_s + p.plan_lead_s + p.late_plan_s:
+            mode = Mode.SLOWING
+        else:
+            mode = Mode.EVADING
+        severity = (Mode.FLYING, Mode.EVADING, Mode.SLOWING, Mode.STOPPING)
+        if severity.index(mode) > severity.index(self.mode):
+            if mode is Mode.STOPPING:
+                self.counters.stops += 1
+                self._wanted = True
+                self._awaiting_plan = False
+            elif mode is Mode.SLOWING:
+                self.counters.slowdowns += 1
+            self.mode = mode
+
+    def on_plan(self, result: Trajectory | PlanFailure) -> None:
+        """Take a plan, or the news that there is none.
+
+        A trajectory is ignored when it is out of order, does not know of the newest foreseen
+        collision, or comes too late for its own start.
+        """
+        if not self._awaiting_plan:
+            self.counters.plans_ignored += 1
+            return
+        self._awaiting_plan = False
+        if isinstance(result, PlanFailure):
+            self._plan_failed()
+            return
+        p = self.params
+        stale = (
+            result.trajectory_seq <= self._trajectory_seq
+            or result.future_collision_seq < self._collision_seq
+        )
+        late = self._rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
+        if stale or late:
+            self.counters.plans_ignored += 1
+            self._wanted = True
+            if late:
+                self.mode = Mode.STOPPING
+            return
+        self._failures = 0
+        self._look_started_s = None
+        self._trajectory_seq = result.trajectory_seq
+        self._collision_seq = max(self._collision_seq, result.future_collision_seq)
+        self._next = result
+
+    def _plan_failed(self) -> None:
+        self.counters.plans_failed += 1
+        self._failures += 1
+        self._wanted = True
+        self._not_before_s = self._stamp_s + self.params.retry_s
+        if self.mode is not Mode.WAITING:
+            self.mode = Mode.STOPPING
+        if self._failures >= self.params.attempts_max:
+            self.mode = Mode.GAVE_UP
+        elif self._failures == self.params.look_round_after:
+            self._look_started_s = self._stamp_s
+            self.counters.look_rounds += 1
+
+    def update(self, stamp_s: float, state: VehicleState) -> Directive:
+        """One control tick: advance along the trajectory and say what to do."""
+        step_s = stamp_s - self._stamp_s if self._stamp_s else 0.0
+        self._stamp_s = stamp_s
+        if self._hold is None:
+            self._hold_here(state)
+        if self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
+            self._adopt_next(stamp_s)
+            self._advance(step_s)
+            self._guard(state)
+            distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
+            if distance_m <= self.params.goal_tolerance_m:
+                self.mode = Mode.ARRIVED
+                self._hold, self._hold_yaw = self.goal_enu_m, state.yaw_rad
+                self._stand()
+        plan = self._plan_request(stamp_s, state)
+        assert self._hold is not None
+        return Directive(
+            mode=self.mode,
+            trajectory=self.trajectory,
+            time_s=self.time_s,
+            rate=self._rate,
+            rate_change_per_s=self._rate_change,
+            hold_enu_m=self._hold,
+            hold_yaw_rad=self._hold_yaw + self._look_round_angle(stamp_s),
+            plan=plan,
+        )
+
+    def _adopt_next(self, stamp_s: float) -> None:
+        """Switch to the next trajectory once its start has come."""
+        if self._next is None or stamp_s < self._next.stamp_s:
+            return
+        if self.trajectory is not None or self.counters.plans_requested > 1:
+            self.counters.replans += 1
+        moving = self.mode not in (Mode.WAITING, Mode.STOPPING)
+        late_s = stamp_s - self._next.stamp_s
+        self.trajectory, self._next = self._next, None
+        self.time_s = late_s if moving else 0.0
+        self._rate, self._rate_change = (self._rate, 0.0) if moving else (1.0, 0.0)
+        self.mode = Mode.FLYING
+
+    def _advance(self, step_s: float) -> None:
+        """Run the trajectory's clock, ramping its rate towards what the mode asks for."""
+        if self.trajectory is None:
+            return
+        target = {Mode.STOPPING: 0.0, Mode.SLOWING: self.params.slow_rate}.get(self.mode, 1.0)
+        speed = max(self._planned_speed(), 0.5)
+        ramp = self.params.brake_mps2 / speed * step_s
+        change = min(max(target - self._rate, -ramp), ramp)
+        before = self._rate
+        self._rate += change
+        self._rate_change = change / step_s if step_s > 0.0 else 0.0
+        self.time_s += 0.5 * (before + self._rate) * step_s
+        if self.mode is Mode.STOPPING and self._rate <= 0.0:
+            self._stop_here()
+        elif not self.time_s < self.trajectory.duration_s and self._next is None:
+            self._stop_here()
+
+    def _guard(self, state: VehicleState) -> None:
+        """Too far from where the trajectory says it should be: stop and plan from here."""
+        if self.trajectory is None:
+            return
+        reference = self._reference_position()
+        error_m = float(np.linalg.norm(state.position_enu_m - reference))
+        if not error_m <= self.params.tracking_error_max_m:
+            self._hold_here(state)
+            self._stand()
+            self._next = None
+            self._wanted = True
+            self._awaiting_plan = False
+            self.mode = Mode.WAITING
+            self.counters.stops += 1
+
+    def _stop_here(self) -> None:
+        """The trajectory is over, or its clock stands: hover there and want a plan."""
+        self._hold = self._reference_position()
+        self._hold_yaw = self._reference_yaw()
+        self._stand()
+        if not self._awaiting_plan:
+            self._wanted = True
+        self.mode = Mode.WAITING
+
+    def _stand(self) -> None:
+        self.trajectory = None
+        self.time_s = 0.0
+        self._rate = 0.0
+        self._rate_change = 0.0
+
+    def _hold_here(self, state: VehicleState) -> None:
+        self._hold = state.position_enu_m.copy()
+        self._hold_yaw = state.yaw_rad
+
+    def _plan_request(self, stamp_s: float, state: VehicleState) -> PlanRequest | None:
+        """A request where one is wanted, none is under way, and the pause is over."""
+        idle = self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.STOPPING)
+        if idle or not self._wanted or self._awaiting_plan or stamp_s < self._not_before_s:
+            return None
+        self._wanted = False
+        self._awaiting_plan = True
+        self.counters.plans_requested += 1
+        start = self._start_of_plan(stamp_s, state)
+        return PlanRequest(
+            stamp_s=start[0],
+            position_enu_m=start[1],
+            velocity_enu_mps=start[2],
+            yaw_rad=start[3],
+            goal_enu_m=self.goal_enu_m,
+            attempt=self.counters.plans_requested,
+            trajectory_seq=self._trajectory_seq,
+            future_collision_seq=self._collision_seq,
+        )
+
+    def _start_of_plan(
+        self, stamp_s: float, state: VehicleState
+    ) -> tuple[float, FloatArray, FloatArray, float]:
+        """Stamp, position, velocity and yaw at which the next trajectory takes over."""
+        if self.trajectory is None:
+            assert self._hold is not None
+            return stamp_s, self._hold.copy(), np.zeros(3), state.yaw_rad
+        lead_s = self.params.plan_lead_s
+        waypoint = reference_waypoint(self.trajectory, self.time_s + self._rate * lead_s)
+        return (
+            stamp_s + lead_s,
+            waypoint[0:3].copy(),
+            self._rate * waypoint[4:7],
+            float(waypoint[3]),
+        )
+
+    def _planned_speed(self) -> float:
+        """Speed that the trajectory asks for at its present point and rate 1, m/s."""
+        if self.trajectory is None:
+            return 0.0
+        speed = float(np.linalg.norm(reference_waypoint(self.trajectory, self.time_s)[4:7]))
+        return min(speed, self.params.v_max_mps) if math.isfinite(speed) else self.params.v_max_mps
+
+    def _reference_position(self) -> FloatArray:
+        assert self.trajectory is not None
+        position: FloatArray = reference_waypoint(self.trajectory, self.time_s)[0:3].copy()
+        return position
+
+    def _reference_yaw(self) -> float:
+        assert self.trajectory is not None
+        return float(reference_waypoint(self.trajectory, self.time_s)[3])
+
+    def _look_round_angle(self, stamp_s: float) -> float:
+        """Angle of the look round that failed plans have started, rad: one turn in 6 s."""
+        if self._look_started_s is None or self.mode is not Mode.WAITING:
+            return 0.0
+        return min(2.0 * math.pi, (stamp_s - self._look_started_s) * 2.0 * math.pi / 6.0)

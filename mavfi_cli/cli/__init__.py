@@ -1,0 +1,75 @@
+"""The command line: one thin module a command, imported only when it is called."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import NoReturn
+
+import click
+
+from mavfi_cli import __version__
+from mavfi_cli.core.errors import Interrupted, MavfiError
+
+# name -> (module, what it does); the help page must not import the modules
+_COMMANDS = {
+    "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
+    "sitl": ("mavfi_cli.cli.sitl", "The simulated vehicle alone, for any MAVLink client."),
+    "world": ("mavfi_cli.cli.world", "List, make, check and draw worlds."),
+    "show": ("mavfi_cli.cli.show", "Read a run and say what happened."),
+    "doctor": ("mavfi_cli.cli.doctor", "Test this machine: what works here, and why not."),
+}
+
+
+class _LazyGroup(click.Group):
+    """Loads a command's module when the command is used or its own help is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        module = importlib.import_module(_COMMANDS[cmd_name][0])
+        command: click.Command = getattr(module, cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        from mavfi_cli.core.errors import UnknownName
+
+        if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
+            ctx.fail(str(UnknownName("command", args[0], _COMMANDS)))
+        return super().resolve_command(ctx, args)
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="mavfi")
+def cli() -> None:
+    """What a bit flip does to a flying robot, and what it costs to survive it."""
+
+
+def main() -> NoReturn:
+    """Entry point: a known error is one line and exit code 1, a usage error exit code 2."""
+    try:
+        cli.main(prog_name="mavfi", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.exceptions.Exit as error:
+        sys.exit(error.exit_code)
+    except (Interrupted, KeyboardInterrupt, click.Abort):
+        click.echo("interrupted", err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(1)
+    except MavfiError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    sys.exit(0)

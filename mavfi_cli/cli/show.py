@@ -1,0 +1,28 @@
+"""`mavfi show`: what happened in a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print result.json as it is.")
+@click.option("--events", is_flag=True, help="Also list every event of the flight.")
+def show(run: Path, as_json: bool, events: bool) -> None:
+    """Say what happened in RUN, a run folder."""
+    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.report.summary import event_lines, summary_lines
+
+    record = load_run(run)
+    if as_json:
+        click.echo(json.dumps(record.result, indent=2, sort_keys=True))
+        return
+    lines = summary_lines(record.result)
+    if events:
+        lines += ["", "Events", *event_lines(record.result)]
+    click.echo("\n".join(lines))
+    click.echo(f"\nRun folder  {record.folder.path}")

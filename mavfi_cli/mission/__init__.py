@@ -1,0 +1,1 @@
+"""The composition root: link + autonomy (+ faults + detectors), one clock and one loop."""

@@ -1,0 +1,73 @@
+"""What a mission is made of: one frozen record, complete enough to repeat the flight."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from mavfi_cli.core.errors import ConfigError
+
+Vector3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionConfig:
+    """One mission. Positions in the world frame (ENU), m.
+
+    Attributes:
+        world: name of a world, or the path of a TOML file of boxes.
+        seed: the root seed; world, planner, latency and sensor streams derive from it.
+        start, goal: None leaves the world's own.
+        link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
+        realtime: pace the simulated vehicle by the wall clock.
+        land: land and disarm after the goal was reached.
+    """
+
+    world: str = "dense"
+    seed: int = 1
+    planner: str = "rrtstar"
+    platform: str = "x86"
+    vehicle: str = "solo"
+    start: Vector3 | None = None
+    goal: Vector3 | None = None
+    takeoff_height_m: float = 5.0
+    v_max_mps: float = 3.0
+    a_max_mps2: float = 5.0
+    goal_tolerance_m: float = 1.0
+    time_limit_s: float = 300.0
+    map_resolution_m: float = 0.2
+    map_range_m: float = 7.0
+    camera_columns: int = 64
+    camera_rows: int = 48
+    camera_rate_hz: float = 10.0
+    realtime: bool = False
+    link: str | None = None
+    land: bool = False
+
+    def __post_init__(self) -> None:
+        positive = {
+            "takeoff_height_m": (self.takeoff_height_m, 1.0, 50.0),
+            "v_max_mps": (self.v_max_mps, 0.1, 12.0),
+            "a_max_mps2": (self.a_max_mps2, 0.5, 8.0),
+            "goal_tolerance_m": (self.goal_tolerance_m, 0.1, 50.0),
+            "time_limit_s": (self.time_limit_s, 1.0, 86400.0),
+            "map_resolution_m": (self.map_resolution_m, 0.05, 1.0),
+            "map_range_m": (self.map_range_m, 2.0, 25.0),
+            "camera_rate_hz": (self.camera_rate_hz, 0.1, 50.0),
+        }
+        for name, (value, low, high) in positive.items():
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
+        if not 0 <= self.seed < 2**31:
+            raise ConfigError(f"must be within 0 and 2^31 - 1, got {self.seed}", key="seed")
+        for name, size in (
+            ("camera_columns", self.camera_columns),
+            ("camera_rows", self.camera_rows),
+        ):
+            if not 4 <= size <= 1024:
+                raise ConfigError(f"must be within 4 and 1024 pixels, got {size}", key=name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for the record of the run."""
+        return asdict(self)

@@ -1,0 +1,39 @@
+"""What happened in a mission, in order: the list that a person reads after the flight."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Event:
+    """One line of the flight's story."""
+
+    stamp_s: float
+    kind: str  # phase, autopilot, plan, collision, outcome
+    text: str
+    position_enu_m: tuple[float, float, float] | None = None
+
+
+@dataclass(slots=True)
+class EventLog:
+    """Collects events; a live view may listen."""
+
+    events: list[Event] = field(default_factory=list)
+
+    def add(
+        self,
+        stamp_s: float,
+        kind: str,
+        text: str,
+        position_enu_m: tuple[float, float, float] | None = None,
+    ) -> None:
+        """Note one event."""
+        self.events.append(
+            Event(stamp_s=stamp_s, kind=kind, text=text, position_enu_m=position_enu_m)
+        )
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Plain values, for the record of the run."""
+        return [asdict(event) for event in self.events]

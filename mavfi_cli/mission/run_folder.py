@@ -1,0 +1,105 @@
+"""The folder of one run: result.json, trace.parquet, flight.tlog, flight.svg."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.mission.files import write_json
+from mavfi_cli.mission.trace import read_trace
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+RESULT = "result.json"
+TRACE = "trace.parquet"
+TLOG = "flight.tlog"
+PICTURE = "flight.svg"
+CRASH = "crash.txt"
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """Paths of one run."""
+
+    path: Path
+
+    @property
+    def result(self) -> Path:
+        """Outcome, quality of flight, seeds, versions, resolved configuration."""
+        return self.path / RESULT
+
+    @property
+    def trace(self) -> Path:
+        """States at every control tick."""
+        return self.path / TRACE
+
+    @property
+    def tlog(self) -> Path:
+        """Every MAVLink packet of both directions."""
+        return self.path / TLOG
+
+    @property
+    def picture(self) -> Path:
+        """Top view of the flight."""
+        return self.path / PICTURE
+
+    def write_result(self, result: dict[str, Any]) -> None:
+        """Write result.json atomically."""
+        write_json(self.result, result)
+
+
+def new_run_folder(parent: Path, stem: str) -> RunFolder:
+    """A new, empty folder `<stem>-<number>` below `parent`; safe among parallel missions.
+
+    Raises:
+        RecordError: it cannot be made.
+    """
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        taken = [int(p.name.rpartition("-")[2]) for p in parent.glob(f"{stem}-[0-9]*")
+                 if p.name.rpartition("-")[2].isdigit()]  # fmt: skip
+        number = max(taken, default=0) + 1
+        while True:
+            path = parent / f"{stem}-{number:03d}"
+            try:
+                path.mkdir()
+                return RunFolder(path)
+            except FileExistsError:
+                number += 1
+    except OSError as error:
+        raise RecordError(f"{parent}: {error.strerror or error}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run as read back."""
+
+    folder: RunFolder
+    result: dict[str, Any]
+    trace: pa.Table | None
+
+
+def load_run(path: Path) -> Run:
+    """Read a run folder, or the folder that its result.json lies in.
+
+    Raises:
+        RecordError: no run there, cut off before its end, or damaged.
+    """
+    folder = RunFolder(path.parent if path.name == RESULT else path)
+    if not folder.path.is_dir():
+        raise RecordError(f"{path}: no such run folder")
+    if not folder.result.is_file():
+        hint = "cut off before its end" if folder.tlog.exists() else "not a run folder"
+        raise RecordError(f"{folder.path}: no {RESULT} ({hint})")
+    try:
+        result = json.loads(folder.result.read_text())
+        trace = read_trace(folder.trace) if folder.trace.is_file() else None
+    except (OSError, ValueError) as error:
+        raise RecordError(f"{folder.path}: damaged ({error})") from None
+    if not isinstance(result, dict) or result.get("schema") != 1:
+        raise RecordError(f"{folder.result}: written by another version of mavfi")
+    return Run(folder, result, trace)

@@ -1,0 +1,76 @@
+"""The simulated vehicle as a child process that speaks MAVLink over an inherited socket pair."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from mavfi_cli.core.errors import VehicleProcessError
+from mavfi_cli.mission.config import MissionConfig
+
+
+class VehicleProcess:
+    """`python -m sitl` in lockstep. Closing the socket ends it and saves the referee's truth."""
+
+    def __init__(self, config: MissionConfig, truth_folder: Path) -> None:
+        self._errors = tempfile.TemporaryFile()
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        with theirs:
+            try:
+                self._process = subprocess.Popen(
+                    _command_line(config, theirs.fileno(), truth_folder),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=self._errors,
+                    pass_fds=[theirs.fileno()],
+                    start_new_session=True,  # Ctrl-C is for the companion, which then closes
+                )
+            except OSError as error:
+                ours.close()
+                raise VehicleProcessError(f"cannot start the vehicle: {error}") from None
+        self.socket = ours
+
+    def stop(self, timeout_s: float = 20.0) -> None:
+        """Let it save the truth and end; kill it where it does not."""
+        with contextlib.suppress(OSError):
+            self.socket.close()
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def failure(self) -> VehicleProcessError | None:
+        """What it said when it ended with an error; None where it ended well."""
+        if self._process.poll() in (None, 0):
+            return None
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        told = [line for line in lines if line.startswith("error: ")]
+        if told:
+            return VehicleProcessError(told[-1].removeprefix("error: "))
+        last = lines[-1] if lines else "no message"
+        return VehicleProcessError(
+            f"the vehicle process ended with code {self._process.returncode}: {last}"
+        )
+
+
+def _command_line(config: MissionConfig, fd: int, truth_folder: Path) -> list[str]:
+    line = [
+        sys.executable, "-m", "sitl",
+        "--fd", str(fd), "--lockstep",
+        "--world", config.world, "--seed", str(config.seed), "--vehicle", config.vehicle,
+        "--camera-size", f"{config.camera_columns}x{config.camera_rows}",
+        "--camera-rate", f"{config.camera_rate_hz:g}",
+        "--truth", str(truth_folder),
+    ]  # fmt: skip
+    for name, place in (("--start", config.start), ("--goal", config.goal)):
+        if place is not None:
+            line.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")
+    if config.realtime:
+        line += ["--speed", "1"]
+    return line

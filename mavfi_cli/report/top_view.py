@@ -1,0 +1,187 @@
+"""The top view of a flight: obstacles, the path by its speed, plans, and what happened where."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mavfi_cli.mission.files import write_atomically
+from mavfi_cli.mission.run_folder import Run
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_OBSTACLE = "#c9ced6"
+_OBSTACLE_EDGE = "#8b93a1"
+_LOW = "#e3ead9"  # boxes that end below the flight: hedges
+_PLAN = "#7a8699"
+_GOOD = "#1b7f4b"
+_BAD = "#c22f2f"
+_MARKS: dict[str, dict[str, Any]] = {
+    "replan": {"marker": "o", "s": 26, "facecolors": "white", "edgecolors": "#222831"},
+    "slow": {"marker": "v", "s": 30, "facecolors": "#f2b134", "edgecolors": "#222831"},
+    "stop": {"marker": "s", "s": 26, "facecolors": "#e4572e", "edgecolors": "#222831"},
+}
+_LABELS = {"replan": "new plan", "slow": "slows down", "stop": "stops"}
+
+
+def write_top_view(run: Run, path: Path) -> None:
+    """Draw the run and write it as SVG, atomically; equal runs give equal bytes."""
+    import matplotlib as mpl
+
+    figure = draw_top_view(run)
+    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
+    write_atomically(path, lambda file: file.write(buffer.getvalue()))
+
+
+def draw_top_view(run: Run) -> Figure:
+    """A matplotlib figure of the run, in metres, east to the right and north up."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    world = run.result.get("world") or {}
+    positions, speeds = _path(run)
+    _draw_obstacles(axes, world, float(np.median(positions[:, 2])) if len(positions) else 5.0)
+    _draw_plans(axes, run.result.get("plans", []))
+    if len(positions) > 1:
+        _draw_path(figure, axes, positions, speeds, run.result["config"]["v_max_mps"])
+    _draw_places(axes, run.result, positions)
+    _draw_marks(axes, run.result["events"])
+    _frame(axes, world, positions)
+    _caption(axes, run.result)
+    return figure
+
+
+def _path(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) m and speeds (n,) m/s of the flight: the truth where it is known."""
+    trace = run.trace
+    if trace is None or trace.num_rows == 0:
+        return np.empty((0, 3)), np.empty(0)
+    prefix = "truth_" if "truth_x_m" in trace.column_names else ""
+
+    def columns(names: tuple[str, ...]) -> np.ndarray:
+        return np.column_stack(
+            [trace[f"{prefix}{n}"].to_numpy(zero_copy_only=False) for n in names]
+        )
+
+    positions = columns(("x_m", "y_m", "z_m"))
+    speeds = np.linalg.norm(columns(("vx_mps", "vy_mps", "vz_mps")), axis=1)
+    known = np.isfinite(positions).all(axis=1)
+    return positions[known], speeds[known]
+
+
+def _draw_obstacles(axes: Axes, world: dict[str, Any], flight_height_m: float) -> None:
+    from matplotlib.patches import Rectangle
+
+    for box in world.get("boxes", []):
+        low = box[5] < flight_height_m - 1.0
+        axes.add_patch(
+            Rectangle(
+                (box[0], box[1]), box[3] - box[0], box[4] - box[1], zorder=1, linewidth=0.6,
+                facecolor=_LOW if low else _OBSTACLE, edgecolor=_OBSTACLE_EDGE,
+            )
+        )  # fmt: skip
+
+
+def _draw_plans(axes: Axes, plans: list[dict[str, Any]]) -> None:
+    for number, plan in enumerate(plans):
+        points = np.array(plan["points_enu_m"], dtype=float)
+        if len(points):
+            axes.plot(
+                points[:, 0], points[:, 1], color=_PLAN, linewidth=0.8, linestyle=(0, (4, 3)),
+                zorder=2, label="planned" if number == 0 else None,
+            )  # fmt: skip
+
+
+def _draw_path(
+    figure: Figure, axes: Axes, positions: np.ndarray, speeds: np.ndarray, v_max: float
+) -> None:
+    from matplotlib.collections import LineCollection
+
+    step = max(1, len(positions) // 1500)
+    points, shown = positions[::step, :2], speeds[::step]
+    if len(points) < 2:
+        return
+    segments = np.stack([points[:-1], points[1:]], axis=1)
+    lines = LineCollection(
+        list(segments), array=shown[1:], cmap="viridis", linewidths=2.2, zorder=4, capstyle="round"
+    )
+    lines.set_clim(0.0, v_max)
+    axes.add_collection(lines)
+    bar = figure.colorbar(lines, ax=axes, shrink=0.6, pad=0.02, aspect=28)
+    bar.set_label("speed, m/s")
+    bar.outline.set_linewidth(0.4)
+
+
+def _draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> None:
+    from matplotlib.patches import Circle
+
+    world = result.get("world") or {}
+    goal = result.get("goal_enu_m") or world.get("goal")
+    if goal:
+        tolerance = result["config"]["goal_tolerance_m"]
+        axes.add_patch(
+            Circle((goal[0], goal[1]), tolerance, fill=False, color=_GOOD, linewidth=1.0, zorder=3)
+        )
+        axes.scatter([goal[0]], [goal[1]], marker="*", s=120, color=_GOOD, zorder=5, label="goal")
+    if len(positions):
+        axes.scatter(
+            [positions[0, 0]], [positions[0, 1]], marker="^", s=55, color="#222831", zorder=5,
+            label="start",
+        )  # fmt: skip
+        if result["outcome"] != "success":
+            axes.scatter(
+                [positions[-1, 0]], [positions[-1, 1]], marker="X", s=90, color=_BAD,
+                edgecolors="white", linewidths=0.8, zorder=7, label=result["outcome"],
+            )  # fmt: skip
+
+
+def _draw_marks(axes: Axes, events: list[dict[str, Any]]) -> None:
+    for kind, style in _MARKS.items():
+        places = [e["position_enu_m"] for e in events if e["kind"] == kind and e["position_enu_m"]]
+        if places:
+            xy = np.array(places, dtype=float)
+            axes.scatter(xy[:, 0], xy[:, 1], linewidths=0.9, zorder=6, label=_LABELS[kind], **style)
+
+
+def _frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
+    """Limits round what matters, equal scales, quiet axes."""
+    places = [positions[:, :2]] if len(positions) else []
+    places += [np.array([world[key][:2]], dtype=float) for key in ("start", "goal") if key in world]
+    if places:
+        joined = np.concatenate(places)
+        low, high = joined.min(axis=0) - 8.0, joined.max(axis=0) + 8.0
+        side = max(high - low)
+        middle = (low + high) / 2.0
+        axes.set_xlim(middle[0] - side / 2.0, middle[0] + side / 2.0)
+        axes.set_ylim(middle[1] - side / 2.0, middle[1] + side / 2.0)
+    axes.set_aspect("equal")
+    axes.set_xlabel("east, m")
+    axes.set_ylabel("north, m")
+    axes.grid(visible=True, color="#edf0f4", linewidth=0.6, zorder=0)
+    axes.set_axisbelow(True)
+    for spine in axes.spines.values():
+        spine.set_color("#aab1bd")
+    axes.tick_params(color="#aab1bd", labelsize=8)
+
+
+def _caption(axes: Axes, result: dict[str, Any]) -> None:
+    config, qof = result["config"], result["quality_of_flight"]
+    time_s, distance_m = qof["flight_time_s"], qof["distance_m"]
+    figures = "" if time_s is None else f", {time_s:.1f} s, {distance_m:.1f} m"
+    axes.set_title(
+        f"{Path(config['world']).stem}, seed {config['seed']}: "
+        f"{result['outcome'].replace('_', ' ')}{figures}",
+        fontsize=10, loc="left",
+    )  # fmt: skip
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(0.0, -0.1), ncols=4, frameon=False, fontsize=8,
+        handletextpad=0.4, columnspacing=1.2,
+    )  # fmt: skip

@@ -1,0 +1,78 @@
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.core.config import load_toml
+from mavfi_cli.core.errors import ConfigError, UnknownKey
+
+
+@dataclass(frozen=True)
+class Inner:
+    a: float
+    b: int = 1
+
+
+@dataclass(frozen=True)
+class Outer:
+    name: str
+    box: list[Inner]
+    sub: Inner | None = None
+    pair: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.name == "bad":
+            raise ValueError("a bad name")
+
+
+def load(tmp_path: Path, text: str) -> Outer:
+    path = tmp_path / "file.toml"
+    path.write_text(text)
+    return load_toml(path, Outer)
+
+
+def test_a_good_file(tmp_path):
+    text = 'name = "x"\npair = [1, 2.5]\n[[box]]\na = 1\n[sub]\na = 2.0\nb = 3\n'
+    assert load(tmp_path, text) == Outer("x", [Inner(1.0)], Inner(2.0, 3), (1.0, 2.5))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name = "x"\nbox = []\nnam = 1', r"file\.toml:3: nam: .*did you mean 'name'"),
+        ('name = "x"\n[[box]]\na = 1\n[[box]]\nq = 2', r"file\.toml:5: box\.q: unknown key"),
+    ],
+)
+def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
+    with pytest.raises(UnknownKey, match=message):
+        load(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name = 3\nbox = []", r"file\.toml:1: name: expected str, got 3"),
+        ('name = "x"\n[[box]]\na = "k"', r"file\.toml:3: box\[0\]\.a: expected float, got 'k'"),
+        ('name = "x"\nbox = []\npair = [1, true]', r"pair\[1\]: expected float, got True"),
+        ('name = "x"\n[[box]]\na = nan', "expected a finite number"),
+        ('name = "x"\nbox = []\n[sub]\nb = 1', r"sub\.a: is missing"),
+        ('name = "x"', "box: is missing"),
+        ("name = = 3", "line 1, column 8"),
+        ('name = "bad"\nbox = []', "a bad name"),
+    ],
+)
+def test_what_is_wrong_is_said_with_file_line_and_key(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        load(tmp_path, text)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(ConfigError, match="No such file"):
+        load_toml(tmp_path / "none.toml", Outer)
+
+
+def test_a_file_that_is_no_text(tmp_path):
+    (tmp_path / "file.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="UTF-8"):
+        load_toml(tmp_path / "file.toml", Outer)
