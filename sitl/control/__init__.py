@@ -1,0 +1,1 @@
+"""The flight controller: position, velocity, attitude and rate loops, and the mixer."""

@@ -1,0 +1,85 @@
+"""Controller gains from the physics of a vehicle profile."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.control import layout
+from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
+
+RATE_DAMPING = 0.75
+RATE_BANDWIDTH_PER_LAG = 1.1  # natural frequency of the tilt-rate loop x motor time constant
+TILT_TO_RATE = 0.32  # tilt gain / natural frequency of the rate loop
+
+
+def gains_for(profile: VehicleProfile, dt_s: float) -> NDArray[np.float64]:
+    """The gain array (layout.GAINS_SIZE,) for a vehicle and a step of `dt_s`.
+
+    The rate loop is placed as a second-order system on the motor's lag tau: with
+    torque = I (P e - D w'), tau s^2 + (1 + D) s + P. Everything outside follows from its
+    natural frequency.
+    """
+    gains = np.zeros(layout.GAINS_SIZE)
+    gains[layout.G_DT] = dt_s
+    gains[layout.G_MASS] = profile.total_mass_kg
+    gains[layout.G_GRAVITY] = GRAVITY_MPS2
+    gains[layout.G_INERTIA : layout.G_INERTIA + 3] = profile.inertia_kgm2
+    _inner(gains, profile)
+    _outer(gains, profile)
+    _mixer(gains, profile)
+    return gains
+
+
+def _inner(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+    hover_n = profile.total_mass_kg * GRAVITY_MPS2 / 4.0
+    lag_s = profile.rotor.time_constant_s(hover_n)
+    natural = RATE_BANDWIDTH_PER_LAG / lag_s
+    p = lag_s * natural**2
+    d = max(2.0 * RATE_DAMPING * natural * lag_s - 1.0, 0.0)
+    yaw_p = 0.3 / lag_s
+    gains[layout.G_RATE_P : layout.G_RATE_P + 3] = (p, p, yaw_p)
+    gains[layout.G_RATE_D : layout.G_RATE_D + 3] = (d, d, 0.0)
+    gains[layout.G_RATE_I : layout.G_RATE_I + 3] = (0.5 * p, 0.5 * p, 0.5 * yaw_p)
+    gains[layout.G_TILT_P] = TILT_TO_RATE * natural
+    gains[layout.G_TILT_RATE_LIMIT] = math.radians(profile.limits.tilt_rate_degps)
+    gains[layout.G_HEADING_P] = 0.4 * yaw_p
+    gains[layout.G_HEADING_MODEL_P] = 3.0
+    gains[layout.G_YAW_RATE_LIMIT] = math.radians(profile.limits.yaw_rate_degps)
+    authority = 0.2 * hover_n * 4.0 * profile.rotor.torque_per_thrust_m
+    gains[layout.G_YAW_ACCELERATION] = min(authority / profile.inertia_kgm2[2], 4.0)
+
+
+def _outer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+    limits = profile.limits
+    tangent = math.tan(math.radians(limits.tilt_deg))
+    tilt_lag_s = 1.0 / gains[layout.G_TILT_P]
+    lift_lag_s = profile.rotor.time_constant_s(profile.total_mass_kg * GRAVITY_MPS2 / 4.0)
+    gains[layout.G_POSITION_P : layout.G_POSITION_P + 3] = (1.0, 1.0, 1.2)
+    gains[layout.G_MODEL_P : layout.G_MODEL_P + 3] = (3.0, 3.0, 4.0)
+    gains[layout.G_MODEL_LAG : layout.G_MODEL_LAG + 3] = (tilt_lag_s, tilt_lag_s, lift_lag_s)
+    gains[layout.G_VELOCITY_P : layout.G_VELOCITY_P + 3] = (2.2, 2.2, 4.0)
+    gains[layout.G_VELOCITY_I : layout.G_VELOCITY_I + 3] = (0.8, 0.8, 2.0)
+    gains[layout.G_INTEGRAL_LIMIT : layout.G_INTEGRAL_LIMIT + 3] = (4.0, 4.0, 5.0)
+    gains[layout.G_ACCELERATION_LIMIT] = 0.9 * GRAVITY_MPS2 * tangent
+    gains[layout.G_ACCELERATION_LIMIT + 1] = limits.vertical_acceleration_mps2
+    gains[layout.G_SPEED_LIMIT] = limits.horizontal_speed_mps
+    gains[layout.G_CLIMB_LIMIT] = limits.climb_mps
+    gains[layout.G_DESCENT_LIMIT] = limits.descent_mps
+    gains[layout.G_TILT_TANGENT] = tangent
+
+
+def _mixer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+    rotor = profile.rotor
+    full_v = rotor.full_throttle_voltage_v
+    torque_nm = rotor.max_thrust_n * rotor.torque_per_thrust_m
+    gains[layout.G_ROTOR_THRUST] = rotor.max_thrust_n
+    gains[layout.G_ROTOR_OFFSET] = rotor.arm_m / math.sqrt(2.0)
+    gains[layout.G_TORQUE_PER_THRUST] = rotor.torque_per_thrust_m
+    gains[layout.G_THROTTLE : layout.G_THROTTLE + 3] = (
+        rotor.motor_no_load_current_a * rotor.motor_resistance_ohm / full_v,
+        rotor.max_rpm / rotor.motor_kv_rpmpv / full_v,
+        torque_nm / rotor.torque_constant_nmpa * rotor.motor_resistance_ohm / full_v,
+    )

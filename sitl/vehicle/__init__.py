@@ -1,0 +1,1 @@
+"""The simulated quadrotor: profile, JSBSim model, battery, energy and truth."""

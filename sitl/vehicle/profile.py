@@ -1,0 +1,235 @@
+"""Vehicle profiles: one TOML file describes one quadrotor completely."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from mavfi_cli.core.config import load_toml
+from mavfi_cli.core.errors import ConfigError, UnknownName
+
+AIR_DENSITY_KGPM3 = 1.225  # ISA sea level, which is where the physics world lies
+GRAVITY_MPS2 = 9.80665
+MIN_THRUST_TO_WEIGHT = 1.15  # below it there is nothing left to steer and climb with
+
+Triple = tuple[float, float, float]
+
+_PROFILES = Path(__file__).parent / "profiles"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rotor:
+    """Four equal rotors on the diagonals of an X frame, and the motors that turn them."""
+
+    arm_m: float  # from the centre to each rotor axis
+    height_m: float  # rotor plane above the centre of mass
+    diameter_m: float
+    thrust_coefficient: float  # static C_T, T = C_T rho n^2 D^4, n in rev/s
+    power_coefficient: float  # static C_P, P = C_P rho n^3 D^5
+    zero_thrust_advance_ratio: float  # J = V / (n D) at which thrust vanishes
+    max_rpm: float  # static, at full throttle
+    inertia_kgm2: float  # propeller and bell about the axis
+    motor_kv_rpmpv: float
+    motor_resistance_ohm: float
+    motor_no_load_current_a: float
+
+    @property
+    def max_thrust_n(self) -> float:
+        """Static thrust of one rotor at `max_rpm`, N."""
+        speed_hz = self.max_rpm / 60.0
+        return self.thrust_coefficient * AIR_DENSITY_KGPM3 * speed_hz**2 * self.diameter_m**4
+
+    @property
+    def torque_per_thrust_m(self) -> float:
+        """Drag torque of a rotor per newton of its thrust, m: C_P D / (2 pi C_T)."""
+        return self.power_coefficient * self.diameter_m / (2.0 * math.pi * self.thrust_coefficient)
+
+    @property
+    def torque_constant_nmpa(self) -> float:
+        """Motor torque per ampere, N m/A: 60 / (2 pi Kv)."""
+        return 60.0 / (2.0 * math.pi * self.motor_kv_rpmpv)
+
+    @property
+    def full_throttle_voltage_v(self) -> float:
+        """Voltage at which the static propeller turns at `max_rpm`: what throttle 1 applies."""
+        torque_nm = self.max_thrust_n * self.torque_per_thrust_m
+        current_a = torque_nm / self.torque_constant_nmpa + self.motor_no_load_current_a
+        return self.max_rpm / self.motor_kv_rpmpv + current_a * self.motor_resistance_ohm
+
+    def time_constant_s(self, thrust_n: float) -> float:
+        """Lag of rotor speed behind voltage, s, linearised at a static thrust per rotor, N.
+
+        J dw/dt = Kt (V - w Kt) / R - Q(w), with Q proportional to w^2.
+        """
+        share = math.sqrt(thrust_n / self.max_thrust_n)
+        speed_radps = share * self.max_rpm * math.pi / 30.0
+        load = 2.0 * thrust_n * self.torque_per_thrust_m / speed_radps
+        return self.inertia_kgm2 / (self.torque_constant_nmpa**2 / self.motor_resistance_ohm + load)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drag:
+    """Body drag along each body axis: F = -(linear v + quadratic v |v|)."""
+
+    linear_nspm: Triple  # forward, right, down; N s/m
+    quadratic_ns2pm2: Triple  # N s^2/m^2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gear:
+    """Four landing legs on the diagonals."""
+
+    leg_radius_m: float  # from the centre, horizontally
+    height_m: float  # centre of mass above the unloaded feet
+    natural_frequency_radps: float = 40.0  # of the vehicle on its springs
+    damping_ratio: float = 0.6
+    friction: float = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Battery:
+    """A lithium pack and everything between it and the shafts."""
+
+    cells: int
+    capacity_ah: float
+    cell_full_v: float = 4.2
+    cell_nominal_v: float = 3.7
+    cell_empty_v: float = 3.3
+    resistance_ohm: float  # of the whole pack
+    drive_efficiency: float  # motor and speed controller, shaft power / electrical power
+    avionics_w: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What the flight controller never asks for more of."""
+
+    tilt_deg: float = 35.0
+    horizontal_speed_mps: float = 12.0
+    climb_mps: float = 3.0
+    descent_mps: float = 1.5
+    vertical_acceleration_mps2: float = 4.0
+    yaw_rate_degps: float = 90.0
+    tilt_rate_degps: float = 220.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnergyRegression:
+    """Coefficients of the multiple regression of rotor power; speeds in km/h, as published.
+
+    P = b1 v + b2 a + b3 v a + b4 vz + b5 az + b6 vz az + b7 m + b9, with horizontal v, a and
+    vertical vz, az as magnitudes in km/h and km/h/s, and m the payload in grams
+    (Tseng et al., arXiv 1703.10049). The wind term b8 is zero here: there is no wind.
+    """
+
+    b1: float
+    b2: float
+    b3: float
+    b4: float
+    b5: float
+    b6: float
+    b7: float
+    b9: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleProfile:
+    """A quadrotor. Body axes: x forward, y right, z down (FRD) unless named otherwise."""
+
+    name: str
+    description: str = ""
+    mass_kg: float  # ready to fly, without payload
+    extra_payload_kg: float = 0.0  # carried at the centre of mass
+    inertia_kgm2: Triple  # Ixx, Iyy, Izz
+    body_box_m: Triple  # length, width, height round the centre of mass, propellers included
+    camera_mount_flu_m: Triple  # forward, left, up of the centre of mass
+    rotor: Rotor
+    drag: Drag
+    gear: Gear
+    battery: Battery
+    limits: Limits
+    energy: EnergyRegression
+
+    def __post_init__(self) -> None:
+        self._check_lift()
+        self._check_physical()
+
+    def _check_lift(self) -> None:
+        ratio = self.max_thrust_n / (self.total_mass_kg * GRAVITY_MPS2)
+        if not ratio >= MIN_THRUST_TO_WEIGHT:
+            raise ConfigError(
+                f"vehicle {self.name!r} cannot fly: {self.max_thrust_n:.1f} N of thrust for "
+                f"{self.mass_kg:g} kg + {self.extra_payload_kg:g} kg payload "
+                f"({self.total_mass_kg * GRAVITY_MPS2:.1f} N) is a thrust-to-weight ratio of "
+                f"{ratio:.2f}, at least {MIN_THRUST_TO_WEIGHT:g} is needed"
+            )
+
+    def _check_physical(self) -> None:
+        positive = {
+            "mass_kg": self.mass_kg,
+            "inertia_kgm2": min(self.inertia_kgm2),
+            "body_box_m": min(self.body_box_m),
+            "gear.height_m": self.gear.height_m,
+            "battery.cells": self.battery.cells,
+            "battery.capacity_ah": self.battery.capacity_ah,
+            "battery.drive_efficiency": self.battery.drive_efficiency,
+            "limits.tilt_deg": self.limits.tilt_deg,
+        }
+        for key, value in positive.items():
+            if value <= 0.0:
+                raise ConfigError(f"must be above zero, is {value:g}", key=key)
+        if self.extra_payload_kg < 0.0:
+            raise ConfigError(
+                f"must not be negative, is {self.extra_payload_kg:g}", key="extra_payload_kg"
+            )
+        if self.limits.tilt_deg > 60.0:
+            raise ConfigError(
+                f"must be at most 60, is {self.limits.tilt_deg:g}", key="limits.tilt_deg"
+            )
+        nominal_v = self.battery.cells * self.battery.cell_nominal_v
+        if self.rotor.full_throttle_voltage_v > nominal_v:
+            raise ConfigError(
+                f"rotor.max_rpm needs {self.rotor.full_throttle_voltage_v:.1f} V at the motor, "
+                f"the battery has {nominal_v:.1f} V"
+            )
+
+    @property
+    def total_mass_kg(self) -> float:
+        """Take-off mass, kg."""
+        return self.mass_kg + self.extra_payload_kg
+
+    @property
+    def max_thrust_n(self) -> float:
+        """Static thrust of all four rotors, N."""
+        return 4.0 * self.rotor.max_thrust_n
+
+    @property
+    def gear_stiffness_npm(self) -> float:
+        """Spring rate of one leg, N/m."""
+        return self.total_mass_kg / 4.0 * self.gear.natural_frequency_radps**2
+
+    @property
+    def rest_height_m(self) -> float:
+        """Height of the centre of mass above the ground when standing on its legs, m."""
+        sag_m = GRAVITY_MPS2 / self.gear.natural_frequency_radps**2
+        return self.gear.height_m - sag_m
+
+
+def profile_names() -> list[str]:
+    """The names of the profiles that come with the package."""
+    return sorted(path.stem for path in _PROFILES.glob("*.toml"))
+
+
+def load_profile(name_or_path: str) -> VehicleProfile:
+    """A shipped profile by name, or any profile by the path of its TOML file.
+
+    Raises:
+        UnknownName: neither a shipped profile nor a TOML path.
+        ConfigError: the file cannot be read, or describes no vehicle that can fly.
+    """
+    if name_or_path in profile_names():
+        return load_toml(_PROFILES / f"{name_or_path}.toml", VehicleProfile)
+    if name_or_path.endswith(".toml") or "/" in name_or_path:
+        return load_toml(Path(name_or_path), VehicleProfile)
+    raise UnknownName("vehicle", name_or_path, profile_names())
