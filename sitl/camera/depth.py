@@ -20,10 +20,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mavfi_cli.core.frames import rotation_matrix
+from sitl.control.compiled import compiled
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -33,6 +33,7 @@ NOTHING = 255
 MAX_RANGE_M = 25.5
 
 _NEAR_M = 1e-6
+_TOUCHING_M = 1e-3
 _INFINITY = math.inf
 _EDGES = np.array(
     [[a, a | bit] for bit in (1, 2, 4) for a in range(8) if not a & bit], dtype=np.int64
@@ -79,10 +80,17 @@ def focal_length_px(columns: int, hfov_rad: float) -> float:
     return columns / 2.0 / math.tan(hfov_rad / 2.0)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _render(  # noqa: D103
-    boxes, position, rotation, focal_px, max_range_m, edges, depth, image
-):  # type: ignore[no-untyped-def]
+@compiled
+def _render(
+    boxes: Vector,
+    position: Vector,
+    rotation: Vector,
+    focal_px: float,
+    max_range_m: float,
+    edges: NDArray[np.int64],
+    depth: Vector,
+    image: Image,
+) -> None:
     if not np.isfinite(position).all() or not np.isfinite(rotation).all():
         image[:] = NOTHING
         return
@@ -91,9 +99,14 @@ def _render(  # noqa: D103
     window = np.empty(4, np.int64)
     for box in range(boxes.shape[0]):
         _corners_in_camera(boxes[box], position, rotation, corners)
-        if corners[:, 0].max() >= 0.0 and corners[:, 0].min() <= max_range_m:
+        if _touches(boxes[box], position):
+            window[:] = 0
+            window[1], window[3] = depth.shape
+        elif corners[:, 0].max() < 0.0 or corners[:, 0].min() > max_range_m:
+            continue
+        else:
             _window(corners, edges, focal_px, depth.shape, window)
-            _paint(boxes[box], position, rotation, focal_px, window, depth)
+        _paint(boxes[box], position, rotation, focal_px, window, depth)
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             level = math.inf
@@ -102,8 +115,8 @@ def _render(  # noqa: D103
             image[row, column] = NOTHING if level >= NOTHING else np.uint8(level)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _ground(position, rotation, focal_px, depth):  # type: ignore[no-untyped-def]
+@compiled
+def _ground(position: Vector, rotation: Vector, focal_px: float, depth: Vector) -> None:
     rows, columns = depth.shape
     for row in range(rows):
         up = (rows / 2.0 - row - 0.5) / focal_px
@@ -113,8 +126,8 @@ def _ground(position, rotation, focal_px, depth):  # type: ignore[no-untyped-def
             depth[row, column] = max(0.0, position[2]) / -dz if dz < 0.0 else _INFINITY
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _corners_in_camera(box, position, rotation, corners):  # type: ignore[no-untyped-def]
+@compiled
+def _corners_in_camera(box: Vector, position: Vector, rotation: Vector, corners: Vector) -> None:
     for corner in range(8):
         x = box[3 if corner & 1 else 0] - position[0]
         y = box[4 if corner & 2 else 1] - position[1]
@@ -125,8 +138,23 @@ def _corners_in_camera(box, position, rotation, corners):  # type: ignore[no-unt
             )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _window(corners, edges, focal_px, shape, window):  # type: ignore[no-untyped-def]
+@compiled
+def _touches(box: Vector, position: Vector) -> bool:
+    """Whether the optical centre is in the box, or so near that its projection degenerates."""
+    for axis in range(3):
+        if position[axis] < box[axis] - _TOUCHING_M or position[axis] > box[axis + 3] + _TOUCHING_M:
+            return False
+    return True
+
+
+@compiled
+def _window(
+    corners: Vector,
+    edges: NDArray[np.int64],
+    focal_px: float,
+    shape: tuple[int, int],
+    window: NDArray[np.int64],
+) -> None:
     """Rows and columns (first, end, first, end) that can see the box; a pixel to spare.
 
     The box's part beyond the near plane is convex, with corners in front and cut edges as its
@@ -156,8 +184,15 @@ def _window(corners, edges, focal_px, shape, window):  # type: ignore[no-untyped
     window[3] = int(min(max(last + 2.0, 0.0), columns))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _paint(box, position, rotation, focal_px, window, depth):  # type: ignore[no-untyped-def]
+@compiled
+def _paint(
+    box: Vector,
+    position: Vector,
+    rotation: Vector,
+    focal_px: float,
+    window: NDArray[np.int64],
+    depth: Vector,
+) -> None:
     rows, columns = depth.shape
     for row in range(window[0], window[1]):
         up = (rows / 2.0 - row - 0.5) / focal_px

@@ -1,0 +1,77 @@
+"""When touching the ground is a landing, and when it is a crash."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandingLimits:
+    """A touch within these, while landing or disarmed, is a landing.
+
+    PX4 lands at 0.7 m/s (MPC_LAND_SPEED); the limits leave room for a hard landing on level
+    legs and none for a fall or for touching down at cruise speed.
+    """
+
+    sink_mps: float = 2.0
+    horizontal_mps: float = 1.5
+    tilt_rad: float = math.radians(35.0)
+    airborne_m: float = 0.3  # the lowest corner above this: the vehicle is in the air
+
+
+@dataclass(slots=True, kw_only=True)
+class GroundRule:
+    """Follows the vehicle from the ground into the air and back.
+
+    Contact before the vehicle was ever airborne is standing on the ground. Contact afterwards
+    is a crash unless the flight controller was landing (or taking off) or disarmed, and the
+    touch stayed within the limits. The speed that counts is the one just before the touch.
+    """
+
+    half_m: tuple[float, float, float]  # half sides of the body
+    limits: LandingLimits
+    airborne: bool = False
+    _velocity_before_mps: Vector | None = None  # (3,) ENU
+
+    def crashed(
+        self,
+        position_enu_m: Vector,
+        quaternion_flu_enu: Vector,
+        velocity_enu_mps: Vector,
+        *,
+        on_ground: bool,
+        may_land: bool,
+    ) -> bool:
+        """Whether the newest pose is a crash into the ground; call it once per observation."""
+        lowest_m, tilt_rad = self._attitude(position_enu_m, quaternion_flu_enu)
+        before = self._velocity_before_mps
+        velocity = velocity_enu_mps if before is None else before
+        self._velocity_before_mps = velocity_enu_mps.copy()
+        if lowest_m > self.limits.airborne_m and not on_ground:
+            self.airborne = True
+            return False
+        if not self.airborne or not (on_ground or lowest_m <= 0.0):
+            return False
+        self.airborne = False
+        return not (may_land and self._is_gentle(velocity, tilt_rad))
+
+    def _attitude(self, position: Vector, quaternion: Vector) -> tuple[float, float]:
+        """Height of the body's lowest corner, m, and tilt of its up axis, rad."""
+        w, x, y, z = quaternion.tolist()
+        up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+        reach = sum(abs(u) * half for u, half in zip(up, self.half_m, strict=True))
+        return float(position[2]) - reach, math.acos(max(-1.0, min(1.0, up[2])))
+
+    def _is_gentle(self, velocity: Vector, tilt_rad: float) -> bool:
+        limits = self.limits
+        return (
+            -velocity[2] <= limits.sink_mps
+            and math.hypot(velocity[0], velocity[1]) <= limits.horizontal_mps
+            and tilt_rad <= limits.tilt_rad
+        )

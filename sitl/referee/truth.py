@@ -1,0 +1,92 @@
+"""The truth log: what really happened, one row a control tick, and its files."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import RecordError
+
+COLUMNS: dict[str, slice] = {
+    "stamp_s": slice(0, 1),
+    "position_enu_m": slice(1, 4),
+    "velocity_enu_mps": slice(4, 7),
+    "quaternion": slice(7, 11),  # w x y z, body FLU -> ENU
+    "clearance_m": slice(11, 12),
+    "power_regression_w": slice(12, 13),
+    "power_propeller_w": slice(13, 14),
+    "armed": slice(14, 15),
+    "on_ground": slice(15, 16),
+}
+_FLAGS = ("armed", "on_ground")
+_WIDTH = 16
+
+
+class TruthLog:
+    """Rows of truth in one growing array."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((1024, _WIDTH))
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, *parts: float | NDArray[np.float64]) -> None:
+        """Add one row: the columns in the order of `COLUMNS`."""
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        row = self._rows[self._count]
+        for part, place in zip(parts, COLUMNS.values(), strict=True):
+            row[place] = part
+        self._count += 1
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The log as named arrays, (n,) or (n, 3 or 4); flags are boolean."""
+        rows = self._rows[: self._count]
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, place in COLUMNS.items():
+            column = rows[:, place]
+            arrays[name] = (column[:, 0] if column.shape[1] == 1 else column).copy()
+        for name in _FLAGS:
+            arrays[name] = arrays[name] != 0.0
+        return arrays
+
+
+def save_truth(folder: Path, log: TruthLog, report: Mapping[str, Any]) -> None:
+    """Write truth.npz and then truth.json into a folder, each whole or not at all.
+
+    Raises:
+        RecordError: the folder cannot be made or written (no space, no permission).
+    """
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = dict(log.arrays())
+    np.savez_compressed(buffer, **arrays)
+    text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_whole(folder / "truth.npz", buffer.getvalue())
+        _write_whole(folder / "truth.json", text.encode())
+    except OSError as error:
+        raise RecordError(f"{folder}: cannot write the truth log: {error.strerror}") from None
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """A kill at any moment leaves the old file or the new one."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
