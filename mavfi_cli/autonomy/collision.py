@@ -1,0 +1,246 @@
+"""Collision check: the whole remaining trajectory against the map, with FCL on the octree.
+
+The vehicle is a sphere. It is placed along the reference that the tracker will follow, densely
+enough that the spheres cover the swept capsule: spheres of radius sqrt(r^2 + (s/2)^2) at spacing s
+contain the capsule of radius r. Unknown space is free, as in the reference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import fcl
+import numpy as np
+
+from mavfi_cli.autonomy.compiled import compiled
+from mavfi_cli.autonomy.occupancy import MapSnapshot
+from mavfi_cli.autonomy.trajectory import locate
+from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory
+
+MAX_SAMPLES = 4096
+MAX_SAMPLES_A_PIECE = 256
+LONGEST_DURATION_S = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollisionParams:
+    """Size of the vehicle and density of the check.
+
+    The radius is the body's half diagonal (about 0.3 m for `solo`) and a margin for tracking
+    error, depth quantisation (0.1 m) and half a voxel. The reference uses a box of 1.5 m.
+    """
+
+    radius_m: float = 0.9
+    spacing_m: float = 0.2
+    body_radius_m: float = 0.35  # never shrunk below, even where the vehicle starts in contact
+    farthest_m: float = 1000.0  # a waypoint farther than this from the first one is unflyable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollisionState:
+    """What the check remembers from one call to the next."""
+
+    future_collision_seq: int = 0
+    foreseen_on_seq: int | None = None  # trajectory on which a collision stands foreseen
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollisionInputs:
+    """One call's worth of messages."""
+
+    stamp_s: float
+    snapshot: MapSnapshot
+    trajectory: Trajectory | None
+    time_s: float  # present point on the trajectory, from its first waypoint
+
+
+def step(
+    state: CollisionState, inputs: CollisionInputs, params: CollisionParams
+) -> tuple[CollisionState, CollisionReport]:
+    """Check what remains of the trajectory.
+
+    The report's time_to_collision_s runs from `inputs.time_s` along the trajectory to the first
+    contact, inf where there is none. future_collision_seq grows by one when a collision is
+    foreseen on a trajectory that was free, or not checked, before. A waypoint that is not finite
+    or farther than `farthest_m` counts as a collision at its time: it cannot be flown.
+    """
+    time_s = math.inf
+    if inputs.trajectory is not None:
+        time_s = time_to_collision(inputs.snapshot, inputs.trajectory, inputs.time_s, params)
+    collision = math.isfinite(time_s)
+    seq, on_seq = state.future_collision_seq, None
+    if collision and inputs.trajectory is not None:
+        on_seq = inputs.trajectory.trajectory_seq
+        if state.foreseen_on_seq != on_seq:
+            seq = (seq + 1) & 0x7FFF_FFFF
+    report = CollisionReport(
+        stamp_s=inputs.stamp_s,
+        collision=collision,
+        time_to_collision_s=time_s,
+        future_collision_seq=seq,
+    )
+    return CollisionState(future_collision_seq=seq, foreseen_on_seq=on_seq), report
+
+
+def time_to_collision(
+    snapshot: MapSnapshot, trajectory: Trajectory, time_s: float, params: CollisionParams
+) -> float:
+    """Time from `time_s` along the trajectory to the first contact, s; inf where it is free."""
+    points = np.empty((MAX_SAMPLES, 3))
+    times_s = np.empty(MAX_SAMPLES)
+    count, unflyable_s = sample_ahead(
+        trajectory.waypoints,
+        trajectory.durations_s,
+        time_s,
+        params.spacing_m,
+        params.farthest_m,
+        points,
+        times_s,
+    )
+    if not snapshot.payload:
+        return float(unflyable_s)
+    hit = _first_contact(snapshot, points[:count], params)
+    return float(times_s[hit]) if hit is not None else float(unflyable_s)
+
+
+class SphereProbe:
+    """A sphere that can be tried at points of a map."""
+
+    def __init__(self, snapshot: MapSnapshot, radius_m: float) -> None:
+        tree = fcl.OcTree(snapshot.resolution_m, snapshot.signed_bytes())
+        self._map = fcl.CollisionObject(tree)
+        self._sphere = fcl.CollisionObject(fcl.Sphere(radius_m))
+        self._request = fcl.CollisionRequest()
+
+    def touches(self, point_enu_m: FloatArray) -> bool:
+        """True where the sphere centred on the point (3,) meets an occupied voxel."""
+        self._sphere.setTranslation(point_enu_m)
+        found = fcl.collide(self._sphere, self._map, self._request, fcl.CollisionResult())
+        return bool(found)
+
+
+def _first_contact(
+    snapshot: MapSnapshot, points: FloatArray, params: CollisionParams
+) -> int | None:
+    """Index of the first point (n, 3) in contact, or None.
+
+    A vehicle that already is within the radius of an obstacle may leave: until a first point is
+    free at full radius, and no farther than two radii from the start, points are tried with the
+    body's radius only.
+    """
+    padding_m = 0.5 * params.spacing_m
+    probe = SphereProbe(snapshot, math.hypot(params.radius_m, padding_m))
+    body: SphereProbe | None = None
+    escaping = True
+    for index, point in enumerate(points):
+        if not probe.touches(point):
+            escaping = False
+            continue
+        if not escaping:
+            return index
+        if float(np.linalg.norm(point - points[0])) > 2.0 * params.radius_m:
+            return index
+        body = body or SphereProbe(snapshot, math.hypot(params.body_radius_m, padding_m))
+        if body.touches(point):
+            return index
+    return None
+
+
+@compiled
+def sample_ahead(
+    waypoints: FloatArray,
+    durations_s: FloatArray,
+    time_s: float,
+    spacing_m: float,
+    farthest_m: float,
+    points: FloatArray,
+    times_s: FloatArray,
+) -> tuple[int, float]:
+    """Points of the remaining reference at most `spacing_m` apart, and when they are reached.
+
+    Gaps between the end of one waypoint's motion and the next waypoint are bridged straight.
+    Every loop is bounded: by the number of waypoints, by MAX_SAMPLES_A_PIECE, by `points`.
+
+    Returns:
+        Number of samples written, and the time of the first unflyable point (inf where none).
+    """
+    current, elapsed = locate(durations_s, time_s)
+    count, now = 0, 0.0
+    if current < 0:
+        return 0, math.inf
+    for index in range(current, min(waypoints.shape[0], durations_s.shape[0])):
+        p, v, a = waypoints[index, 0:3], waypoints[index, 4:7], waypoints[index, 7:10]
+        start = elapsed if index == current else 0.0
+        duration = durations_s[index]
+        if not duration > start:
+            duration = start
+        duration = min(duration, start + LONGEST_DURATION_S)
+        span = duration - start
+        speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+        pull = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+        reach = (speed + pull * start) * span + 0.5 * pull * span * span
+        pieces = _pieces(reach, spacing_m)
+        for piece in range(pieces + 1):
+            t = start + span * piece / pieces
+            x = p[0] + v[0] * t + 0.5 * a[0] * t * t
+            y = p[1] + v[1] * t + 0.5 * a[1] * t * t
+            z = p[2] + v[2] * t + 0.5 * a[2] * t * t
+            at_s = now + t - start
+            if not _flyable(waypoints[current], x, y, z, farthest_m):
+                return count, at_s
+            count = _bridge(points, times_s, count, x, y, z, at_s, spacing_m)
+        now += span
+    return count, math.inf
+
+
+@compiled
+def _pieces(length_m: float, spacing_m: float) -> int:
+    """Pieces no longer than the spacing, at least one and at most MAX_SAMPLES_A_PIECE."""
+    wanted = length_m / spacing_m
+    if not wanted < MAX_SAMPLES_A_PIECE:
+        return MAX_SAMPLES_A_PIECE
+    return max(1, math.ceil(wanted))
+
+
+@compiled
+def _flyable(first: FloatArray, x: float, y: float, z: float, farthest_m: float) -> bool:
+    limit = farthest_m
+    return (
+        abs(x - first[0]) <= limit and abs(y - first[1]) <= limit and abs(z - first[2]) <= limit
+    )
+
+
+@compiled
+def _bridge(
+    points: FloatArray,
+    times_s: FloatArray,
+    count: int,
+    x: float,
+    y: float,
+    z: float,
+    at_s: float,
+    spacing_m: float,
+) -> int:
+    """Append a point, and points between it and the last one where that is far away."""
+    pieces = 1
+    if count > 0:
+        last = points[count - 1]
+        dx, dy, dz = x - last[0], y - last[1], z - last[2]
+        gap = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if gap < 1e-9:
+            return count
+        pieces = _pieces(gap, spacing_m)
+    base = max(count - 1, 0)
+    for piece in range(1, pieces + 1):
+        if count >= points.shape[0]:
+            return count
+        share = piece / pieces
+        if piece == pieces:
+            points[count, 0], points[count, 1], points[count, 2] = x, y, z
+        else:
+            for axis, target in enumerate((x, y, z)):
+                points[count, axis] = points[base, axis] + share * (target - points[base, axis])
+        times_s[count] = at_s
+        count += 1
+    return count

@@ -1,0 +1,243 @@
+"""Obstacle grid: the map's occupied voxels, dilated by the planning radius, for fast segment tests.
+
+A voxel is blocked where some point of it is closer than the radius to some point of an occupied
+voxel, so a path through free voxels keeps the radius from everything that is mapped (it may keep
+up to one voxel diagonal more). Unknown space is free, as in the reference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.autonomy.compiled import compiled
+from mavfi_cli.autonomy.occupancy import MapSnapshot
+from mavfi_cli.autonomy.octree import occupied_leaves
+from mavfi_cli.core.types import FloatArray
+
+Blocked = NDArray[np.uint8]
+
+MAX_VOXELS = 60_000_000  # bounds the memory that a corrupted map or bound can ask for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObstacleGrid:
+    """Blocked voxels in a box around the obstacles; outside it, all of `bounds_enu_m` is free."""
+
+    blocked: Blocked  # (nx, ny, nz), 1 where the vehicle's centre must not be
+    origin_enu_m: FloatArray  # (3,) lower corner of voxel (0, 0, 0)
+    resolution_m: float
+    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax; leaving it is blocked
+    radius_m: float
+
+    def point_free(self, point_enu_m: FloatArray) -> bool:
+        """True where the vehicle's centre may be."""
+        return self.segment_free(point_enu_m, point_enu_m)
+
+    def segment_free(self, start_enu_m: FloatArray, end_enu_m: FloatArray) -> bool:
+        """True where the vehicle's centre may fly straight from start to end, each (3,)."""
+        s, e = start_enu_m, end_enu_m
+        free: bool = segment_free(
+            self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m,
+            float(s[0]), float(s[1]), float(s[2]), float(e[0]), float(e[1]), float(e[2]),
+        )  # fmt: skip
+        return free
+
+    def path_free(self, points_enu_m: FloatArray) -> bool:
+        """True where every straight piece between consecutive points (n, 3) is free."""
+        free: bool = path_free(
+            self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m,
+            np.ascontiguousarray(points_enu_m),
+        )  # fmt: skip
+        return free
+
+
+def build(snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> ObstacleGrid:
+    """The grid of a map inside `bounds_enu_m` (6,), dilated by `radius_m`.
+
+    Occupied voxels outside the bounds count as far as their dilation reaches in.
+    """
+    resolution = snapshot.resolution_m
+    reach = math.ceil(radius_m / resolution) + 1
+    leaves = occupied_leaves(snapshot)
+    low, size = _extent(leaves, bounds_enu_m, resolution, reach)
+    blocked = np.zeros(tuple(size), np.uint8)
+    if blocked.size and len(leaves):
+        occupied = np.zeros_like(blocked)
+        _rasterise(leaves, low, occupied)
+        _dilate(occupied, run_half_widths(radius_m, resolution), blocked)
+    return ObstacleGrid(
+        blocked=blocked,
+        origin_enu_m=low * resolution,
+        resolution_m=resolution,
+        bounds_enu_m=np.asarray(bounds_enu_m, np.float64),
+        radius_m=radius_m,
+    )
+
+
+def _extent(
+    leaves: NDArray[np.int64], bounds: FloatArray, resolution: float, reach: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Lower voxel index (3,) and size (3,) of the box that dilated obstacles can reach."""
+    if not len(leaves):
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    low = leaves[:, :3].min(axis=0) - reach
+    high = (leaves[:, :3] + leaves[:, 3:]).max(axis=0) + reach
+    # One reach beyond the bounds, so that obstacles just outside still dilate inwards.
+    low = np.maximum(low, np.floor(bounds[:3] / resolution).astype(np.int64) - reach)
+    high = np.minimum(high, np.ceil(bounds[3:] / resolution).astype(np.int64) + reach)
+    size = np.maximum(high - low, 0)
+    if float(np.prod(size.astype(np.float64))) > MAX_VOXELS:
+        raise ValueError(f"obstacle grid of {size.tolist()} voxels is too large")
+    return low, size
+
+
+def run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
+    """Half height in z of the dilation for each column offset (dx, dy), (w, w); -1 where none.
+
+    Offset k between two voxels leaves a gap of max(|k| - 1, 0) voxels between them.
+    """
+    reach = math.ceil(radius_m / resolution_m) + 1
+    offsets = np.abs(np.arange(-reach, reach + 1))
+    gap = np.maximum(offsets - 1, 0) * resolution_m
+    widths = np.full((len(offsets), len(offsets)), -1, np.int64)
+    for i, gap_x in enumerate(gap):
+        for j, gap_y in enumerate(gap):
+            reached = np.hypot(np.hypot(gap, gap_y), gap_x) < radius_m
+            if reached.any():
+                widths[i, j] = offsets[reached].max()
+    return widths
+
+
+@compiled
+def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Blocked) -> None:
+    """Set the voxels of every leaf (x, y, z, size, size, size) that lie in the grid."""
+    nx, ny, nz = occupied.shape
+    for i in range(leaves.shape[0]):
+        x, y, z = leaves[i, 0] - low[0], leaves[i, 1] - low[1], leaves[i, 2] - low[2]
+        for m in range(max(x, 0), min(x + leaves[i, 3], nx)):
+            for j in range(max(y, 0), min(y + leaves[i, 4], ny)):
+                for k in range(max(z, 0), min(z + leaves[i, 5], nz)):
+                    occupied[m, j, k] = 1
+
+
+@compiled
+def _dilate(occupied: Blocked, widths: NDArray[np.int64], blocked: Blocked) -> None:
+    """Spread every occupied run of z over its neighbour columns, by run, not by voxel.
+
+    Walls are upright, so one run stands for a whole column of them.
+    """
+    nx, ny, nz = occupied.shape
+    reach = widths.shape[0] // 2
+    for x in range(nx):
+        for y in range(ny):
+            z = 0
+            while z < nz:
+                if occupied[x, y, z] == 0:
+                    z += 1
+                    continue
+                end = z
+                while end < nz and occupied[x, y, end] == 1:
+                    end += 1
+                for i in range(max(x - reach, 0), min(x + reach + 1, nx)):
+                    for j in range(max(y - reach, 0), min(y + reach + 1, ny)):
+                        width = widths[i - x + reach, j - y + reach]
+                        if width >= 0:
+                            blocked[i, j, max(z - width, 0) : min(end + width, nz)] = 1
+                z = end
+
+
+@compiled
+def segment_free(
+    blocked: Blocked,
+    origin: FloatArray,
+    resolution: float,
+    bounds: FloatArray,
+    x0: float,
+    y0: float,
+    z0: float,
+    x1: float,
+    y1: float,
+    z1: float,
+) -> bool:
+    """True where a straight segment stays in the bounds and meets no blocked voxel.
+
+    Traverses exactly the voxels that the segment crosses (Amanatides and Woo 1987). Ends that
+    are not finite are not free.
+    """
+    # Written so that NaN fails every comparison.
+    if not (bounds[0] <= x0 <= bounds[3] and bounds[0] <= x1 <= bounds[3]):
+        return False
+    if not (bounds[1] <= y0 <= bounds[4] and bounds[1] <= y1 <= bounds[4]):
+        return False
+    if not (bounds[2] <= z0 <= bounds[5] and bounds[2] <= z1 <= bounds[5]):
+        return False
+    nx, ny, nz = blocked.shape
+    if nz == 0 or ny == 0 or nx == 0:
+        return True
+    sx, sy, sz = (x0 - origin[0]) / resolution, (y0 - origin[1]) / resolution, (z0 - origin[2]) / resolution
+    ex, ey, ez = (x1 - origin[0]) / resolution, (y1 - origin[1]) / resolution, (z1 - origin[2]) / resolution
+    i, j, k = math.floor(sx), math.floor(sy), math.floor(sz)
+    steps = abs(math.floor(ex) - i) + abs(math.floor(ey) - j) + abs(math.floor(ez) - k)
+    dx, dy, dz = ex - sx, ey - sy, ez - sz
+    step_x, step_y, step_z = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
+    next_x = ((i + (dx > 0)) - sx) / dx if dx != 0.0 else math.inf
+    next_y = ((j + (dy > 0)) - sy) / dy if dy != 0.0 else math.inf
+    next_z = ((k + (dz > 0)) - sz) / dz if dz != 0.0 else math.inf
+    delta_x = abs(1.0 / dx) if dx != 0.0 else math.inf
+    delta_y = abs(1.0 / dy) if dy != 0.0 else math.inf
+    delta_z = abs(1.0 / dz) if dz != 0.0 else math.inf
+    for _ in range(steps + 1):
+        if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and blocked[i, j, k] == 1:
+            return False
+        if next_x <= next_y and next_x <= next_z:
+            i += step_x
+            next_x += delta_x
+        elif next_y <= next_z:
+            j += step_y
+            next_y += delta_y
+        else:
+            k += step_z
+            next_z += delta_z
+    return True
+
+
+@compiled
+def path_free(
+    blocked: Blocked,
+    origin: FloatArray,
+    resolution: float,
+    bounds: FloatArray,
+    points: FloatArray,
+) -> bool:
+    """`segment_free` along a whole polyline (n, 3)."""
+    for i in range(points.shape[0] - 1):
+        if not segment_free(
+            blocked, origin, resolution, bounds,
+            points[i, 0], points[i, 1], points[i, 2],
+            points[i + 1, 0], points[i + 1, 1], points[i + 1, 2],
+        ):  # fmt: skip
+            return False
+    return True
+
+
+def blend(
+    grid: ObstacleGrid, inner: ObstacleGrid, centre_enu_m: FloatArray, radius_m: float
+) -> Blocked:
+    """The blocked voxels of `grid`, but those of `inner` within the radius of the centre."""
+    blocked = grid.blocked.copy()
+    resolution = grid.resolution_m
+    to_inner = np.rint((grid.origin_enu_m - inner.origin_enu_m) / resolution).astype(np.int64)
+    indices = np.indices(blocked.shape, sparse=True)
+    centre = (centre_enu_m - grid.origin_enu_m) / resolution - 0.5
+    near = sum((index - c) ** 2 for index, c in zip(indices, centre, strict=True))
+    chosen = np.argwhere(near <= (radius_m / resolution) ** 2)
+    inside = chosen + to_inner
+    known = ((inside >= 0) & (inside < inner.blocked.shape)).all(axis=1)
+    values = np.zeros(len(chosen), np.uint8)
+    values[known] = inner.blocked[tuple(inside[known].T)]
+    blocked[tuple(chosen.T)] = values
+    return blocked

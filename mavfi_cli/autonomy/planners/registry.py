@@ -1,0 +1,44 @@
+"""Planners by name: ours, and those that other packages register under `mavfi.planners`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.metadata import entry_points
+
+from mavfi_cli.autonomy.planners.base import Planner
+from mavfi_cli.autonomy.planners.rrt import RRT
+from mavfi_cli.autonomy.planners.rrt_connect import RRTConnect
+from mavfi_cli.autonomy.planners.rrt_star import RRTStar
+from mavfi_cli.core.errors import UnknownName
+
+ENTRY_POINT_GROUP = "mavfi.planners"
+
+_OURS: dict[str, Callable[[], Planner]] = {
+    "rrtstar": RRTStar,
+    "rrt": RRT,
+    "rrtconnect": RRTConnect,
+}
+
+
+def names() -> list[str]:
+    """Names of all planners that are there, ours first."""
+    others = {entry.name for entry in entry_points(group=ENTRY_POINT_GROUP)}
+    return [*_OURS, *sorted(others - set(_OURS))]
+
+
+def find(name: str) -> Planner:
+    """The planner of that name with its default settings.
+
+    Case, hyphens, underscores and the star of RRT* do not matter for our own.
+
+    Raises:
+        UnknownName: there is none; names the nearest.
+    """
+    plain = name.lower().replace("*", "star").replace("-", "").replace("_", "")
+    if plain in _OURS:
+        return _OURS[plain]()
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        if entry.name == name:
+            planner: Planner = entry.load()()
+            return planner
+    raise UnknownName("planner", name, names())

@@ -1,0 +1,126 @@
+"""One OMPL search: space, validity, seed and stop condition, the same for all its planners.
+
+Repeatability: OMPL's generators take their seeds from a process-wide sequence when they are
+made. Setting that sequence anew before each search, and making every generator afterwards, makes
+the search a function of problem and seed; OMPL warns that generators made earlier stay as they
+are, but none of those is used. The search stops after a count of iterations, never by time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from ompl import base as ob
+from ompl import util as ou
+
+from mavfi_cli.autonomy.grid import ObstacleGrid, segment_free
+from mavfi_cli.autonomy.planners.base import PlanningProblem, PlanResult, refuse
+from mavfi_cli.core.types import FloatArray
+
+MAX_SEED = 0x7FFF_FFFF
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """How to run an OMPL planner."""
+
+    make: Callable[[Any], Any]  # space information -> configured OMPL planner
+    iterations: int
+    optimise: bool = False  # go on after the first solution until the iterations are used up
+
+
+class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
+    """Segment test on the obstacle grid; holds no reference to OMPL objects."""
+
+    def __init__(self, information: Any, grid: ObstacleGrid) -> None:
+        super().__init__(information)
+        self._arguments = (grid.blocked, grid.origin_enu_m, grid.resolution_m, grid.bounds_enu_m)
+
+    def checkMotion(self, a: Any, b: Any) -> bool:  # noqa: N802
+        """True where the straight motion from state a to state b is free."""
+        free: bool = segment_free(*self._arguments, a[0], a[1], a[2], b[0], b[1], b[2])
+        return free
+
+
+def run(problem: PlanningProblem, seed: int, search: Search) -> PlanResult:
+    """Search from start to goal; a straight line where that is free."""
+    refused = refuse(problem)
+    if refused is not None:
+        return refused
+    start, goal = problem.start_enu_m, problem.goal_enu_m
+    if problem.grid.segment_free(start, goal):
+        return PlanResult(found=True, path_enu_m=np.vstack([start, goal]))
+    ou.setLogLevel(ou.LogLevel.LOG_NONE)
+    ou.RNG.setSeed(seed % MAX_SEED + 1)
+    space, information = _space(problem.grid)
+    definition = ob.ProblemDefinition(information)
+    definition.setStartAndGoalStates(_state(space, start), _state(space, goal), 1e-6)
+    if search.optimise:
+        definition.setOptimizationObjective(ob.PathLengthOptimizationObjective(information))
+    planner = search.make(information)
+    planner.setProblemDefinition(definition)
+    planner.setup()
+    counter = _Counter(search.iterations)
+    planner.solve(ob.PlannerTerminationCondition(counter))
+    return _result(problem, definition, counter.count)
+
+
+class _Counter:
+    """Stop condition: true once it was asked more than `limit` times."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.count = 0
+
+    def __call__(self) -> bool:
+        self.count += 1
+        return self.count > self.limit
+
+
+def _space(grid: ObstacleGrid) -> tuple[Any, Any]:
+    space = ob.RealVectorStateSpace(3)
+    bounds = ob.RealVectorBounds(3)
+    for axis in range(3):
+        bounds.setLow(axis, float(grid.bounds_enu_m[axis]))
+        bounds.setHigh(axis, float(grid.bounds_enu_m[3 + axis]))
+    space.setBounds(bounds)
+    information = ob.SpaceInformation(space)
+    arguments = (grid.blocked, grid.origin_enu_m, grid.resolution_m, grid.bounds_enu_m)
+
+    def valid(state: Any) -> bool:
+        x, y, z = state[0], state[1], state[2]
+        free: bool = segment_free(*arguments, x, y, z, x, y, z)
+        return free
+
+    information.setStateValidityChecker(valid)
+    information.setMotionValidator(_GridMotions(information, grid))
+    information.setup()
+    return space, information
+
+
+def _state(space: Any, point: FloatArray) -> Any:
+    state = space.allocState()
+    for axis in range(3):
+        state[axis] = float(point[axis])
+    return state
+
+
+def _result(problem: PlanningProblem, definition: Any, iterations: int) -> PlanResult:
+    if not definition.hasExactSolution():
+        gap_m = float(np.linalg.norm(problem.goal_enu_m - problem.start_enu_m))
+        if definition.hasApproximateSolution():
+            gap_m = min(gap_m, float(definition.getSolutionDifference()))
+        return PlanResult(
+            found=False,
+            path_enu_m=np.empty((0, 3)),
+            reason=f"no path within {iterations} iterations",
+            nearest_m=gap_m,
+            iterations=iterations,
+        )
+    states = definition.getSolutionPath().getStates()
+    path = np.array([[state[0], state[1], state[2]] for state in states])
+    path[0], path[-1] = problem.start_enu_m, problem.goal_enu_m
+    return PlanResult(found=True, path_enu_m=path, iterations=iterations)

@@ -1,0 +1,285 @@
+"""Smoothing: a path becomes a trajectory that keeps its limits, sampled every 0.5 s.
+
+The path is flown with even accelerations and parabolic corners (see `corners`), then sampled at
+equal times; the samples are the control points of a uniform quadratic B-spline, whose knots are
+the waypoints. Followed as `trajectory` says (p + v t + a t^2 / 2), the waypoints *are* that spline,
+so between them, too:
+
+- speed and acceleration never exceed those of the motion that was sampled: each is an average
+  of it;
+- position and velocity are continuous, and each piece lies in the triangle of three control
+  points, within a T^2 / 8 (9 cm) of the motion;
+- it starts with exactly the given position and velocity and ends at rest on the last point.
+
+Where a piece leaves the free corridor, the corners that it rounds are slowed down, at last to a
+stop on the corner itself, which is on the path that was found free.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.autonomy import corners
+from mavfi_cli.autonomy.corners import Limits, Motion
+from mavfi_cli.autonomy.grid import ObstacleGrid
+from mavfi_cli.autonomy.heading import headings, turn_time_s
+from mavfi_cli.core.types import FloatArray, Trajectory
+
+
+NEGLIGIBLE_MPS = 0.05  # slower than this counts as at rest
+RUN_OUT_RESERVE = 1.02  # stopping distance, with a little to spare for rounding
+SLOWEST_SQUARED = 0.1  # a corner slower than this (squared, m^2/s^2) becomes a stop
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmoothingParams:
+    """Limits and sampling of trajectories.
+
+    v_max, a_max, the yaw rate and the 0.5 s of the samples are the reference's (facts, sections
+    4.1 and 4.6). The shares leave the tracker room to catch up. The vertical limits are those
+    that autopilots commonly have.
+    """
+
+    v_max_mps: float = 3.0
+    a_max_mps2: float = 5.0
+    speed_share: float = 0.9
+    acceleration_share: float = 0.6
+    climb_max_mps: float = 2.0
+    descent_max_mps: float = 1.5
+    yaw_rate_max_radps: float = math.pi / 2.0
+    sample_period_s: float = 0.5
+    corner_cut_m: float = 0.5  # how far a corner may be cut where there is room
+    turn_first_rad: float = math.pi / 4.0  # a larger turn is made at rest, before flying
+    passes_max: int = 40
+
+    @property
+    def limits(self) -> Limits:
+        """What the planned motion keeps to."""
+        return Limits(
+            speed_mps=self.speed_share * self.v_max_mps,
+            climb_mps=self.climb_max_mps,
+            descent_mps=self.descent_max_mps,
+            acceleration_mps2=self.acceleration_share * self.a_max_mps2,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Departure:
+    """The motion that a trajectory takes over from."""
+
+    stamp_s: float
+    velocity_enu_mps: FloatArray  # (3,)
+    yaw_rad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sequence:
+    """The numbers that a trajectory carries."""
+
+    trajectory_seq: int = 0
+    future_collision_seq: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Smoothed:
+    """A trajectory, and whether all of it lies in free space."""
+
+    trajectory: Trajectory
+    free: bool
+
+
+def smooth(
+    path_enu_m: FloatArray,
+    grid: ObstacleGrid | None,
+    departure: Departure,
+    sequence: Sequence,
+    params: SmoothingParams,
+) -> Smoothed:
+    """The trajectory along a free path (n, 3) from its first to its last point.
+
+    It begins with the departure's velocity (cut to v_max). In motion it first runs straight on
+    for the stopping distance, from where it turns to the path as fast as the corner allows; if
+    that stretch is not free, `free` is False, and nothing can be done about it in this place.
+    """
+    velocity = _cut(departure.velocity_enu_mps, params.v_max_mps)
+    path = np.asarray(path_enu_m, np.float64)
+    vertices, free = _with_run_out(path, velocity, grid, params)
+    flight = _Flight(path[0], velocity, departure.yaw_rad, vertices, params)
+    caps = flight.corner_caps()
+    for _ in range(params.passes_max):
+        q, moving, spline = flight.fly(caps)
+        blamed = [c for c in _blocked_corners(spline, moving, grid, params) if q[c] > 0.0]
+        if not blamed:
+            break
+        caps[blamed] = np.where(q[blamed] > SLOWEST_SQUARED, 0.25 * q[blamed], 0.0)
+    free = free and _piecewise_free(spline, grid).all()
+    return Smoothed(trajectory=_waypoints(spline, departure, sequence, params), free=bool(free))
+
+
+def brake(
+    position_enu_m: FloatArray, departure: Departure, sequence: Sequence, params: SmoothingParams
+) -> Trajectory:
+    """Straight on to a stop, as short as the planned acceleration allows, then hold.
+
+    The yaw stays as it is.
+    """
+    velocity = _cut(departure.velocity_enu_mps, params.v_max_mps)
+    vertices = _run_out(position_enu_m, velocity, params)
+    flight = _Flight(position_enu_m, velocity, departure.yaw_rad, vertices, params)
+    spline = flight.fly(flight.corner_caps())[2]
+    trajectory = _waypoints(spline, departure, sequence, params)
+    trajectory.waypoints[:, 3] = departure.yaw_rad
+    return trajectory
+
+
+class _Flight:
+    """A polyline to be flown from a start in motion, as often as its corner speeds change."""
+
+    def __init__(
+        self,
+        start: FloatArray,
+        velocity: FloatArray,
+        yaw_rad: float,
+        vertices: FloatArray,
+        params: SmoothingParams,
+    ) -> None:
+        self._start = start
+        self._velocity = velocity
+        self._yaw_rad = yaw_rad
+        self._params = params
+        self._line = corners.polyline(vertices, params.limits)
+
+    def corner_caps(self) -> FloatArray:
+        """Squared speeds (n,) at which each corner is cut by no more than `corner_cut_m`."""
+        room = 2.0 * self._params.limits.acceleration_mps2 * self._params.corner_cut_m
+        sines = self._line.half_sines
+        caps: FloatArray = room / np.maximum(sines, 1e-6) ** 2
+        return caps
+
+    def fly(self, caps: FloatArray) -> tuple[FloatArray, Motion, FloatArray]:
+        """Squared corner speeds (n,), motion, and control points (m, 3) under the caps (n,)."""
+        acceleration = self._params.limits.acceleration_mps2
+        speed = float(np.linalg.norm(self._velocity))
+        q = corners.squared_corner_speeds(self._line, speed, caps, acceleration)
+        moving = corners.motion(self._line, q, self._dwells(q), acceleration)
+        period = self._params.sample_period_s
+        count = math.ceil(moving.duration_s / period) + 2
+        ahead = moving.position(np.arange(count) * period)
+        before = self._start - 0.5 * period * self._velocity
+        return q, moving, np.vstack([before, ahead])
+
+    def _dwells(self, q: FloatArray) -> FloatArray:
+        """How long to wait at each vertex (n,): at corners passed at rest, and to turn there."""
+        line, params = self._line, self._params
+        dwells = np.zeros(len(q))
+        yaw = self._yaw_rad
+        for i, direction in enumerate(line.directions):
+            if q[i] == 0.0:
+                turning = turn_time_s(
+                    yaw, direction, params.turn_first_rad, params.yaw_rate_max_radps
+                )
+                # Two control points on a corner keep the spline on its legs.
+                settling = 2.0 * params.sample_period_s if i > 0 else 0.0
+                dwells[i] = max(turning, settling)
+            if math.hypot(direction[0], direction[1]) >= 0.1:
+                yaw = math.atan2(direction[1], direction[0])
+        return dwells
+
+
+def _cut(velocity: FloatArray, limit: float) -> FloatArray:
+    """The velocity (3,), no faster than the limit; zero where it is not finite or negligible."""
+    velocity = np.asarray(velocity, np.float64)
+    if not np.isfinite(velocity).all():
+        return np.zeros(3)
+    largest = float(np.abs(velocity).max())
+    if largest < NEGLIGIBLE_MPS:
+        return np.zeros(3)
+    speed = largest * float(np.linalg.norm(velocity / largest))
+    return velocity if speed <= limit else velocity / largest * (limit * largest / speed)
+
+
+def _run_out(position: FloatArray, velocity: FloatArray, params: SmoothingParams) -> FloatArray:
+    """Vertices (1 or 2, 3) of going straight on for half a sample, then braking to a stop."""
+    speed = float(np.linalg.norm(velocity))
+    if speed == 0.0:
+        return np.array([position])
+    begin = position + 0.5 * params.sample_period_s * velocity
+    braking_s = 0.5 * speed / params.limits.acceleration_mps2
+    return np.array([begin, begin + RUN_OUT_RESERVE * braking_s * velocity])
+
+
+def _with_run_out(
+    path: FloatArray, velocity: FloatArray, grid: ObstacleGrid | None, params: SmoothingParams
+) -> tuple[FloatArray, bool]:
+    """The vertices to fly, and whether the way on from a start in motion is free.
+
+    From where the vehicle could stop it goes to the farthest path vertex in sight, or, where it
+    sees none, back to the start of the path.
+    """
+    vertices = _run_out(path[0], velocity, params)
+    if len(vertices) == 1:
+        return path, True
+    stop = vertices[-1]
+    if grid is None:
+        return np.vstack([vertices, path[1:]]), True
+    free = grid.segment_free(path[0], stop)
+    for k in range(len(path) - 1, 0, -1):
+        if grid.segment_free(stop, path[k]):
+            return np.vstack([vertices, path[k:]]), free
+    return np.vstack([vertices, path]), free
+
+
+def _blocked_corners(
+    spline: FloatArray, moving: Motion, grid: ObstacleGrid | None, params: SmoothingParams
+) -> list[int]:
+    """Vertices whose rounding belongs to spline pieces that are not free."""
+    period = params.sample_period_s
+    blamed: set[int] = set()
+    ends_s = np.append(moving.starts_s[1:], moving.duration_s)
+    for piece in np.flatnonzero(~_piecewise_free(spline, grid)):
+        # Piece k is made of the control points at (k - 1) T, k T and (k + 1) T.
+        begin_s, end_s = (piece - 1) * period, (piece + 1) * period
+        during = (moving.starts_s <= end_s) & (ends_s >= begin_s) & (moving.corners >= 0)
+        blamed.update(moving.corners[during].astype(int).tolist())
+    return sorted(blamed)
+
+
+def _piecewise_free(spline: FloatArray, grid: ObstacleGrid | None) -> NDArray[np.bool_]:
+    """Which of the spline's pieces (m - 2,) are free, each tried along four chords."""
+    pieces = len(spline) - 2
+    if grid is None:
+        return np.ones(pieces, np.bool_)
+    first, second, third = spline[:-2, None], spline[1:-1, None], spline[2:, None]
+    u = np.linspace(0.0, 1.0, 5)[:, None]
+    points = (
+        0.5 * (1.0 - u) ** 2 * first + (0.5 + u - u * u) * second + 0.5 * u * u * third
+    )  # (m - 2, 5, 3)
+    return np.array([grid.path_free(piece) for piece in points], np.bool_)
+
+
+def _waypoints(
+    spline: FloatArray, departure: Departure, sequence: Sequence, params: SmoothingParams
+) -> Trajectory:
+    """The knots of the spline with control points (m, 3) as a trajectory of m - 1 waypoints."""
+    period = params.sample_period_s
+    velocities = np.diff(spline, axis=0) / period
+    accelerations = np.zeros_like(velocities)
+    accelerations[:-1] = np.diff(velocities, axis=0) / period
+    waypoints = np.empty((len(velocities), 10))
+    waypoints[:, 0:3] = 0.5 * (spline[:-1] + spline[1:])
+    waypoints[:, 3] = headings(
+        waypoints[:, 0:3], departure.yaw_rad, 2, params.yaw_rate_max_radps * period
+    )
+    waypoints[:, 4:7] = velocities
+    waypoints[:, 7:10] = accelerations
+    return Trajectory(
+        stamp_s=departure.stamp_s,
+        waypoints=waypoints,
+        durations_s=np.full(len(waypoints), period),
+        trajectory_seq=sequence.trajectory_seq,
+        future_collision_seq=sequence.future_collision_seq,
+    )

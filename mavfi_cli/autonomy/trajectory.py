@@ -1,0 +1,111 @@
+"""What a sampled trajectory means between its waypoints, in one place for all its consumers.
+
+Waypoint i is followed for durations_s[i]; t seconds into it the reference is
+
+    p = p_i + v_i t + a_i t^2 / 2,   v = v_i + a_i t,   a = a_i,
+
+so acceleration is part of the motion, not an annotation. Yaw turns at an even rate towards the
+next waypoint's, the short way round. After the end the last waypoint's final point is held. A
+duration that is NaN or negative counts as zero; an endless one is followed for ever.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from mavfi_cli.autonomy.compiled import compiled
+from mavfi_cli.core.types import FloatArray, Trajectory
+
+TWO_PI = 2.0 * math.pi
+
+
+def reference_waypoint(trajectory: Trajectory, time_s: float) -> FloatArray:
+    """The reference (10,), in the order of WAYPOINT_FIELDS, `time_s` after the first waypoint.
+
+    Clamped to the trajectory: before it the first waypoint holds, after it the last point, at
+    rest. Corrupted waypoints pass through as they are.
+    """
+    out = np.empty(10)
+    reference(trajectory.waypoints, trajectory.durations_s, time_s, out)
+    return out
+
+
+def waypoint_index(trajectory: Trajectory, time_s: float) -> int:
+    """Index of the waypoint that is followed at that time."""
+    return int(locate(trajectory.durations_s, time_s)[0])
+
+
+def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
+    """The trajectory with one waypoint dropped and its time filled from the next.
+
+    The next waypoint's motion is run backwards over the dropped duration, so the trajectory
+    keeps its timing and joins without a jump. The last waypoint is replaced by rest at the end
+    of the one before it; the only one is left as it is.
+    """
+    waypoints = trajectory.waypoints.copy()
+    last = len(waypoints) - 1
+    if last == 0:
+        return trajectory
+    if index < last:
+        source, time_s = waypoints[index + 1], -float(trajectory.durations_s[index])
+    else:
+        source, time_s = waypoints[last - 1], float(trajectory.durations_s[last - 1])
+    velocity, acceleration = source[4:7], source[7:10]
+    waypoints[index, 0:3] = source[0:3] + velocity * time_s + 0.5 * acceleration * time_s**2
+    waypoints[index, 3] = source[3]
+    waypoints[index, 4:7] = velocity + acceleration * time_s if index < last else 0.0
+    waypoints[index, 7:10] = acceleration if index < last else 0.0
+    return replace(trajectory, waypoints=waypoints)
+
+
+@compiled
+def locate(durations_s: FloatArray, time_s: float) -> tuple[int, float]:
+    """Waypoint that is followed at `time_s`, and the time spent in it; (-1, 0) where none is.
+
+    A time that is NaN counts as zero.
+    """
+    left = time_s if time_s > 0.0 else 0.0
+    last = len(durations_s) - 1
+    for index in range(last + 1):
+        duration = durations_s[index]
+        if not duration > 0.0:
+            duration = 0.0
+        if left < duration:
+            return index, left
+        if index == last:
+            return index, duration
+        left -= duration
+    return -1, 0.0
+
+
+@compiled
+def reference(
+    waypoints: FloatArray, durations_s: FloatArray, time_s: float, out: FloatArray
+) -> None:
+    """Write the reference at `time_s` into `out` (10,); all NaN where there is no waypoint."""
+    index, t = locate(durations_s, time_s)
+    if index < 0 or index >= waypoints.shape[0]:
+        out[:] = math.nan
+        return
+    for axis in range(3):
+        p, v, a = waypoints[index, axis], waypoints[index, 4 + axis], waypoints[index, 7 + axis]
+        out[axis] = p + v * t + 0.5 * a * t * t
+        out[4 + axis] = v + a * t
+        out[7 + axis] = a
+    yaw = waypoints[index, 3]
+    duration = durations_s[index]
+    if index + 1 < waypoints.shape[0] and duration > 0.0:
+        yaw += angle_between(yaw, waypoints[index + 1, 3]) * min(1.0, t / duration)
+    elif t >= duration:  # the end: rest
+        out[4:10] = 0.0
+    out[3] = yaw
+
+
+@compiled
+def angle_between(start_rad: float, end_rad: float) -> float:
+    """The turn from start to end the short way round, in (-pi, pi]; NaN where one is not finite."""
+    turn = (end_rad - start_rad) % TWO_PI
+    return turn - TWO_PI if turn > math.pi else turn
