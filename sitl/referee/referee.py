@@ -206,10 +206,10 @@ class Referee:
             "world": {
                 "name": world.name,
                 "seed": world.seed,
-                "boxes_enu_m": world.boxes_enu_m.tolist(),
-                "bounds_enu_m": world.bounds_enu_m.tolist(),
-                "start_enu_m": world.start_enu_m.tolist(),
-                "goal_enu_m": world.goal_enu_m.tolist(),
+                "boxes": world.boxes_enu_m.tolist(),
+                "bounds": world.bounds_enu_m.tolist(),
+                "start": world.start_enu_m.tolist(),
+                "goal": world.goal_enu_m.tolist(),
             },
         }
 

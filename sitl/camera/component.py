@@ -1,0 +1,228 @@
+"""The depth camera as a MAVLink camera component: commands in, frames out.
+
+It has no clock and no socket: `handle` answers a message, `poll` says what is due at a stamp, so
+the same stamps and messages give the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.link.codec import dialect
+from sitl.autopilot.geodesy import Origin
+from sitl.camera import messages
+from sitl.camera.depth import render_depth
+from sitl.camera.geometry import CameraPose, Optics, camera_pose
+from sitl.camera.schedule import Schedule
+
+Vector = NDArray[np.float64]
+Message = Any  # of pymavlink's `common` dialect
+
+COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
+MAX_RATE_HZ = 50.0  # one frame a control tick
+_HEARTBEAT_S = 1.0
+_HOME = Origin()
+
+_LEGACY_REQUESTS: dict[int, int] = {
+    dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION: dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION,
+    dialect.MAV_CMD_REQUEST_CAMERA_SETTINGS: dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS,
+    dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION,
+    dialect.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS: (dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS),
+}
+
+
+class Camera:
+    """A depth camera on a vehicle in a world.
+
+    Args:
+        world_boxes: (n, 6) xmin ymin zmin xmax ymax zmax, ENU m.
+        columns: image width, pixels.
+        rows: image height, pixels.
+        hfov_rad: horizontal field of view, rad.
+        mount_offset_flu_m: optical centre from the vehicle's position; forward, left, up.
+        rate_hz: frames a second where a client names no interval; at most 50.
+        system: the vehicle's MAVLink system id; commands to others are not heard.
+        origin: where on earth the world's origin is, for the position fields.
+
+    Raises:
+        ConfigError: a size, field of view or rate that cannot be.
+    """
+
+    def __init__(
+        self,
+        world_boxes: Vector,
+        *,
+        columns: int = 64,
+        rows: int = 48,
+        hfov_rad: float = math.pi / 2.0,
+        mount_offset_flu_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        rate_hz: float = 10.0,
+        system: int = 1,
+        origin: Origin = _HOME,
+    ) -> None:
+        if not 0.0 < rate_hz <= MAX_RATE_HZ:
+            raise ConfigError(f"camera rate {rate_hz:g} Hz: must be above 0, to {MAX_RATE_HZ:g}")
+        forward, left, up = (float(c) for c in mount_offset_flu_m)
+        self.optics = Optics(
+            columns=columns, rows=rows, hfov_rad=hfov_rad, mount_offset_flu_m=(forward, left, up)
+        )
+        self.system = system
+        self.images = 0  # taken since boot; also the next image's index
+        self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
+        self._origin = origin
+        self._default_interval_s = 1.0 / rate_hz
+        self._pose: CameraPose | None = None
+        self._stamp_s = 0.0
+        self._heartbeat = Schedule(interval_s=_HEARTBEAT_S)
+        self._frames: Schedule | None = None
+        self._frames_left = 0  # 0: no end
+        self._streams: dict[int, Schedule] = {}
+        self._commands: dict[int, Callable[[Message], int]] = {
+            dialect.MAV_CMD_IMAGE_START_CAPTURE: self._start_capture,
+            dialect.MAV_CMD_IMAGE_STOP_CAPTURE: self._stop_capture,
+            dialect.MAV_CMD_SET_CAMERA_MODE: self._set_mode,
+            dialect.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+        }
+
+    @property
+    def capturing(self) -> bool:
+        """Whether frames are being streamed."""
+        return self._frames is not None
+
+    def handle(self, message: Message) -> list[Message]:
+        """Answer one message; nothing where it is not for a camera."""
+        kind = message.get_type()
+        if kind not in ("COMMAND_LONG", "COMMAND_INT") or message.target_system != self.system:
+            return []
+        if message.target_component == COMPONENT_ID:
+            return self._command(message)
+        if message.target_component == dialect.MAV_COMP_ID_ALL:
+            # The autopilot hears it too: refusing what is meant for it would confuse the sender.
+            answers = self._command(message)
+            accepted = answers[-1].result == dialect.MAV_RESULT_ACCEPTED
+            return answers if accepted else []
+        return []
+
+    def poll(
+        self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
+    ) -> list[Message]:
+        """What is due at a stamp: heartbeat, streams, and a frame from the vehicle's pose.
+
+        Args:
+            stamp_s: the vehicle's boot clock; a step back by a second is taken as a reboot.
+            position_enu_m: (3,) of the vehicle.
+            quaternion_flu_enu: (4,) of the vehicle.
+        """
+        if stamp_s < self._stamp_s - 1.0:
+            self._reboot()
+        self._stamp_s = stamp_s
+        self._pose = camera_pose(self.optics, stamp_s, position_enu_m, quaternion_flu_enu)
+        due = [messages.heartbeat()] if self._heartbeat.due(stamp_s) else []
+        for message_id, stream in self._streams.items():
+            answer = self._request(message_id) if stream.due(stamp_s) else None
+            if answer is not None:
+                due.append(answer)
+        if self._frames is not None and self._frames.due(stamp_s):
+            due += self._take_frame(self._pose)
+        return due
+
+    def _reboot(self) -> None:
+        self._heartbeat.restart()
+        for schedule in [*self._streams.values(), *([self._frames] if self._frames else [])]:
+            schedule.restart()
+
+    def _take_frame(self, pose: CameraPose) -> list[Message]:
+        optics = self.optics
+        image = render_depth(
+            self._boxes,
+            pose.position_enu_m,
+            pose.quaternion_flu_enu,
+            optics.columns,
+            optics.rows,
+            optics.hfov_rad,
+        )
+        frame = messages.frame_messages(image, self.images, pose, self._origin)
+        self.images += 1
+        if self._frames_left:
+            self._frames_left -= 1
+            if not self._frames_left:
+                self._frames = None
+        return frame
+
+    def _command(self, message: Message) -> list[Message]:
+        """The answer to a command: what was asked for, then the acknowledgement."""
+        number = int(message.command)
+        answers: list[Message] = []
+        if number == dialect.MAV_CMD_REQUEST_MESSAGE or number in _LEGACY_REQUESTS:
+            wanted = _LEGACY_REQUESTS.get(number, message.param1)
+            answer = self._request(_whole(wanted))
+            answers = [] if answer is None else [answer]
+            result = dialect.MAV_RESULT_DENIED if answer is None else dialect.MAV_RESULT_ACCEPTED
+        else:
+            act = self._commands.get(number)
+            result = dialect.MAV_RESULT_UNSUPPORTED if act is None else act(message)
+        ack = dialect.MAVLink_command_ack_message(
+            number, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+        )
+        return [*answers, ack]
+
+    def _request(self, message_id: int | None) -> Message | None:
+        """The message of an id as of now; None where the camera has no such thing."""
+        stamp_s = self._stamp_s
+        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION:
+            return messages.information(self.optics, stamp_s)
+        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS:
+            return messages.settings(stamp_s)
+        if message_id == dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION:
+            return messages.storage_information(stamp_s)
+        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS:
+            interval_s = None if self._frames is None else self._frames.interval_s
+            return messages.capture_status(stamp_s, interval_s=interval_s, images=self.images)
+        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS and self._pose is not None:
+            return messages.fov_status(self.optics, self._pose, self._origin)
+        return None
+
+    def _start_capture(self, message: Message) -> int:
+        """IMAGE_START_CAPTURE: param2 interval, s (0: the camera's own), param3 how many."""
+        interval_s, count = float(message.param2), _whole(message.param3)
+        if count is None or count < 0 or interval_s < 0.0 or math.isinf(interval_s):
+            return int(dialect.MAV_RESULT_DENIED)
+        if math.isnan(interval_s) or interval_s == 0.0:
+            interval_s = self._default_interval_s
+        self._frames = Schedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
+        self._frames_left = count
+        return int(dialect.MAV_RESULT_ACCEPTED)
+
+    def _stop_capture(self, _message: Message) -> int:
+        self._frames, self._frames_left = None, 0
+        return int(dialect.MAV_RESULT_ACCEPTED)
+
+    def _set_mode(self, message: Message) -> int:
+        photo = _whole(message.param2) == 0
+        return int(dialect.MAV_RESULT_ACCEPTED if photo else dialect.MAV_RESULT_DENIED)
+
+    def _set_interval(self, message: Message) -> int:
+        """SET_MESSAGE_INTERVAL for what can be requested; 0 and -1 both mean: on request only."""
+        message_id, interval_us = _whole(message.param1), _whole(message.param2)
+        known = message_id is not None and self._request(message_id) is not None
+        if not known or interval_us is None:
+            return int(dialect.MAV_RESULT_DENIED)
+        assert message_id is not None
+        self._streams.pop(message_id, None)
+        if interval_us > 0:
+            interval_s = max(interval_us / 1e6, 1.0 / MAX_RATE_HZ)
+            self._streams[message_id] = Schedule(interval_s=interval_s)
+        return int(dialect.MAV_RESULT_ACCEPTED)
+
+
+def _whole(value: float) -> int | None:
+    """A whole number that came in a float parameter; NaN, the wire's "not given", is 0."""
+    if math.isnan(value):
+        return 0
+    return round(value) if abs(value) < 2**31 else None
