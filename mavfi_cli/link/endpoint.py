@@ -108,8 +108,8 @@ def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> tuple[socket.Address
     """
     try:
         found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)
-    except (OSError, UnicodeError) as error:
-        raise EndpointError(endpoint.url, f"no such host: {error}") from None
+    except (OSError, UnicodeError):
+        raise EndpointError(endpoint.url, f"no such host {endpoint.host!r}") from None
     found.sort(key=lambda entry: entry[0] != socket.AF_INET)
     family, _, _, _, address = found[0]
     return family, str(address[0])

@@ -1,0 +1,94 @@
+"""What differs between autopilots: mode numbers, and what take-off wants.
+
+Sources: PX4 px4_custom_mode.h (main mode in bits 16..23, sub mode in bits 24..31) and ArduCopter's
+mode numbers; both as observed on the wire with PX4 1.17 and ArduCopter 4.5.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from mavfi_cli.link.codec import dialect
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Autopilot:
+    """One autopilot's dialect of modes and commands."""
+
+    name: str
+    modes: dict[str, int]  # mode name -> HEARTBEAT.custom_mode
+    offboard_mode: str  # where it follows our setpoints
+    land_mode: str
+    arming_modes: tuple[str, ...]  # modes to arm in; the first is the one to ask for
+    takeoff_amsl: bool  # NAV_TAKEOFF takes an altitude above sea level, not above home
+    unused: float  # what a command parameter without meaning holds
+
+    def mode_name(self, custom_mode: int) -> str:
+        """The name of a HEARTBEAT.custom_mode, or its number in words."""
+        for name, number in self.modes.items():
+            if number == custom_mode:
+                return name
+        return f"mode {custom_mode}"
+
+    def mode_parameters(self, name: str) -> tuple[float, float]:
+        """Parameters 2 and 3 of MAV_CMD_DO_SET_MODE for a mode of `modes`."""
+        number = self.modes[name]
+        if self is PX4:
+            return float(number >> 16 & 0xFF), float(number >> 24)
+        return float(number), 0.0
+
+
+def _px4(main: int, sub: int = 0) -> int:
+    return main << 16 | sub << 24
+
+
+PX4 = Autopilot(
+    name="PX4",
+    modes={
+        "MANUAL": _px4(1),
+        "ALTCTL": _px4(2),
+        "POSCTL": _px4(3),
+        "AUTO.READY": _px4(4, 1),
+        "AUTO.TAKEOFF": _px4(4, 2),
+        "AUTO.LOITER": _px4(4, 3),
+        "AUTO.MISSION": _px4(4, 4),
+        "AUTO.RTL": _px4(4, 5),
+        "AUTO.LAND": _px4(4, 6),
+        "ACRO": _px4(5),
+        "OFFBOARD": _px4(6),
+        "STABILIZED": _px4(7),
+    },
+    offboard_mode="OFFBOARD",
+    land_mode="AUTO.LAND",
+    arming_modes=("AUTO.LOITER", "AUTO.TAKEOFF", "POSCTL"),
+    takeoff_amsl=True,
+    unused=math.nan,
+)
+
+ARDUCOPTER = Autopilot(
+    name="ArduCopter",
+    modes={
+        "STABILIZE": 0,
+        "ACRO": 1,
+        "ALT_HOLD": 2,
+        "AUTO": 3,
+        "GUIDED": 4,
+        "LOITER": 5,
+        "RTL": 6,
+        "CIRCLE": 7,
+        "LAND": 9,
+        "BRAKE": 17,
+        "SMART_RTL": 21,
+    },
+    offboard_mode="GUIDED",
+    land_mode="LAND",
+    arming_modes=("GUIDED",),
+    takeoff_amsl=False,
+    unused=0.0,
+)
+
+
+def autopilot_of(mav_autopilot: int) -> Autopilot:
+    """By HEARTBEAT.autopilot; one that we do not know is spoken to as PX4."""
+    return ARDUCOPTER if mav_autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA else PX4

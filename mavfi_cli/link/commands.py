@@ -1,0 +1,155 @@
+"""MAVLink's command protocol: send, await the acknowledgement, repeat; no clock of its own.
+
+Source: https://mavlink.io/en/services/command.html. An acknowledgement names the command only, so
+two of the same command never are under way to one component at once.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import Enum
+
+from mavfi_cli.link.codec import Message, dialect
+
+TIMEOUT_S = 0.5
+PROGRESS_TIMEOUT_S = 5.0  # after MAV_RESULT_IN_PROGRESS
+TRIES = 4
+REFUSAL_PAUSE_S = 1.0
+_MAX_WAITING = 64
+
+_RESULTS = {
+    dialect.MAV_RESULT_ACCEPTED: "accepted",
+    dialect.MAV_RESULT_TEMPORARILY_REJECTED: "temporarily rejected",
+    dialect.MAV_RESULT_DENIED: "denied",
+    dialect.MAV_RESULT_UNSUPPORTED: "unsupported",
+    dialect.MAV_RESULT_FAILED: "failed",
+    dialect.MAV_RESULT_IN_PROGRESS: "in progress",
+    dialect.MAV_RESULT_COMMAND_LONG_ONLY: "only as COMMAND_LONG",
+    dialect.MAV_RESULT_COMMAND_INT_ONLY: "only as COMMAND_INT",
+}
+# Refusals that time may cure.
+_PASSING = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_FAILED)
+
+
+class Verdict(Enum):
+    """Where a command stands."""
+
+    PENDING = "pending"
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    UNANSWERED = "no answer"
+
+
+class Ticket:
+    """One command on its way; `verdict` tells where it stands, `result` the peer's word for it."""
+
+    __slots__ = (
+        "command", "component", "due_s", "parameters", "refusals_left", "result", "sent",
+        "sent_since_answer", "verdict",
+    )  # fmt: skip
+
+    def __init__(
+        self, command: int, parameters: tuple[float, ...], component: int, refusals: int
+    ) -> None:
+        self.command = command
+        self.component = component
+        self.parameters = parameters
+        self.refusals_left = refusals
+        self.verdict = Verdict.PENDING
+        self.result = Verdict.UNANSWERED.value
+        self.sent = 0
+        self.sent_since_answer = 0
+        self.due_s = -1.0
+
+    @property
+    def pending(self) -> bool:
+        """Whether the outcome is still open."""
+        return self.verdict is Verdict.PENDING
+
+
+class CommandChannel:
+    """Commands to the components of one system.
+
+    Args:
+        system: own system id.
+        component: own component id; acknowledgements to somebody else are not ours.
+    """
+
+    def __init__(self, system: int, component: int) -> None:
+        self._own = (system, component)
+        self._lanes: dict[tuple[int, int], deque[Ticket]] = {}
+        self._now_s = 0.0
+
+    def submit(
+        self,
+        command: int,
+        *parameters: float,
+        component: int = dialect.MAV_COMP_ID_AUTOPILOT1,
+        unused: float = 0.0,
+        refusals: int = 0,
+    ) -> Ticket:
+        """Queue a COMMAND_LONG.
+
+        Args:
+            command: a MAV_CMD number.
+            parameters: the first of its seven parameters; the others become `unused`.
+            component: whom it is for.
+            unused: value of a parameter without meaning.
+            refusals: how many passing refusals are answered with another try, a second later.
+        """
+        padded = (*parameters, *[unused] * (7 - len(parameters)))
+        ticket = Ticket(command, padded, component, refusals)
+        lane = self._lanes.setdefault((component, command), deque())
+        if len(lane) >= _MAX_WAITING:
+            ticket.verdict = Verdict.UNANSWERED
+        else:
+            lane.append(ticket)
+        return ticket
+
+    def acknowledge(self, message: Message) -> None:
+        """Take a COMMAND_ACK; one that answers nothing of ours is ignored."""
+        if message.target_system not in (0, self._own[0]):
+            return
+        if message.target_component not in (0, self._own[1]):
+            return
+        lane = self._lanes.get((message.get_srcComponent(), message.command))
+        if not lane or lane[0].sent == 0:
+            return
+        ticket = lane[0]
+        ticket.result = _RESULTS.get(message.result, f"result {message.result}")
+        ticket.sent_since_answer = 0
+        if message.result == dialect.MAV_RESULT_IN_PROGRESS:
+            ticket.due_s = self._now_s + PROGRESS_TIMEOUT_S
+        elif message.result == dialect.MAV_RESULT_ACCEPTED:
+            self._close(lane, Verdict.ACCEPTED)
+        elif message.result in _PASSING and ticket.refusals_left > 0:
+            ticket.refusals_left -= 1
+            ticket.due_s = self._now_s + REFUSAL_PAUSE_S
+        else:
+            self._close(lane, Verdict.REFUSED)
+
+    def poll(self, stamp_s: float, system: int) -> list[Message]:
+        """The commands that are due at `stamp_s`, addressed to `system`."""
+        self._now_s = stamp_s
+        due = []
+        for lane in self._lanes.values():
+            while lane and lane[0].due_s <= stamp_s:
+                ticket = lane[0]
+                if ticket.sent_since_answer < TRIES:
+                    due.append(self._send(ticket, system))
+                    break
+                self._close(lane, Verdict.UNANSWERED)
+        return due
+
+    def _send(self, ticket: Ticket, system: int) -> Message:
+        confirmation = min(ticket.sent, 255)
+        ticket.sent += 1
+        ticket.sent_since_answer += 1
+        ticket.due_s = self._now_s + TIMEOUT_S
+        return dialect.MAVLink_command_long_message(
+            system, ticket.component, ticket.command, confirmation, *ticket.parameters
+        )
+
+    @staticmethod
+    def _close(lane: deque[Ticket], verdict: Verdict) -> None:
+        lane.popleft().verdict = verdict

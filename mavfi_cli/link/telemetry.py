@@ -1,0 +1,187 @@
+"""What the autopilot tells about itself, kept up to date message by message."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import IntEnum
+
+import numpy as np
+
+from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
+from mavfi_cli.core.types import FloatArray, VehicleState
+from mavfi_cli.link.autopilots import PX4, Autopilot, autopilot_of
+from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.history import StateHistory
+from mavfi_cli.link.texts import TextCollector
+
+HEARTBEAT_LOSS_S = 3.0
+_PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
+
+
+class LandedState(IntEnum):
+    """EXTENDED_SYS_STATE.landed_state."""
+
+    UNDEFINED = dialect.MAV_LANDED_STATE_UNDEFINED
+    ON_GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
+    IN_AIR = dialect.MAV_LANDED_STATE_IN_AIR
+    TAKEOFF = dialect.MAV_LANDED_STATE_TAKEOFF
+    LANDING = dialect.MAV_LANDED_STATE_LANDING
+
+
+class Telemetry:
+    """The newest word of one autopilot.
+
+    The first autopilot heard (component 1, of any system) is the one; others are not listened to.
+
+    Attributes:
+        now_s: set by the owner before messages are handled; when they count as received.
+        system: the autopilot's system id, 0 before it is heard.
+        state: position, velocity and attitude in ENU, None before both are known.
+        armed: HEARTBEAT's word.
+        mode: name of the flight mode, "" before the first HEARTBEAT.
+        landed_state: EXTENDED_SYS_STATE's word.
+        ready: SYS_STATUS says that the pre-arm checks pass.
+        home_amsl_m: altitude of home above sea level, m, None when unknown.
+        battery_remaining: 0..1, None when unknown.
+        battery_voltage_v: None when unknown.
+        texts: STATUSTEXTs.
+        collision_text: the text in which the referee reports a collision, None without one.
+    """
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.system = 0
+        self.autopilot: Autopilot = PX4
+        self.state: VehicleState | None = None
+        self.armed = False
+        self.mode = ""
+        self.landed_state = LandedState.UNDEFINED
+        self.ready = False
+        self.home_amsl_m: float | None = None
+        self.battery_remaining: float | None = None
+        self.battery_voltage_v: float | None = None
+        self.texts = TextCollector()
+        self.collision_text: str | None = None
+        self.heartbeat_s = -math.inf
+        self.history = StateHistory()
+        self._quaternion: FloatArray | None = None  # body FLU -> ENU
+
+    @property
+    def heard(self) -> bool:
+        """Whether an autopilot has been heard at all."""
+        return self.system != 0
+
+    @property
+    def link_lost(self) -> bool:
+        """Whether a known autopilot's HEARTBEAT has been missing for three seconds."""
+        return self.heard and self.now_s - self.heartbeat_s >= HEARTBEAT_LOSS_S
+
+    @property
+    def in_air(self) -> bool:
+        """Whether the autopilot says that it flies."""
+        return self.landed_state in (
+            LandedState.IN_AIR,
+            LandedState.TAKEOFF,
+            LandedState.LANDING,
+        )
+
+    def handle(self, message: Message) -> bool:
+        """Take a message; False where it is not the autopilot's."""
+        if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
+            return False
+        if not self.heard and isinstance(message, dialect.MAVLink_heartbeat_message):
+            self._adopt(message)
+        if not self.heard or message.get_srcSystem() != self.system:
+            return False
+        handler = _HANDLERS.get(type(message))
+        if handler is not None:
+            handler(self, message)
+        return True
+
+    def _adopt(self, message: Message) -> None:
+        if message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
+            self.system = message.get_srcSystem()
+            self.autopilot = autopilot_of(message.autopilot)
+
+    def _heartbeat(self, message: Message) -> None:
+        self.heartbeat_s = self.now_s
+        self.armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+        self.mode = self.autopilot.mode_name(message.custom_mode)
+
+    def _local_position(self, message: Message) -> None:
+        position = np.array([message.y, message.x, -message.z], dtype=np.float64)
+        velocity = np.array([message.vy, message.vx, -message.vz], dtype=np.float64)
+        if self._quaternion is None or not math.isfinite(sum(position) + sum(velocity)):
+            return
+        state = VehicleState(
+            stamp_s=message.time_boot_ms / 1e3,
+            position_enu_m=position,
+            velocity_enu_mps=velocity,
+            quaternion=self._quaternion,
+            yaw_rad=yaw_from_quaternion(self._quaternion),
+        )
+        if self.history.add(state):
+            self.state = state
+
+    def _attitude_quaternion(self, message: Message) -> None:
+        self._attitude_from([message.q1, message.q2, message.q3, message.q4])
+
+    def _attitude(self, message: Message) -> None:
+        angles = (message.roll, message.pitch, message.yaw)
+        if all(math.isfinite(angle) for angle in angles):
+            self._attitude_from(quaternion_from_euler(*angles).tolist())
+
+    def _attitude_from(self, components: list[float]) -> None:
+        """Take a body-FRD-to-NED quaternion w x y z, if it is one."""
+        norm = math.sqrt(sum(c * c for c in components))
+        if math.isfinite(norm) and 0.5 < norm < 2.0:
+            unit = np.array([c / norm for c in components])
+            self._quaternion = flu_enu_from_frd_ned(unit)
+
+    def _sys_status(self, message: Message) -> None:
+        self.ready = bool(message.onboard_control_sensors_health & _PREARM)
+        if message.voltage_battery != 0xFFFF:
+            self.battery_voltage_v = message.voltage_battery / 1e3
+        if message.battery_remaining >= 0:
+            self.battery_remaining = message.battery_remaining / 100.0
+
+    def _extended_sys_state(self, message: Message) -> None:
+        if 0 <= message.landed_state <= max(LandedState):
+            self.landed_state = LandedState(message.landed_state)
+
+    def _home(self, message: Message) -> None:
+        self.home_amsl_m = message.altitude / 1e3
+
+    def _global_position(self, message: Message) -> None:
+        if self.home_amsl_m is None:
+            self.home_amsl_m = (message.alt - message.relative_alt) / 1e3
+
+    def _status_text(self, message: Message) -> None:
+        before = self.texts.total
+        self.texts.add(message, self.now_s)
+        self._look_for_collision(before)
+
+    def expire(self) -> None:
+        """Let texts go whose missing chunks are not to be expected any more."""
+        before = self.texts.total
+        self.texts.expire(self.now_s)
+        self._look_for_collision(before)
+
+    def _look_for_collision(self, before: int) -> None:
+        for text in self.texts.since(before):
+            if self.collision_text is None and text.text.startswith("Collision"):
+                self.collision_text = text.text
+
+
+_HANDLERS: dict[type, Callable[[Telemetry, Message], None]] = {
+    dialect.MAVLink_heartbeat_message: Telemetry._heartbeat,
+    dialect.MAVLink_local_position_ned_message: Telemetry._local_position,
+    dialect.MAVLink_attitude_quaternion_message: Telemetry._attitude_quaternion,
+    dialect.MAVLink_attitude_message: Telemetry._attitude,
+    dialect.MAVLink_sys_status_message: Telemetry._sys_status,
+    dialect.MAVLink_extended_sys_state_message: Telemetry._extended_sys_state,
+    dialect.MAVLink_home_position_message: Telemetry._home,
+    dialect.MAVLink_global_position_int_message: Telemetry._global_position,
+    dialect.MAVLink_statustext_message: Telemetry._status_text,
+}

@@ -1,0 +1,83 @@
+"""STATUSTEXT: chunks joined into whole texts.
+
+Source: https://mavlink.io/en/messages/common.html#STATUSTEXT. A text longer than 50 characters
+comes in chunks with a common id; the last one is shorter than 50 characters.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from mavfi_cli.link.codec import Message
+
+CHUNK_LENGTH = 50
+_MAX_OPEN = 16
+_MAX_TEXTS = 1000
+_PATIENCE_S = 1.0  # how long a text waits for its missing chunks
+_GAP = "[...]"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Text:
+    """One whole text of a component."""
+
+    stamp_s: float  # when its last chunk came
+    severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
+    text: str
+
+
+@dataclass(slots=True, kw_only=True)
+class _Open:
+    severity: int
+    started_s: float
+    chunks: dict[int, str]
+
+
+class TextCollector:
+    """Gathers texts; `texts` holds the newest thousand, `total` counts all."""
+
+    def __init__(self) -> None:
+        self.texts: deque[Text] = deque(maxlen=_MAX_TEXTS)
+        self.total = 0
+        self._open: dict[tuple[int, int, int], _Open] = {}
+
+    def since(self, total: int) -> list[Text]:
+        """The texts that came after `total` stood at this number."""
+        fresh = min(self.total - total, len(self.texts))
+        return list(self.texts)[len(self.texts) - fresh :]
+
+    def add(self, message: Message, stamp_s: float) -> None:
+        """Take a STATUSTEXT."""
+        if message.id == 0:
+            self._emit(stamp_s, message.severity, message.text)
+            return
+        key = (message.get_srcSystem(), message.get_srcComponent(), message.id)
+        if key not in self._open:
+            if len(self._open) >= _MAX_OPEN:
+                self._finish(next(iter(self._open)), stamp_s)
+            self._open[key] = _Open(severity=message.severity, started_s=stamp_s, chunks={})
+        chunks = self._open[key].chunks
+        chunks[message.chunk_seq] = message.text
+        last = max(chunks)
+        if len(chunks[last]) < CHUNK_LENGTH and len(chunks) == last + 1:
+            self._finish(key, stamp_s)
+
+    def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> None:
+        """Give up on chunks that did not come for so long; their text is kept with a gap."""
+        if self._open:
+            late = [k for k, o in self._open.items() if stamp_s - o.started_s >= patience_s]
+            for key in late:
+                self._finish(key, stamp_s)
+
+    def _finish(self, key: tuple[int, int, int], stamp_s: float) -> None:
+        part = self._open.pop(key)
+        last = max(part.chunks)
+        text = "".join(part.chunks.get(index, _GAP) for index in range(last + 1))
+        if len(part.chunks[last]) >= CHUNK_LENGTH:
+            text += _GAP
+        self._emit(stamp_s, part.severity, text)
+
+    def _emit(self, stamp_s: float, severity: int, text: str) -> None:
+        self.total += 1
+        self.texts.append(Text(stamp_s=stamp_s, severity=severity, text=text.strip()))

@@ -1,0 +1,97 @@
+"""The .tlog of a flight: every frame of both directions, as ground stations record them.
+
+A record is the time in microseconds since 1970 (8 bytes, big endian) and the frame as it was on
+the wire. Time is EPOCH_UNIX_S plus the simulated stamp, so the same flight gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+
+from mavfi_cli.core.errors import RecordError
+
+EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
+_FLUSH_BYTES = 1 << 16
+_FLUSH_INTERVAL_S = 1.0  # of simulated time
+
+
+class TlogWriter:
+    """Writes a .tlog; a kill leaves whole records, at most a second or 64 KiB short.
+
+    Args:
+        path: created, or emptied.
+
+    Raises:
+        RecordError: the file cannot be written (here or in any method).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._pending = bytearray()
+        self._whole = 0  # bytes of the file that are whole records
+        self._flushed_s = 0.0
+        self._descriptor: int | None = None
+        try:
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        except OSError as error:
+            raise self._error(error) from None
+
+    def write(self, stamp_s: float, frame: bytes) -> None:
+        """Record one frame, sent or received, at a stamp."""
+        time_us = EPOCH_UNIX_S * 1_000_000 + round(stamp_s * 1e6)
+        self._pending += time_us.to_bytes(8, "big")
+        self._pending += frame
+        overdue = abs(stamp_s - self._flushed_s) >= _FLUSH_INTERVAL_S
+        if overdue or len(self._pending) >= _FLUSH_BYTES:
+            self._flushed_s = stamp_s
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand what is pending to the system, whole or not at all."""
+        if self._descriptor is None or not self._pending:
+            return
+        data = memoryview(bytes(self._pending))
+        written = 0
+        try:
+            while written < len(data):
+                written += os.write(self._descriptor, data[written:])
+        except OSError as error:
+            self._take_back()
+            raise self._error(error) from None
+        self._whole += written
+        self._pending.clear()
+
+    def _take_back(self) -> None:
+        """Cut off a record that did not fit on the disk, and write no more."""
+        assert self._descriptor is not None
+        descriptor, self._descriptor = self._descriptor, None
+        self._pending.clear()
+        try:
+            os.ftruncate(descriptor, self._whole)
+        except OSError:  # not a plain file (a pipe, /dev/full): nothing to cut
+            pass
+        finally:
+            os.close(descriptor)
+
+    def close(self) -> None:
+        """Flush and close; harmless when repeated."""
+        self.flush()
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def __enter__(self) -> TlogWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _error(self, error: OSError) -> RecordError:
+        return RecordError(f"{self._path}: cannot write: {error.strerror or error}")
