@@ -17,6 +17,7 @@ from enum import Enum
 
 import numpy as np
 
+from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
 
@@ -267,9 +268,9 @@ class Pilot:
         self._rate += change
         self._rate_change = change / step_s if step_s > 0.0 else 0.0
         self.time_s += 0.5 * (before + self._rate) * step_s
-        if self.mode is Mode.STOPPING and self._rate <= 0.0:
-            self._stop_here()
-        elif not self.time_s < self.trajectory.duration_s and self._next is None:
+        if (self.mode is Mode.STOPPING and self._rate <= 0.0) or (
+            not self.time_s < self.trajectory.duration_s and self._next is None
+        ):
             self._stop_here()
 
     def _guard(self, state: VehicleState) -> None:

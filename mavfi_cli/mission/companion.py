@@ -4,33 +4,277 @@
                                      |                            |  ^
                                      +------------> planner <-----+--+
 
-Every arrow out of a kernel passes through one place here (`_publish_...`), which is where a
-fault is injected and a detector looks.
+Every message that one kernel hands to the next passes through one of the `_take_...` methods.
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, tracking
+from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
 from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFailure, PlanRequest
+from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.autonomy.trajectory import waypoint_index
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import (
     CollisionReport,
     Command,
     DepthFrame,
-    FloatArray,
     PointCloud,
     Trajectory,
     VehicleState,
 )
+from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.events import EventLog
 from mavfi_cli.mission.executor import Executor
 from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
+from mavfi_cli.mission.wall import WallClock
 
-SAME_TICK_S = 0.004  # a command this quick goes out in the tick that it was computed in
+# A command computed within one physics step of the vehicle goes out in the tick of its state:
+# a shorter delay is below what the simulation resolves.
+SAME_TICK_S = 0.004
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reaction:
+    """How long a depth frame took to reach a setpoint: the pipeline's response time."""
+
+    frame_stamp_s: float
+    setpoint_stamp_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _CheckInput:
+    snapshot: occupancy.MapSnapshot
+    trajectory: Trajectory | None
+    time_s: float
+
+
+class Companion:
+    """Perception, planning and control of one mission."""
+
+    def __init__(
+        self,
+        config: MissionConfig,
+        platform: PlatformProfile,
+        planner: Planner,
+        briefing: Briefing,
+        wall: WallClock,
+    ) -> None:
+        self._config = config
+        self._planner = planner
+        v_max, a_max = config.v_max_mps, config.a_max_mps2
+        self.pilot = Pilot(
+            PilotParams(
+                goal_tolerance_m=config.goal_tolerance_m, v_max_mps=v_max, a_max_mps2=a_max
+            ),
+            briefing.goal_enu_m,
+        )
+        self._cloud_params = point_cloud.PointCloudParams(max_range_m=config.map_range_m)
+        self._map = occupancy.OccupancyMap(
+            occupancy.OccupancyParams(
+                resolution_m=config.map_resolution_m, max_range_m=config.map_range_m
+            )
+        )
+        self._collision_params = collision.CollisionParams()
+        self._collision_state = collision.CollisionState()
+        self._planning_params = planning.StageParams(
+            smoothing=smoothing.SmoothingParams(v_max_mps=v_max, a_max_mps2=a_max)
+        )
+        self._bounds_enu_m = briefing.bounds_enu_m
+        self._tracking_params = tracking.TrackingParams(v_max_mps=v_max, a_max_mps2=a_max)
+        self._tracking_state: tracking.TrackingState | None = None
+        self._latency = LatencyModel(platform, config.seed)
+        self.executor = Executor(
+            draw_latency_s=self._latency.draw_s, cores=platform.cores, wall=wall
+        )
+        add = self.executor.add
+        add("point_cloud", self._run_point_cloud, self._take_cloud)
+        add("octomap", self._run_octomap, self._take_snapshot)
+        add("collision_check", self._run_collision_check, self._take_report)
+        add("planner", self._run_planner, self._take_plan)
+        self._snapshot: occupancy.MapSnapshot | None = None
+        self._checked: Trajectory | None = None
+        self._commands: deque[tuple[float, Command]] = deque()  # (due stamp, command)
+        self.report: CollisionReport | None = None
+        self.command: Command | None = None
+        self.directive: Directive | None = None
+        self.plans: list[Trajectory] = []
+        self.reactions: list[Reaction] = []
+        self._fresh_frame_s: float | None = None
+
+    # Kernels as nodes run them: (input, start stamp) -> output
+
+    def _run_point_cloud(self, frame: DepthFrame, _stamp_s: float) -> PointCloud:
+        return point_cloud.generate(frame, self._cloud_params)
+
+    def _run_octomap(self, cloud: PointCloud, _stamp_s: float) -> occupancy.MapSnapshot:
+        self._map.insert(cloud)
+        return self._map.snapshot()
+
+    def _run_collision_check(
+        self, check: _CheckInput, stamp_s: float
+    ) -> tuple[CollisionReport, float]:
+        inputs = collision.CollisionInputs(
+            stamp_s=stamp_s,
+            snapshot=check.snapshot,
+            trajectory=check.trajectory,
+            time_s=check.time_s,
+        )
+        self._collision_state, report = collision.step(
+            self._collision_state, inputs, self._collision_params
+        )
+        return report, check.snapshot.stamp_s
+
+    def _run_planner(
+        self, job: tuple[PlanRequest, occupancy.MapSnapshot], stamp_s: float
+    ) -> Trajectory | PlanFailure:
+        request, snapshot = job
+        found = planning.plan(
+            self._planner,
+            planning.StageInputs(
+                snapshot=snapshot,
+                position_enu_m=request.position_enu_m,
+                departure=smoothing.Departure(
+                    stamp_s=request.stamp_s,
+                    velocity_enu_mps=request.velocity_enu_mps,
+                    yaw_rad=request.yaw_rad,
+                ),
+                goal_enu_m=request.goal_enu_m,
+                bounds_enu_m=self._bounds_enu_m,
+                sequence=smoothing.Sequence(
+                    trajectory_seq=request.trajectory_seq + 1,
+                    future_collision_seq=request.future_collision_seq,
+                ),
+                seed=derive(self._config.seed, Stream.PLANNER, request.attempt),
+            ),
+            self._planning_params,
+        )
+        if found.trajectory is None:
+            return PlanFailure(stamp_s=stamp_s, reason=found.reason)
+        return found.trajectory
+
+    # Messages as they take effect
+
+    def take_frame(self, frame: DepthFrame) -> None:
+        """A new depth image has arrived."""
+        self.executor.submit("point_cloud", frame)
+
+    def _take_cloud(self, cloud: PointCloud, _stamp_s: float) -> None:
+        self.executor.submit("octomap", cloud)
+
+    def _take_snapshot(self, snapshot: occupancy.MapSnapshot, _stamp_s: float) -> None:
+        self._snapshot = snapshot
+        self._check()
+
+    def _take_report(self, checked: tuple[CollisionReport, float], _stamp_s: float) -> None:
+        self.report, self._fresh_frame_s = checked
+        self.pilot.on_report(self.report)
+
+    def _take_plan(self, result: Trajectory | PlanFailure, _stamp_s: float) -> None:
+        if isinstance(result, Trajectory):
+            self.plans.append(result)
+        self.pilot.on_plan(result)
+
+    def _check(self) -> None:
+        """Have the present trajectory checked against the newest map."""
+        trajectory = self.pilot.trajectory
+        if self._snapshot is None or trajectory is None:
+            return
+        self._checked = trajectory
+        self.executor.submit(
+            "collision_check",
+            _CheckInput(snapshot=self._snapshot, trajectory=trajectory, time_s=self.pilot.time_s),
+        )
+
+    # The control tick
+
+    @property
+    def sees(self) -> bool:
+        """Whether a map of what is ahead is there, so that planning makes sense."""
+        return self._snapshot is not None
+
+    def tick(self, stamp_s: float, state: VehicleState) -> Command | None:
+        """One control tick in flight: the command that goes out now.
+
+        `executor.advance(stamp_s)` comes before it and `executor.compute()` after it.
+        """
+        if not self.sees:
+            return None
+        directive = self.directive = self.pilot.update(stamp_s, state)
+        if directive.plan is not None:
+            assert self._snapshot is not None
+            self.executor.submit("planner", (directive.plan, self._snapshot))
+        if directive.trajectory is not None and directive.trajectory is not self._checked:
+            self._check()
+        command = self._track(stamp_s, state, directive)
+        self._commands.append((stamp_s + self._control_delay_s(), command))
+        while self._commands and self._commands[0][0] <= stamp_s:
+            self._take_command(stamp_s, self._commands.popleft()[1])
+        return self.command
+
+    def _track(self, stamp_s: float, state: VehicleState, directive: Directive) -> Command:
+        if self._tracking_state is None:
+            self._tracking_state = tracking.TrackingState(yaw_rad=state.yaw_rad, stamp_s=stamp_s)
+        inputs = tracking.TrackingInputs(
+            stamp_s=stamp_s,
+            position_enu_m=state.position_enu_m,
+            velocity_enu_mps=state.velocity_enu_mps,
+            trajectory=directive.trajectory,
+            time_s=directive.time_s,
+            rate=directive.rate,
+            rate_change_per_s=directive.rate_change_per_s,
+            hold_enu_m=directive.hold_enu_m,
+            hold_yaw_rad=directive.hold_yaw_rad,
+        )
+        self._tracking_state, command = tracking.step(
+            self._tracking_state, inputs, self._tracking_params
+        )
+        return command
+
+    def _control_delay_s(self) -> float:
+        latency_s = self._latency.draw_s("control")
+        return latency_s if latency_s >= SAME_TICK_S else 0.0
+
+    def _take_command(self, stamp_s: float, command: Command) -> None:
+        self.command = command
+        if self._fresh_frame_s is not None:
+            self.reactions.append(
+                Reaction(frame_stamp_s=self._fresh_frame_s, setpoint_stamp_s=stamp_s)
+            )
+            self._fresh_frame_s = None
+
+    @property
+    def tracked(self) -> tuple[Trajectory, int] | None:
+        """The tracked trajectory and the index of its present waypoint."""
+        trajectory = self.pilot.trajectory
+        if trajectory is None or not len(trajectory.waypoints):
+            return None
+        return trajectory, max(0, waypoint_index(trajectory, self.pilot.time_s))
+
+    @property
+    def mode(self) -> Mode:
+        """What the pilot is doing."""
+        return self.pilot.mode
+
+    def goal_distance_m(self, state: VehicleState) -> float:
+        """Distance to the goal, m."""
+        return float(np.linalg.norm(state.position_enu_m - self.pilot.goal_enu_m))
+
+
+def response_times(reactions: list[Reaction]) -> dict[str, float | None]:
+    """Median and 95th percentile of the time from a depth frame to a setpoint, s."""
+    if not reactions:
+        return {"median": None, "p95": None, "count": 0}
+    times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])
+    times = times[np.isfinite(times)]
+    if not len(times):
+        return {"median": None, "p95": None, "count": 0}
+    return {
+        "median": round(float(np.median(times)), 9),
+        "p95": round(float(np.percentile(times, 95.0)), 9),
+        "count": len(times),
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,10 +16,18 @@ class Event:
     position_enu_m: tuple[float, float, float] | None = None
 
 
+class Listener(Protocol):
+    """Hears of every event as it happens."""
+
+    def on_event(self, event: Event) -> None:
+        """Called for every event."""
+
+
 @dataclass(slots=True)
 class EventLog:
-    """Collects events; a live view may listen."""
+    """Collects events and passes them on."""
 
+    listener: Listener
     events: list[Event] = field(default_factory=list)
 
     def add(
@@ -30,9 +38,9 @@ class EventLog:
         position_enu_m: tuple[float, float, float] | None = None,
     ) -> None:
         """Note one event."""
-        self.events.append(
-            Event(stamp_s=stamp_s, kind=kind, text=text, position_enu_m=position_enu_m)
-        )
+        event = Event(stamp_s=stamp_s, kind=kind, text=text, position_enu_m=position_enu_m)
+        self.events.append(event)
+        self.listener.on_event(event)
 
     def to_list(self) -> list[dict[str, Any]]:
         """Plain values, for the record of the run."""

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from mavfi_cli.mission.wall import WallClock
+
 Run = Callable[[Any, float], Any]  # (input, start stamp) -> output
 Publish = Callable[[Any, float], None]  # (output, stamp at which it takes effect)
 
@@ -41,9 +43,10 @@ class _Job:
     done: bool = False
     output: Any = None
 
-    def compute(self) -> Any:
+    def compute(self, wall: WallClock) -> Any:
         if not self.done:
-            self.output = self.node.run(self.input, self.start_s)
+            with wall.measure(self.node.name):
+                self.output = self.node.run(self.input, self.start_s)
             self.input = None
             self.done = True
         return self.output
@@ -69,6 +72,7 @@ class Executor:
 
     draw_latency_s: Callable[[str], float]
     cores: int
+    wall: WallClock = field(default_factory=WallClock)
     now_s: float = 0.0
     timetable: list[Invocation] = field(default_factory=list)
     _nodes: dict[str, Node] = field(default_factory=dict)
@@ -117,7 +121,7 @@ class Executor:
     def compute(self) -> None:
         """Do the real work of every invocation that has started; safe to call at any time."""
         while self._uncomputed:
-            self._uncomputed.pop(0).compute()
+            self._uncomputed.pop(0).compute(self.wall)
 
     def _start_if_free(self, node: Node) -> None:
         if node.busy or node.pending is None:
@@ -140,7 +144,7 @@ class Executor:
         self._count += 1
 
     def _finish(self, job: _Job, end_s: float) -> None:
-        output = job.compute()
+        output = job.compute(self.wall)
         job.node.busy = False
         self._working -= 1
         job.node.publish(output, end_s)

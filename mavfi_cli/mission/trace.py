@@ -63,6 +63,11 @@ class Trace:
     def __len__(self) -> int:
         return len(self._stamps)
 
+    def motion(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Stamps (n,) s, positions (n, 3) m and velocities (n, 3) m/s that were received, ENU."""
+        vehicle = np.array(self._vehicle, dtype=np.float64).reshape(-1, len(_STATE_COLUMNS))
+        return np.array(self._stamps), vehicle[:, 0:3], vehicle[:, 3:6]
+
     def table(self, truth: dict[str, np.ndarray] | None) -> pa.Table:
         """The columns: stamp, phase, vehicle, every monitored state, and the referee's truth.
 

@@ -17,7 +17,7 @@ class VehicleProcess:
     """`python -m sitl` in lockstep. Closing the socket ends it and saves the referee's truth."""
 
     def __init__(self, config: MissionConfig, truth_folder: Path) -> None:
-        self._errors = tempfile.TemporaryFile()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         with theirs:
             try:

@@ -1,0 +1,125 @@
+"""`mavfi fly`: one mission, with live progress, a summary and a run folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from mavfi_cli.mission.config import MissionConfig
+
+_OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
+
+
+class _Place(click.ParamType[Any]):
+    """Three numbers: east, north, up in metres."""
+
+    name = "X,Y,Z"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, float, float]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            x, y, z = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not three numbers like 30,40,5", param, ctx)
+        return x, y, z
+
+
+class _Size(click.ParamType[Any]):
+    """An image size."""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            columns, rows = (int(part) for part in str(value).lower().split("x"))
+        except ValueError:
+            self.fail(f"{value!r} is not a size like 64x48", param, ctx)
+        return columns, rows
+
+
+@click.command()
+@click.option("--world", default="dense", show_default=True, metavar="NAME|FILE",
+              help="A world, or a TOML file of boxes; `mavfi world list` shows them.")  # fmt: skip
+@click.option("--seed", default=1, show_default=True, help="Root seed of everything random.")
+@click.option("--planner", default="rrtstar", show_default=True,
+              help="rrtstar, rrt, rrtconnect, or a plug-in's name.")  # fmt: skip
+@click.option("--platform", default="x86", show_default=True, metavar="NAME|FILE",
+              help="The companion computer whose latencies the flight feels.")  # fmt: skip
+@click.option("--vehicle", default="solo", show_default=True, metavar="NAME|FILE",
+              help="solo, spark, or a TOML profile.")  # fmt: skip
+@click.option("--start", type=_Place(), help="Where to take off, ENU, m  [the world's own].")
+@click.option("--goal", type=_Place(), help="Where to fly, ENU, m  [the world's own].")
+@click.option("--height", "takeoff_height_m", default=5.0, show_default=True,
+              help="Take-off height, m.")  # fmt: skip
+@click.option("--v-max", "v_max_mps", default=3.0, show_default=True, help="Speed limit, m/s.")
+@click.option("--a-max", "a_max_mps2", default=5.0, show_default=True,
+              help="Acceleration limit, m/s^2.")  # fmt: skip
+@click.option("--tolerance", "goal_tolerance_m", default=1.0, show_default=True,
+              help="How near the goal counts as reached, m.")  # fmt: skip
+@click.option("--time-limit", "time_limit_s", default=300.0, show_default=True,
+              help="Simulated seconds after take-off.")  # fmt: skip
+@click.option("--camera", type=_Size(), default="64x48", show_default=True,
+              help="Depth image size.")  # fmt: skip
+@click.option("--realtime", is_flag=True, help="Pace the simulated vehicle by the wall clock.")
+@click.option("--link", metavar="URL",
+              help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
+@click.option("--land/--no-land", default=None,
+              help="Land and disarm at the goal  [only with --link].")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
+              show_default=True, help="Where the run folder goes.")  # fmt: skip
+@click.option("--picture/--no-picture", default=True, help="Draw flight.svg.", show_default=True)
+@click.option("--expect", type=click.Choice(_OUTCOMES),
+              help="Exit with 1 unless the mission ends like this.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print result.json instead of the summary.")
+@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+def fly(
+    out: Path, picture: bool, expect: str | None, as_json: bool, quiet: bool, **options: Any
+) -> None:
+    """Fly one mission from take-off to the goal, through obstacles that nobody told it about.
+
+    A mission that fails is a result: the exit code is 0 unless --expect asks otherwise.
+    """
+    from mavfi_cli.cli.progress import progress_view
+    from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.report.summary import outcome_line, summary_lines
+    from mavfi_cli.report.top_view import write_top_view
+
+    config = _config(options)
+    with progress_view(config, quiet=quiet) as view:
+        folder = fly_mission(config, out, view)
+    run = load_run(folder.path)
+    if picture:
+        write_top_view(run, folder.picture)
+    if as_json:
+        click.echo(json.dumps(run.result, indent=2, sort_keys=True))
+    else:
+        click.echo("\n".join(summary_lines(run.result)))
+        click.echo(
+            f"\nRun folder  {folder.path}" + (f"  (see {folder.picture.name})" if picture else "")
+        )
+    if run.result["outcome"] == "interrupted":
+        raise click.exceptions.Exit(130)
+    if expect is not None and run.result["outcome"] != expect:
+        click.echo(f"error: expected {expect}, got {outcome_line(run.result)}", err=True)
+        raise click.exceptions.Exit(1)
+
+
+def _config(options: dict[str, Any]) -> MissionConfig:
+    from mavfi_cli.mission.config import MissionConfig
+
+    columns, rows = options.pop("camera")
+    land = options.pop("land")
+    return MissionConfig(
+        camera_columns=columns,
+        camera_rows=rows,
+        land=options["link"] is not None if land is None else land,
+        **options,
+    )

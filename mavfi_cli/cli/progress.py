@@ -1,0 +1,81 @@
+"""Progress of a mission on stderr: a live line on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import click
+
+from mavfi_cli.mission.events import Event
+from mavfi_cli.mission.progress import Progress, Watcher
+
+if TYPE_CHECKING:
+    from rich.status import Status
+
+    from mavfi_cli.mission.config import MissionConfig
+
+_PLAIN_EVERY_S = 10.0
+_TOLD = ("phase", "autopilot", "plan", "stop", "collision", "outcome")
+
+
+class _Plain(Watcher):
+    """A line for what happens, and one every ten simulated seconds."""
+
+    def __init__(self) -> None:
+        self._next_s = 0.0
+
+    def on_progress(self, progress: Progress) -> None:
+        if progress.stamp_s >= self._next_s:
+            self._next_s = progress.stamp_s + _PLAIN_EVERY_S
+            click.echo(_line(progress), err=True)
+
+    def on_event(self, event: Event) -> None:
+        if event.kind in _TOLD:
+            click.echo(f"{event.stamp_s:7.2f} s  {event.text}", err=True)
+
+
+class _Live(Watcher):
+    """One line that is rewritten, with the events scrolling above it."""
+
+    def __init__(self, status: Status) -> None:
+        self._status = status
+
+    def on_progress(self, progress: Progress) -> None:
+        self._status.update(_line(progress))
+
+    def on_event(self, event: Event) -> None:
+        if event.kind in _TOLD:
+            self._status.console.print(
+                f"[dim]{event.stamp_s:7.2f} s[/dim]  {event.text}", highlight=False
+            )
+
+
+def _line(progress: Progress) -> str:
+    goal = "" if progress.goal_distance_m is None else f"{progress.goal_distance_m:5.1f} m to go  "
+    return (
+        f"{progress.stamp_s:7.2f} s  {progress.phase:<12} {goal}"
+        f"{progress.speed_mps:.1f} m/s  replans {progress.replans}"
+    )
+
+
+@contextmanager
+def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
+    """The watcher that suits stderr: none, plain lines, or a live line."""
+    if quiet:
+        yield Watcher()
+        return
+    where = config.link or f"{config.world}, seed {config.seed}"
+    title = f"Flying {config.vehicle} in {where}" if config.link is None else f"Flying {where}"
+    if not sys.stderr.isatty():
+        click.echo(title, err=True)
+        yield _Plain()
+        return
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    console.print(f"[bold]{title}[/bold]", highlight=False)
+    with console.status("starting") as status:
+        yield _Live(status)

@@ -1,0 +1,73 @@
+"""What the mission is told before it flies: where to go, and how its camera is mounted.
+
+The simulated vehicle's process leaves a `briefing.json` before its first message, since only it
+has the world; for a foreign autopilot the briefing comes from the command line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mavfi_cli.core.errors import ConfigError, VehicleProcessError
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.mission.config import MissionConfig
+
+FILE = "briefing.json"
+LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home
+MARGIN_M = 30.0  # round home and goal, where no world says how far it reaches
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Briefing:
+    """Goal, where one may fly, and camera."""
+
+    goal_enu_m: FloatArray  # (3,)
+    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax that plans keep to
+    camera_offset_flu_m: FloatArray  # (3,) of the optical centre from the vehicle's centre
+    hfov_rad: float = math.pi / 2.0  # used until the camera tells
+
+
+def of_simulation(folder: Path) -> Briefing:
+    """The briefing that the simulated vehicle left.
+
+    Raises:
+        VehicleProcessError: there is none.
+    """
+    try:
+        data = json.loads((folder / FILE).read_text())
+        return Briefing(
+            goal_enu_m=np.array(data["goal_enu_m"], dtype=np.float64),
+            bounds_enu_m=_flight_bounds(data["bounds_enu_m"]),
+            camera_offset_flu_m=np.array(data["camera_offset_flu_m"], dtype=np.float64),
+        )
+    except (OSError, ValueError, KeyError) as error:
+        raise VehicleProcessError(f"the vehicle process left no briefing ({error})") from None
+
+
+def of_config(config: MissionConfig) -> Briefing:
+    """The briefing for a foreign autopilot: the goal must be named.
+
+    Raises:
+        ConfigError: no goal was given.
+    """
+    if config.goal is None:
+        raise ConfigError("a foreign autopilot needs --goal X,Y,Z (ENU, m, from its home)")
+    goal = np.array(config.goal)
+    low, high = np.minimum(goal, 0.0) - MARGIN_M, np.maximum(goal, 0.0) + MARGIN_M
+    return Briefing(
+        goal_enu_m=goal,
+        bounds_enu_m=_flight_bounds([*low, *high]),
+        camera_offset_flu_m=np.zeros(3),
+    )
+
+
+def _flight_bounds(bounds_enu_m: list[float]) -> FloatArray:
+    """The bounds with its flight levels; the reference plans between 1 and 10 m."""
+    bounds = np.array(bounds_enu_m, dtype=np.float64)
+    bounds[2], bounds[5] = LOWEST_M, HIGHEST_M
+    return bounds

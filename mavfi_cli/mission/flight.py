@@ -1,0 +1,383 @@
+"""The loop of one mission: messages in, one control tick a state, setpoints out.
+
+The clock is the vehicle's: a LOCAL_POSITION_NED is the tick of its stamp. In lockstep the
+vehicle waits for the setpoint of that stamp; the answer goes out first, and the heavy kernels
+run while the vehicle already simulates the next tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.autonomy.pilot import Mode
+from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.core.errors import LinkLost, NoAutopilot
+from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
+from mavfi_cli.link.codec import Codec, Message, dialect
+from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
+from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
+from mavfi_cli.link.tlog import TlogWriter
+from mavfi_cli.link.transport import Transport
+from mavfi_cli.mission import quality
+from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.events import EventLog
+from mavfi_cli.mission.platform import PlatformProfile
+from mavfi_cli.mission.progress import Progress, Watcher
+from mavfi_cli.mission.trace import Trace
+from mavfi_cli.mission.wall import WallClock
+
+SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
+IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing
+LOST_S = 5.0  # a foreign autopilot that says nothing for so long is lost
+SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
+_LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
+
+
+class Flight:
+    """One mission on one link, from the first heartbeat to its outcome."""
+
+    def __init__(
+        self,
+        config: MissionConfig,
+        transport: Transport,
+        platform: PlatformProfile,
+        planner: Planner,
+        watcher: Watcher,
+        interrupts: Sequence[int],
+    ) -> None:
+        self._config = config
+        self._transport = transport
+        self._platform = platform
+        self._planner = planner
+        self._watcher = watcher
+        self._interrupts = interrupts
+        self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
+        self._session = self._new_session()
+        self._images = ImageReceiver()
+        self._frames: list[ImageFrame] = []
+        self._tlog: TlogWriter | None = None
+        self._early: list[tuple[float, bytes]] = []  # packets from before the run folder
+        self._phase: Phase | None = None
+        self._texts = 0
+        self._mode: Mode | None = None
+        self._camera_asked = False
+        self._next_progress_s = 0.0
+        self._idle_s = 0.0
+        self._on_clock = config.link is None
+        self._briefing: Briefing | None = None
+        self.companion: Companion | None = None
+        self.log = EventLog(watcher)
+        self.trace = Trace()
+        self.wall = WallClock()
+        self.stamp_s = 0.0
+        self.takeover_s = float("inf")
+        self.end_s = 0.0
+        self.outcome: Outcome | None = None
+        self.reason = ""
+
+    def _new_session(self) -> OffboardSession:
+        settings = SessionSettings(
+            takeoff_height_m=self._config.takeoff_height_m,
+            request_streams=self._config.link is not None,
+        )
+        return OffboardSession(settings, url=self._config.link or "the simulated vehicle")
+
+    # Before and after -----------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Wait for the autopilot's first heartbeat.
+
+        Raises:
+            NoAutopilot: nothing was heard.
+            LinkLost: the other end closed the connection.
+        """
+        while self._session.phase is Phase.CONNECTING:
+            self._turn()
+        if self._session.failure is not None:
+            raise self._session.failure
+
+    def brief(self, briefing: Briefing) -> None:
+        """Tell where the goal is and how the camera is mounted; makes the companion ready."""
+        self._briefing = briefing
+        self.companion = Companion(self._config, self._platform, self._planner, briefing, self.wall)
+
+    def fly(self, tlog: Path) -> None:
+        """Fly until the mission has an outcome.
+
+        Raises:
+            CommandRefused: the autopilot refused to arm, take off or change its mode.
+            RecordError: the tlog could not be written.
+        """
+        with TlogWriter(tlog) as self._tlog:
+            for stamp_s, data in self._early:
+                self._tlog.write(stamp_s, data)
+            self._early.clear()
+            try:
+                while not self._finished():
+                    self._turn()
+                    self._judge()
+            except LinkLost as error:
+                self.end(Outcome.LINK_LOST, str(error))
+            finally:
+                self.end_s = self.stamp_s if self.outcome is None else self.end_s
+
+    def _finished(self) -> bool:
+        if self._session.failure is not None and self._session.failure is not self._landing_failed:
+            raise self._session.failure
+        if self.outcome is None:
+            return False
+        landing = self._config.land and self.outcome in _LAND_AFTER
+        if not landing or len(self._interrupts) > 1:
+            return True
+        self._session.request_land()
+        return self._session.phase in (Phase.DONE, Phase.FAILED)
+
+    @property
+    def _landing_failed(self) -> Exception | None:
+        """A landing that was refused does not undo the mission's outcome."""
+        return self._session.failure if self.outcome is not None else None
+
+    def end(self, outcome: Outcome, reason: str = "") -> None:
+        """Settle how the mission ended; the first word counts."""
+        if self.outcome is not None:
+            return
+        self.outcome, self.reason, self.end_s = outcome, reason, self.stamp_s
+        text = outcome.value.replace("_", " ") + (f": {reason}" if reason else "")
+        self._note("outcome", text)
+
+    # One turn of the loop -------------------------------------------------------------------------
+
+    def _turn(self) -> None:
+        """Take what came, and do the control tick of every state in it."""
+        with self.wall.measure("wait"):
+            data = self._transport.receive(SILENCE_S if self._config.link is None else IDLE_S)
+        if not data:
+            self._silence()
+            return
+        self._idle_s = 0.0
+        with self.wall.measure("link"):
+            messages = self._codec.decode(data, datagram=self._transport.datagram)
+        for message in messages:
+            self._handle(message)
+            if (
+                isinstance(message, dialect.MAVLink_local_position_ned_message)
+                and message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1
+                and message.get_srcSystem() == (self._session.telemetry.system or SYSTEM_ID)
+            ):
+                self._tick(message.time_boot_ms / 1e3)
+
+    def _silence(self) -> None:
+        if self._config.link is None:
+            raise LinkLost(f"the simulated vehicle said nothing for {SILENCE_S:g} s")
+        self._idle_s += IDLE_S
+        if self._idle_s >= LOST_S and self._on_clock:
+            raise LinkLost(f"{self._config.link}: nothing was heard for {LOST_S:g} s")
+        self.stamp_s += IDLE_S
+        self._send(self._session.tick(self.stamp_s))
+        if isinstance(self._session.failure, NoAutopilot):
+            raise self._session.failure
+
+    def _handle(self, message: Message) -> None:
+        with self.wall.measure("link"):
+            self._session.handle(message)
+            self._frames += self._images.feed(message)
+            self._record(self.stamp_s, message.get_msgbuf())
+
+    def _tick(self, stamp_s: float) -> None:
+        """One control tick: publish what is due, decide, answer, and only then compute."""
+        if not self._on_clock:  # the vehicle's clock takes over from ours
+            self._on_clock = True
+            system = self._session
+            self._session = self._new_session()
+            self._session.telemetry = system.telemetry
+        if stamp_s <= self.stamp_s and len(self.trace):
+            return
+        self.stamp_s = stamp_s
+        state, companion = self._session.state, self.companion
+        if companion is not None:
+            companion.executor.advance(stamp_s)
+        if companion is not None and state is not None and self._airborne():
+            self._offer_frames(companion)
+            with self.wall.measure("control"):
+                self._control(stamp_s, state, companion)
+        with self.wall.measure("link"):
+            self._send(self._session.tick(stamp_s))
+        if companion is not None:
+            companion.executor.compute()
+        self._tell(state)
+
+    def _airborne(self) -> bool:
+        return self._session.phase in (Phase.TAKING_OFF, Phase.OFFBOARD, Phase.LANDING)
+
+    def _control(self, stamp_s: float, state: VehicleState, companion: Companion) -> None:
+        if self._session.phase is not Phase.OFFBOARD or self.outcome is not None:
+            self._session.hold()
+            return
+        if self.takeover_s > stamp_s:
+            self.takeover_s = stamp_s
+        command = companion.tick(stamp_s, state)
+        if command is not None:
+            self._session.set_target(
+                command.velocity_enu_mps.tolist(),
+                command.yaw_rad,
+                command.acceleration_enu_mps2.tolist(),
+            )
+        self.trace.add(
+            stamp_s, companion.mode.value, state, companion.report, companion.tracked, command
+        )
+
+    def _offer_frames(self, companion: Companion) -> None:
+        """Give the newest depth frames to perception, with the pose of their moment."""
+        assert self._briefing is not None
+        for image in self._frames:
+            pose = self._session.state_at(image.stamp_s)
+            if pose is not None:
+                companion.take_frame(
+                    depth_frame(
+                        image,
+                        pose,
+                        hfov_rad=self._briefing.hfov_rad,
+                        mount_offset_flu_m=self._briefing.camera_offset_flu_m,
+                    )
+                )
+        self._frames.clear()
+
+    def _send(self, messages: Sequence[Message]) -> None:
+        frames = [self._codec.encode(message) for message in messages]
+        for frame in frames:
+            self._record(self.stamp_s, frame)
+        if self._transport.datagram:
+            for frame in frames:
+                self._transport.send(frame)
+        elif frames:
+            self._transport.send(b"".join(frames))
+
+    def _record(self, stamp_s: float, frame: bytes) -> None:
+        if self._tlog is None:
+            self._early.append((stamp_s, frame))
+        else:
+            self._tlog.write(stamp_s, frame)
+
+    # What became of it ----------------------------------------------------------------------------
+
+    def _judge(self) -> None:
+        """Does the mission have an outcome now?"""
+        if self.outcome is not None:
+            return
+        session, companion = self._session, self.companion
+        if self._interrupts:
+            self.end(Outcome.INTERRUPTED)
+        elif session.collision_text is not None:
+            self.end(Outcome.COLLISION, session.collision_text.removeprefix("Collision: "))
+        elif session.failsafe:
+            self.end(Outcome.FAILSAFE, session.failsafe_text or "")
+        elif session.link_lost:
+            self.end(Outcome.LINK_LOST, "no heartbeat for 3 s")
+        elif companion is not None and companion.mode is Mode.ARRIVED:
+            self.end(Outcome.SUCCESS)
+        elif companion is not None and companion.mode is Mode.GAVE_UP:
+            self.end(
+                Outcome.NO_PATH, f"{companion.pilot.params.attempts_max} plans in a row failed"
+            )
+        elif self.stamp_s - self.takeover_s >= self._config.time_limit_s:
+            self.end(Outcome.TIMEOUT, f"{self._config.time_limit_s:g} s")
+
+    def _tell(self, state: VehicleState | None) -> None:
+        """Note what is new, and show progress once a second."""
+        session = self._session
+        if session.phase is not self._phase:
+            self._phase = session.phase
+            self._note("phase", session.phase.value)
+        for text in session.telemetry.texts.since(self._texts):
+            self._note("autopilot", text.text.strip())
+        self._texts = session.telemetry.texts.total
+        if session.phase is Phase.TAKING_OFF and not self._camera_asked:
+            self._camera_asked = True
+            session.camera.start(1.0 / self._config.camera_rate_hz)
+        companion = self.companion
+        if companion is not None and companion.mode is not self._mode:
+            self._tell_mode(companion)
+        if state is not None and self.stamp_s >= self._next_progress_s:
+            self._next_progress_s = self.stamp_s + 1.0
+            self._watcher.on_progress(self._progress(state))
+
+    def _tell_mode(self, companion: Companion) -> None:
+        mode, before = companion.mode, self._mode
+        self._mode = mode
+        if mode is Mode.SLOWING:
+            self._note("slow", "slows down before an obstacle")
+        elif mode is Mode.STOPPING:
+            self._note("stop", "stops before an obstacle")
+        elif mode is Mode.FLYING and before is not None:
+            again = companion.pilot.counters.replans > 0
+            self._note(
+                "replan" if again else "plan", "flies a new plan" if again else "flies a plan"
+            )
+
+    def _note(self, kind: str, text: str) -> None:
+        state = self._session.state
+        place = None if state is None else tuple(round(float(c), 3) for c in state.position_enu_m)
+        self.log.add(round(self.stamp_s, 3), kind, text, place)  # type: ignore[arg-type]
+
+    def _progress(self, state: VehicleState) -> Progress:
+        companion = self.companion
+        return Progress(
+            stamp_s=self.stamp_s,
+            phase=self._session.phase.value
+            if companion is None or self._session.phase is not Phase.OFFBOARD
+            else companion.mode.value,
+            speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),
+            goal_distance_m=None if companion is None else companion.goal_distance_m(state),
+            replans=0 if companion is None else companion.pilot.counters.replans,
+        )
+
+    # For the record -------------------------------------------------------------------------------
+
+    @property
+    def goal_enu_m(self) -> FloatArray | None:
+        """(3,), m; None before the briefing."""
+        return None if self._briefing is None else self._briefing.goal_enu_m
+
+    def own_quality(self) -> quality.QualityOfFlight:
+        """Quality of flight as far as the companion itself knows it."""
+        if self.goal_enu_m is None:
+            return quality.QualityOfFlight()
+        return quality.from_states(*self.trace.motion(), self.goal_enu_m)
+
+    def statistics(self) -> dict[str, Any]:
+        """Counters of pilot, kernels and camera link."""
+        companion = self.companion
+        if companion is None:
+            return {"pilot": None, "kernels": {}, "images": {}}
+        kernels = {
+            name: {
+                "invocations": node.invocations,
+                "dropped_inputs": node.dropped,
+                "busy_s": round(node.busy_s, 9),
+            }
+            for name, node in companion.executor.nodes.items()
+        }
+        return {
+            "pilot": asdict(companion.pilot.counters),
+            "kernels": kernels,
+            "images": {"received": self._images.received, "lost": self._images.lost},
+        }
+
+    def plan_lines(self) -> list[dict[str, Any]]:
+        """The planned trajectories, thinned for drawing."""
+        if self.companion is None:
+            return []
+        return [
+            {
+                "stamp_s": plan.stamp_s,
+                "points_enu_m": np.round(plan.waypoints[:, 0:3], 3).tolist(),
+            }
+            for plan in self.companion.plans
+        ]

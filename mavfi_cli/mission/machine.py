@@ -1,0 +1,146 @@
+"""What this machine can do: each check says what it found, and what to do where it fails."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+
+class Verdict(Enum):
+    """How a check ended."""
+
+    OK = "ok"
+    LIMITED = "limited"  # flying works, something else does not
+    FAILED = "failed"  # flying does not work
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One line of the report."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    remedy: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for --json."""
+        return {**asdict(self), "verdict": self.verdict.value}
+
+
+_WHEELS = {
+    "numpy": "numpy", "numba": "numba", "jsbsim": "jsbsim", "pymavlink": "pymavlink",
+    "pyoctomap": "pyoctomap", "ompl": "ompl", "python-fcl": "fcl", "pyarrow": "pyarrow",
+    "matplotlib": "matplotlib", "click": "click", "rich": "rich", "cattrs": "cattrs",
+    "pyserial": "serial",
+}  # fmt: skip
+_EXTRAS = {"train": "torch", "cluster": "distributed", "view": "rerun"}
+
+
+def check_machine() -> Iterator[Check]:
+    """Run every check, one after the other."""
+    yield _python()
+    yield _processor()
+    yield from _wheels()
+    yield _extras()
+    yield _disk()
+    yield _loopback()
+    yield _physics()
+    yield from _injection()
+
+
+def _python() -> Check:
+    version = platform.python_version()
+    good = sys.version_info >= (3, 11)
+    return Check(
+        name="Python", verdict=Verdict.OK if good else Verdict.FAILED, found=version,
+        remedy="" if good else "install Python 3.11 or newer",
+    )  # fmt: skip
+
+
+def _processor() -> Check:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    system, machine = platform.system(), platform.machine()
+    found = f"{system} {machine}, {cores} core{'s' if cores != 1 else ''} usable"
+    if system != "Linux" or machine not in ("x86_64", "aarch64"):
+        return Check(name="Processor", verdict=Verdict.LIMITED, found=found,
+                     remedy="wheels exist for Linux on x86-64")  # fmt: skip
+    if machine == "aarch64":
+        return Check(name="Processor", verdict=Verdict.LIMITED, found=found,
+                     remedy="jsbsim and pyoctomap have no wheel here: build them")  # fmt: skip
+    return Check(name="Processor", verdict=Verdict.OK, found=found)
+
+
+def _wheels() -> Iterator[Check]:
+    missing, found = [], []
+    for distribution, module in _WHEELS.items():
+        try:
+            importlib.import_module(module)
+            found.append(f"{distribution} {importlib.metadata.version(distribution)}")
+        except (ImportError, importlib.metadata.PackageNotFoundError, OSError) as error:
+            missing.append(f"{distribution} ({error})")
+    if missing:
+        told = "missing: " + "; ".join(missing)
+        yield Check(name="Libraries", verdict=Verdict.FAILED, found=told,
+                    remedy="pip install -e . in the project's folder")  # fmt: skip
+    else:
+        yield Check(name="Libraries", verdict=Verdict.OK, found=", ".join(found))
+
+
+def _extras() -> Check:
+    have = [extra for extra, module in _EXTRAS.items() if importlib.util.find_spec(module)]
+    lack = [extra for extra in _EXTRAS if extra not in have]
+    found = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
+    return Check(name="Extras", verdict=Verdict.OK, found=found)
+
+
+def _disk() -> Check:
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    good = free > 1.0
+    return Check(
+        name="Disk", verdict=Verdict.OK if good else Verdict.LIMITED,
+        found=f"{free:.1f} GB free here",
+        remedy="" if good else "a campaign wants more room; name another folder with --out",
+    )  # fmt: skip
+
+
+def _loopback() -> Check:
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
+            there.bind(("127.0.0.1", 0))
+            there.settimeout(2.0)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
+                here.sendto(b"mavfi", there.getsockname())
+            good = there.recv(16) == b"mavfi"
+    except OSError as error:
+        return Check(name="Loopback", verdict=Verdict.LIMITED, found=f"UDP fails: {error}",
+                     remedy="`mavfi fly` does not need it; ground stations do")  # fmt: skip
+    return Check(name="Loopback", verdict=Verdict.OK if good else Verdict.LIMITED,
+                 found="UDP on 127.0.0.1 works")  # fmt: skip
+
+
+def _physics() -> Check:
+    """The vehicle's process starts, which loads JSBSim and every compiled kernel it has."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = subprocess.run(
+            [sys.executable, "-m", "sitl", "--version"], capture_output=True, text=True, cwd=folder,
+            timeout=120.0, check=False,
+        )  # fmt: skip
+    if run.returncode == 0:
+        return Check(name="Vehicle", verdict=Verdict.OK, found=run.stdout.strip())
+    last = (run.stderr.strip().splitlines() or ["no message"])[-1]
+    return Check(name="Vehicle", verdict=Verdict.FAILED, found=last,
+                 remedy="pip install -e . in the project's folder")  # fmt: skip

@@ -1,0 +1,202 @@
+"""Fly one mission and leave its record: the function behind `mavfi fly`."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import importlib.metadata
+import json
+import os
+import platform as host_platform
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli import __version__
+from mavfi_cli.autonomy import planners, warm_up
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.types import Outcome
+from mavfi_cli.link.transport import Transport, open_transport
+from mavfi_cli.mission import briefing, quality
+from mavfi_cli.mission.companion import response_times
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.flight import Flight
+from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.run_folder import CRASH, RunFolder, new_run_folder
+from mavfi_cli.mission.trace import write_trace
+from mavfi_cli.mission.vehicle_process import VehicleProcess
+
+_VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")
+
+
+def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder:
+    """Fly one mission from start to end and write its run folder.
+
+    Whatever becomes of the flight, crash of the companion included, is a result and is recorded.
+
+    Args:
+        config: the mission.
+        out: where the run folder goes.
+        watcher: gets progress and events.
+
+    Raises:
+        MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
+            or its record could not be written.
+    """
+    started = datetime.datetime.now(datetime.UTC)
+    begun = time.perf_counter()
+    platform = load_platform(config.platform)
+    planner = planners.find(config.planner)
+    with _vehicle(config) as (transport, truth_folder, process):
+        warm_up()
+        with _interruptible() as interrupt:
+            flight = Flight(config, transport, platform, planner, watcher, interrupt)
+            try:
+                flight.connect()
+                flight.brief(
+                    briefing.of_config(config)
+                    if truth_folder is None
+                    else briefing.of_simulation(truth_folder)
+                )
+            except MavfiError:
+                transport.close()
+                if process is not None and (failure := _failure(process)):
+                    raise failure from None
+                raise
+            name = Path(config.world).stem if config.link is None else "link"
+            folder = new_run_folder(out, f"{name}-{config.seed}")
+            flight_begun = time.perf_counter()
+            crash = _fly(flight, folder)
+            flight_wall_s = time.perf_counter() - flight_begun
+        if process is not None:
+            process.stop()
+        host = {
+            "started": started.isoformat(timespec="seconds"),
+            "startup_s": round(flight_begun - begun, 3),
+            "flight_wall_s": round(flight_wall_s, 3),
+            "machine": host_platform.machine(),
+            "cores": os.cpu_count(),
+            "stage_wall_s": {k: round(v, 4) for k, v in flight.wall.totals.items()},
+        }
+        truth, referee = _read_truth(truth_folder)
+    _write(flight, folder, config, host, truth, referee, crash)
+    return folder
+
+
+def _fly(flight: Flight, folder: RunFolder) -> str | None:
+    """Fly to the end. A crash of the companion's software is an outcome: returns its traceback."""
+    try:
+        flight.fly(folder.tlog)
+    except MavfiError:
+        raise
+    except Exception as error:  # the mission-process boundary: a crash is a result
+        flight.end(Outcome.CRASH, f"{type(error).__name__}: {error}")
+        return traceback.format_exc()
+    return None
+
+
+@contextlib.contextmanager
+def _vehicle(
+    config: MissionConfig,
+) -> Iterator[tuple[Transport, Path | None, VehicleProcess | None]]:
+    """The other end: a simulated vehicle of our own, or a foreign autopilot."""
+    if config.link is not None:
+        transport = open_transport(config.link)
+        try:
+            yield transport, None, None
+        finally:
+            transport.close()
+        return
+    with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
+        process = VehicleProcess(config, Path(folder))
+        try:
+            yield open_transport(f"fd:{process.socket.detach()}"), Path(folder), process
+        finally:
+            process.stop()
+
+
+def _failure(process: VehicleProcess) -> MavfiError | None:
+    process.stop()
+    return process.failure()
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """Turn Ctrl-C and SIGTERM into a request, so that the flight ends with a whole record.
+
+    Yields a list that is empty until then. Only the main thread can ask for this.
+    """
+    asked: list[int] = []
+    previous: dict[signal.Signals, Any] = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with contextlib.suppress(ValueError):  # not the main thread
+            previous[number] = signal.signal(number, lambda n, _frame: asked.append(n))
+    try:
+        yield asked
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, Any] | None]:
+    """The referee's log and report; None for a foreign autopilot, or a vehicle that died."""
+    if folder is None or not (folder / "truth.json").is_file():
+        return None, None
+    with np.load(folder / "truth.npz") as data:
+        truth = {name: data[name] for name in data.files}
+    return truth, json.loads((folder / "truth.json").read_text())
+
+
+def _write(
+    flight: Flight,
+    folder: RunFolder,
+    config: MissionConfig,
+    host: dict[str, Any],
+    truth: quality.Truth | None,
+    referee: dict[str, Any] | None,
+    crash: str | None,
+) -> None:
+    companion = flight.companion
+    goal = flight.goal_enu_m
+    if truth is not None and goal is not None:
+        qof = quality.from_truth(truth, flight.takeover_s, flight.end_s, goal)
+    else:
+        qof = flight.own_quality()
+    assert flight.outcome is not None
+    result = {
+        "schema": 1,
+        "outcome": flight.outcome.value,
+        "reason": flight.reason,
+        "config": config.to_dict(),
+        "seeds": {"root": config.seed},
+        "simulated_s": flight.end_s,
+        "quality_of_flight": qof.to_dict(),
+        **flight.statistics(),
+        "response_time_s": response_times(companion.reactions if companion else []),
+        "events": flight.log.to_list(),
+        "plans": flight.plan_lines(),
+        "goal_enu_m": None if goal is None else goal.tolist(),
+        "world": None if referee is None else referee["world"],
+        "referee": None if referee is None else {k: v for k, v in referee.items() if k != "world"},
+        "versions": _versions(),
+        "host": host,
+    }
+    write_trace(folder.trace, flight.trace.table(truth))
+    if crash is not None:
+        (folder.path / CRASH).write_text(crash)
+    folder.write_result(result)
+
+
+def _versions() -> dict[str, str]:
+    versions = {"mavfi": __version__, "python": sys.version.split()[0]}
+    for name in _VERSIONS:
+        versions[name] = importlib.metadata.version(name)
+    return versions

@@ -1,0 +1,23 @@
+"""Where the host's time goes. Never part of the mission: only the record's `host` section."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from time import perf_counter
+
+
+class WallClock:
+    """Host seconds by name."""
+
+    def __init__(self) -> None:
+        self.totals: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[None]:
+        """Add what the block takes to a name."""
+        begun = perf_counter()
+        try:
+            yield
+        finally:
+            self.totals[name] = self.totals.get(name, 0.0) + perf_counter() - begun
