@@ -1,0 +1,260 @@
+"""The command line of worlds: list, make, check, draw."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from mavfi_cli.core.errors import MavfiError, RecordError
+from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
+from sitl.world.generate import Pair
+from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, world_names
+from sitl.world.scene import read_scene, scene_toml
+from sitl.world.world import World, show
+
+F = TypeVar("F", bound=Callable[..., object])
+
+_WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a TOML file."
+
+
+class _Place(click.ParamType[tuple[float, ...]]):
+    """Three numbers with commas between: east, north, up in m."""
+
+    name = "x,y,z"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        try:
+            place = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            place = ()
+        if len(place) != 3 or not all(math.isfinite(c) for c in place):
+            self.fail(f"{value!r}: expected x,y,z in m, such as 30,40,5", param, ctx)
+        return place
+
+
+def _world_options(command: F) -> F:
+    decorators = [
+        click.argument("name", metavar="WORLD"),
+        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
+        click.option("--start", type=_Place(), help="Where flights start, ENU m."),
+        click.option("--goal", type=_Place(), help="Where they go, ENU m."),
+        click.option("--json", "as_json", is_flag=True, help="The result as JSON."),
+    ]
+    for decorate in reversed(decorators):
+        command = decorate(command)
+    return command
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def world() -> None:
+    """List, make, check and draw worlds: boxes on flat ground, a start and a goal.
+
+    A generated world holds, in each cell of 10 x 10 m, with a given probability a square tower of
+    unlimited height. A fixed scene always looks the same; there the seed chooses start and goal.
+    The same seed always gives the same world.
+    """
+
+
+@world.command(name="list")
+@click.option("--json", "as_json", is_flag=True, help="The result as JSON.")
+def list_(as_json: bool) -> None:
+    """Every world that has a name."""
+    rows = [(name, _describe(name)) for name in world_names()]
+    if as_json:
+        click.echo(json.dumps([{"name": n, "description": d} for n, d in rows], indent=1))
+        return
+    for name, description in rows:
+        click.echo(f"{name:<14}{description}")
+    click.echo("\nAlso gen:density,size (such as gen:0.1,4) and the path of a TOML file.")
+
+
+def _describe(name: str) -> str:
+    pair = GENERATED.get(name)
+    if pair is None:
+        return f"fixed scene: {read_scene(SCENE_FOLDER / f'{name}.toml').description}"
+    use = "to train detectors on: " if pair.family == "training" else ""
+    return use + _describe_pair(pair)
+
+
+def _describe_pair(pair: Pair) -> str:
+    return (
+        f"towers of {pair.size_m:g} x {pair.size_m:g} m in {100 * pair.density:g} % "
+        "of the 10 x 10 m cells"
+    )
+
+
+@world.command(epilog=_WORLD_HELP)
+@_world_options
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="File  [standard output].")
+def make(
+    name: str,
+    seed: int,
+    start: tuple[float, ...] | None,
+    goal: tuple[float, ...] | None,
+    as_json: bool,
+    output: Path | None,
+) -> None:
+    """Write a world as a TOML file of boxes, which every --world option takes."""
+    made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
+    text = scene_toml(made)
+    if output is not None:
+        write_whole(output, text.encode())
+    if as_json:
+        click.echo(json.dumps({**_world_json(made), "file": _name(output)}, indent=1))
+    elif output is None:
+        click.echo(text, nl=False)
+    else:
+        click.echo(f"{output}: {_boxes(made)}")
+
+
+@world.command(epilog=_WORLD_HELP)
+@_world_options
+@click.option(
+    "--clearance",
+    type=click.FloatRange(min=0.0),
+    default=DEFAULT_CLEARANCE_M,
+    show_default=True,
+    help="Room that the way must leave to every box, m.",
+)
+@click.option("--expect", type=click.Choice(["path"]), help="Exit with 1 where there is no path.")
+def check(
+    name: str,
+    seed: int,
+    start: tuple[float, ...] | None,
+    goal: tuple[float, ...] | None,
+    as_json: bool,
+    clearance: float,
+    expect: str | None,
+) -> None:
+    """Check a world: start and goal are clear, and a path with the clearance exists.
+
+    The path is searched on a grid of 0.5 m at the goal's height; flying over or under an obstacle
+    is not counted on.
+    """
+    made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
+    found = check_world(made, clearance_m=clearance)
+    if as_json:
+        click.echo(json.dumps({**_world_json(made), "check": _check_json(found)}, indent=1))
+    else:
+        click.echo(_check_text(made, found))
+    if expect == "path" and not found.path_exists:
+        sys.exit(1)
+
+
+@world.command(epilog=_WORLD_HELP)
+@_world_options
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="SVG file  [WORLD-SEED.svg].")
+@click.option("--path", "with_path", is_flag=True, help="Draw the way that `check` finds, too.")
+def draw(
+    name: str,
+    seed: int,
+    start: tuple[float, ...] | None,
+    goal: tuple[float, ...] | None,
+    as_json: bool,
+    output: Path | None,
+    with_path: bool,
+) -> None:
+    """Draw a world from above, as SVG."""
+    from sitl.world.draw import world_svg
+
+    made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
+    file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
+    path = check_world(made).path_enu_m if with_path else None
+    write_whole(file, world_svg(made, path))
+    if as_json:
+        click.echo(json.dumps({**_world_json(made), "file": _name(file)}, indent=1))
+    else:
+        click.echo(f"{file}: {_boxes(made)}")
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file so that a kill at any moment leaves the old one or the new one.
+
+    Raises:
+        RecordError: it cannot be written.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RecordError(f"{path}: {error.strerror}") from None
+
+
+def _name(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _boxes(made: World) -> str:
+    count = len(made.boxes_enu_m)
+    return f"{made.name}, seed {made.seed}, {count} box{'' if count == 1 else 'es'}"
+
+
+def _check_text(made: World, found: WorldCheck) -> str:
+    path = "none" if found.path_m is None else f"{found.path_m:.1f} m"
+    return "\n".join(
+        [
+            _boxes(made),
+            f"start  {show(made.start_enu_m)}, nearest obstacle {_metres(found.start_clearance_m)}",
+            f"goal   {show(made.goal_enu_m)}, nearest obstacle {_metres(found.goal_clearance_m)}",
+            f"path   {path} with {found.clearance_m:g} m clearance; straight "
+            f"{found.straight_m:.1f} m",
+        ]
+    )
+
+
+def _metres(value: float) -> str:
+    return f"{value:.1f} m away" if math.isfinite(value) else "none"
+
+
+def _world_json(made: World) -> dict[str, Any]:
+    return {
+        "name": made.name,
+        "seed": made.seed,
+        "bounds": made.bounds_enu_m.tolist(),
+        "start": made.start_enu_m.tolist(),
+        "goal": made.goal_enu_m.tolist(),
+        "boxes": made.boxes_enu_m.tolist(),
+    }
+
+
+def _check_json(found: WorldCheck) -> dict[str, Any]:
+    def finite(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {
+        "clearance_m": found.clearance_m,
+        "path_exists": found.path_exists,
+        "path_m": found.path_m,
+        "straight_m": found.straight_m,
+        "start_clearance_m": finite(found.start_clearance_m),
+        "goal_clearance_m": finite(found.goal_clearance_m),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line: 0 done, 1 a known error in one line, 2 usage."""
+    try:
+        world.main(args=arguments, prog_name="mavfi world", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except click.Abort:
+        return 1
+    except MavfiError as error:
+        click.echo(f"error: {error}", err=True)
+        return 1
+    return 0
