@@ -1,0 +1,347 @@
+"""The autopilot: dispatches messages, flies the mode in force, and gathers telemetry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.link.codec import dialect
+from sitl.autopilot import services
+from sitl.autopilot.commander import GPS_FIX_US, Commander, Result
+from sitl.autopilot.commands import Command, acknowledge, execute, from_int, from_long
+from sitl.autopilot.flight_modes import External, Hold, Land, Return, Sticks, Takeoff
+from sitl.autopilot.geodesy import Origin
+from sitl.autopilot.guidance import Guidance, Situation, climbs
+from sitl.autopilot.link import Link
+from sitl.autopilot.modes import Mode, mode_from_custom
+from sitl.autopilot.parameters import Parameters
+from sitl.autopilot.setpoint import (
+    Setpoint,
+    SetpointRefused,
+    global_setpoint,
+    local_setpoint,
+    no_setpoint,
+)
+from sitl.autopilot.snapshot import Snapshot
+from sitl.autopilot.streams import Preset
+from sitl.autopilot.telemetry_status import consumed_mah
+from sitl.autopilot.text import Severity, text_messages
+from sitl.autopilot.truth import Truth, Vector
+
+COMPONENT = 1
+_BUTTONS_CENTRED = (0, 0, 500, 0)
+_STRAIGHT_DOWN_MPS = 0.3
+
+Handler = Callable[[Any, Link], None]
+
+
+class Autopilot:
+    """A PX4-like autopilot without sockets or clock.
+
+    At each stamp: `observe` the vehicle, `collect` what each link is due, `handle` what clients
+    send, then `fly`: `setpoint` (11,) and `motors_on` say what to do until the next stamp.
+
+    Args:
+        truth: the vehicle's state; as it is before the first `observe`.
+        system_id: MAVLink system id.
+        origin: where on earth the local frame lies.
+    """
+
+    def __init__(self, truth: Truth, *, system_id: int = 1, origin: Origin | None = None) -> None:
+        self.system_id = system_id
+        self.parameters = Parameters(system_id)
+        self.commander = Commander(self.parameters)
+        self.snapshot = Snapshot(
+            commander=self.commander,
+            parameters=self.parameters,
+            origin=origin or Origin(),
+            truth=truth,
+            home_ned_m=np.array(truth.position_ned_m),
+        )
+        self.setpoint: Setpoint = no_setpoint()
+        self.motors_on = False
+        self._links: list[Link] = []
+        self._handlers = self._handler_table()
+        self._offboard: Setpoint = no_setpoint()
+        self._sticks = _BUTTONS_CENTRED
+        self._takeoff_down_m = math.nan
+        self._hold: Hold | None = None  # how to enter LOITER next
+        self._flown: Mode | None = None
+        self._guidance: Guidance = Hold()
+        self._elapsed_s = 0.0
+        self._text_id = 0
+
+    # Links.
+
+    def open_link(self, preset: Preset) -> Link:
+        """A new client with the streams of a preset."""
+        link = Link(preset)
+        self._links.append(link)
+        return link
+
+    def close_link(self, link: Link) -> None:
+        """Forget a client."""
+        self._links.remove(link)
+
+    def broadcast(self, message: Any) -> None:
+        """Queue a message for every client."""
+        for link in self._links:
+            link.send(message)
+
+    def collect(self, link: Link) -> list[Any]:
+        """Everything that a link is due at the newest stamp: answers, then streams."""
+        if link.parameters_left:
+            services.list_parameters(self, link)
+        due = link.streams.due(self.snapshot.stamp_us, self.snapshot)
+        if not link.outbox:
+            return due
+        messages, link.outbox = link.outbox, []
+        messages += due
+        return messages
+
+    def take_outbox(self, link: Link) -> list[Any]:
+        """Answers and texts only, for a link that is served between ticks."""
+        messages, link.outbox = link.outbox, []
+        return messages
+
+    # What clients ask.
+
+    def handle(self, message: Any, link: Link) -> None:
+        """Take one message of a client; what is not for this autopilot is ignored."""
+        handler = self._handlers.get(message.get_msgId())
+        if handler is not None:
+            handler(message, link)
+            self._flush_texts()
+
+    def enter_mode(self, mode: Mode | None) -> Result:
+        """Change the mode as a user asks; entering a mode again starts it anew."""
+        result = self.commander.request_mode(mode)
+        if result is Result.ACCEPTED:
+            self._flown = None
+            self._hold = None
+            if mode is Mode.TAKEOFF:
+                self._takeoff_down_m = math.nan
+        return result
+
+    def take_off(self, target_down_m: float) -> Result:
+        """Enter AUTO.TAKEOFF to a height; disarmed, it begins with arming."""
+        result = self.enter_mode(Mode.TAKEOFF)
+        if result is Result.ACCEPTED:
+            self._takeoff_down_m = target_down_m
+        return result
+
+    def go_to(self, target_ned_m: Vector, yaw_rad: float) -> Result:
+        """Enter AUTO.LOITER at a place."""
+        if self.commander.landed:
+            return Result.DENIED
+        result = self.enter_mode(Mode.LOITER)
+        if result is Result.ACCEPTED:
+            self._hold = Hold(target_ned_m, yaw_rad)
+        return result
+
+    def set_home(self, place_ned_m: Vector) -> None:
+        """Move the home position and tell everybody."""
+        self.snapshot.home_ned_m = place_ned_m
+        self._announce_home()
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Change a REAL32 parameter from inside, with its broadcast."""
+        index = self.parameters.index(name)
+        assert index is not None
+        self.parameters.write(name, value, 9)
+        self.broadcast(self.parameters.message(index))
+
+    # What time brings.
+
+    def observe(self, stamp_us: int, truth: Truth) -> None:
+        """Take the vehicle's state at a stamp; the commander decides what follows from it."""
+        now = self.snapshot
+        self._elapsed_s = elapsed_s = (stamp_us - now.stamp_us) * 1e-6
+        has_fix_now = stamp_us >= GPS_FIX_US > now.stamp_us
+        now.stamp_us, now.truth = stamp_us, truth
+        if has_fix_now:
+            self.set_home(np.array(truth.position_ned_m))
+        now.consumed_mah += consumed_mah(truth.battery_current_a, elapsed_s)
+        wants_up = self.motors_on and climbs(self.setpoint, truth)
+        self.commander.update(stamp_us, truth, wants_up=wants_up)
+        self._flush_texts()
+
+    @property
+    def may_touch_ground(self) -> bool:
+        """Whether a gentle touch of the ground now would be a landing."""
+        if self.commander.mode is not Mode.OFFBOARD:
+            return True
+        north, east, down = self.setpoint[3:6]
+        return bool(math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0)
+
+    def fly(self) -> None:
+        """Let the mode in force choose setpoint and motors until the next stamp."""
+        commander, truth = self.commander, self.snapshot.truth
+        out = no_setpoint()
+        if not commander.armed:
+            self._flown = None
+            self._command(out, motors_on=False)
+            return
+        if commander.mode is not self._flown:
+            self._guidance = self._enter(commander.mode)
+            self._flown = commander.mode
+        spool_up_s = self.parameters.effective("COM_SPOOLUP_TIME")
+        spooled_up = commander.armed_for_s >= spool_up_s
+        self._guidance.fly(
+            Situation(
+                truth=truth, dt_s=self._elapsed_s, parameters=self.parameters,
+                landed=commander.landed, spooled_up=spooled_up,
+                home_ned_m=self.snapshot.home_ned_m, heading_rad=self.snapshot.euler_rad[2],
+            ),
+            out,
+        )  # fmt: skip
+        lifts_off = spooled_up and climbs(out, truth)
+        flies = not commander.landed or lifts_off
+        self._command(out, motors_on=flies and not commander.terminated)
+        self._flush_texts()
+
+    def _command(self, setpoint: Setpoint, *, motors_on: bool) -> None:
+        self.setpoint = self.snapshot.setpoint = setpoint
+        self.motors_on = self.snapshot.motors_on = motors_on
+
+    def _enter(self, mode: Mode) -> Guidance:
+        """The guidance that begins a mode."""
+        if mode is Mode.OFFBOARD:
+            return External(lambda: self._offboard)
+        if mode is Mode.POSCTL:
+            return Sticks(lambda: self._sticks)
+        if mode is Mode.TAKEOFF:
+            return self._begin_takeoff()
+        if mode is Mode.LAND:
+            return Land()
+        if mode is Mode.RTL:
+            return Return(self._announce_return)
+        hold, self._hold = self._hold or Hold(), None
+        return hold
+
+    def _begin_takeoff(self) -> Guidance:
+        down = self._takeoff_down_m
+        if math.isnan(down):
+            height = self.parameters.effective("MIS_TAKEOFF_ALT")
+            down = float(self.snapshot.home_ned_m[2]) - height
+
+        def finished() -> None:
+            place = np.array(self.snapshot.truth.position_ned_m)
+            place[2] = min(down, float(place[2]) + 0.5)
+            self._hold = Hold(place)
+            self.commander.takeoff_finished()
+
+        return Takeoff(down, finished)
+
+    def _announce_return(self, height_m: float) -> None:
+        amsl = self.snapshot.amsl_m(float(self.snapshot.home_ned_m[2])) + height_m
+        text = f"RTL: start return at {amsl:.0f} m ({height_m:.0f} m above destination)"
+        self.commander.say(Severity.INFO, text)
+
+    def _announce_home(self) -> None:
+        for number in (
+            dialect.MAVLINK_MSG_ID_HOME_POSITION,
+            dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+        ):
+            for link in self._links:
+                link.streams.hasten(number, self.snapshot.stamp_us)
+
+    def _flush_texts(self) -> None:
+        texts = self.commander.texts
+        if not texts:
+            return
+        self.commander.texts = []
+        for severity, text in texts:
+            self._text_id = self._text_id % 0xFFFF + 1
+            for message in text_messages(severity, text, self._text_id):
+                self.broadcast(message)
+
+    # Dispatch.
+
+    def _handler_table(self) -> dict[int, Handler]:
+        def addressed(service: Callable[[Autopilot, Any, Link], None]) -> Handler:
+            def handler(message: Any, link: Link) -> None:
+                if self._is_for_me(message):
+                    service(self, message, link)
+
+            return handler
+
+        targeted = {
+            dialect.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: services.param_request_list,
+            dialect.MAVLINK_MSG_ID_PARAM_REQUEST_READ: services.param_request_read,
+            dialect.MAVLINK_MSG_ID_PARAM_SET: services.param_set,
+            dialect.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: services.mission_request_list,
+            dialect.MAVLINK_MSG_ID_MISSION_COUNT: services.mission_count,
+            dialect.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: services.mission_clear_all,
+            dialect.MAVLINK_MSG_ID_MISSION_REQUEST: services.mission_request,
+            dialect.MAVLINK_MSG_ID_MISSION_REQUEST_INT: services.mission_request,
+            dialect.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: services.file_transfer,
+            dialect.MAVLINK_MSG_ID_LOG_REQUEST_LIST: services.log_request_list,
+        }
+        return {
+            **{number: addressed(service) for number, service in targeted.items()},
+            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: self._on_local_target,
+            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: self._on_global_target,
+            dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
+            dialect.MAVLINK_MSG_ID_COMMAND_LONG: self._on_command_long,
+            dialect.MAVLINK_MSG_ID_COMMAND_INT: self._on_command_int,
+            dialect.MAVLINK_MSG_ID_SET_MODE: self._on_set_mode,
+            dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: self._on_manual_control,
+            dialect.MAVLINK_MSG_ID_TIMESYNC: lambda m, link: services.timesync(self, m, link),
+            dialect.MAVLINK_MSG_ID_PING: lambda m, link: services.ping(self, m, link),
+        }
+
+    def _is_for_me(self, message: Any, *, anybody: bool = True) -> bool:
+        systems = (self.system_id, 0) if anybody else (self.system_id,)
+        return message.target_system in systems and message.target_component in (COMPONENT, 0)
+
+    def _on_local_target(self, message: Any, _link: Link) -> None:
+        if self._is_for_me(message):
+            heading = self.snapshot.euler_rad[2]
+            self._take_setpoint(lambda: local_setpoint(message, heading))
+
+    def _on_global_target(self, message: Any, _link: Link) -> None:
+        if self._is_for_me(message):
+            home_down = float(self.snapshot.home_ned_m[2])
+            self._take_setpoint(lambda: global_setpoint(message, self.snapshot.origin, home_down))
+
+    def _take_setpoint(self, read: Callable[[], Setpoint]) -> None:
+        try:
+            self._offboard = read()
+        except SetpointRefused as refusal:
+            self.commander.say(Severity.CRITICAL, str(refusal))
+            return
+        self.commander.offboard_setpoint_arrived()
+
+    def _on_attitude_target(self, message: Any, _link: Link) -> None:
+        if self._is_for_me(message):
+            self.commander.say(Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported")
+
+    def _on_command_long(self, message: Any, link: Link) -> None:
+        if self._is_for_me(message, anybody=False):
+            execute(self, from_long(message), link)
+
+    def _on_command_int(self, message: Any, link: Link) -> None:
+        if self._is_for_me(message, anybody=False):
+            execute(self, from_int(message), link)
+
+    def _on_set_mode(self, message: Any, link: Link) -> None:
+        """The message before DO_SET_MODE; answered as that, once."""
+        if message.target_system != self.system_id:
+            return
+        mode = mode_from_custom(message.custom_mode) if message.base_mode & 1 else None
+        command = Command(
+            number=dialect.MAV_CMD_DO_SET_MODE, p1=1.0, p2=0.0, p3=0.0, p4=0.0,
+            latitude_deg=math.nan, longitude_deg=math.nan, altitude_m=math.nan,
+            above_home=False, system=message.get_srcSystem(),
+            component=message.get_srcComponent(),
+        )  # fmt: skip
+        link.send(acknowledge(command, self.enter_mode(mode)))
+
+    def _on_manual_control(self, message: Any, _link: Link) -> None:
+        if message.target == self.system_id:
+            self._sticks = (message.x, message.y, message.z, message.r)
+            self.commander.sticks_arrived()

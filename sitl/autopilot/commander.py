@@ -1,0 +1,282 @@
+"""Modes, arming, failsafe and disarming: the decisions that PX4's commander takes.
+
+Texts, results and delays are those that a PX4 v1.17 was seen to give on the wire.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from sitl.autopilot.landing import LandDetector
+from sitl.autopilot.modes import Mode
+from sitl.autopilot.parameters import Parameters
+from sitl.autopilot.text import Severity
+from sitl.autopilot.truth import Truth
+
+GPS_FIX_US = 2_500_000  # first fix after boot, and with it the home position
+POSITION_US = 3_060_000  # global position fused
+READY_US = 4_000_000  # pre-arm checks pass
+
+_CONTROL_BACK_US = 1_000_000  # a lost source of setpoints must be back this long
+_RETRIED_MODES = (Mode.TAKEOFF, Mode.LAND, Mode.RTL)  # disarming ends them
+_UNARMABLE = (Mode.LAND, Mode.RTL)
+_OBL_ACTIONS = {4: Mode.LAND, 5: Mode.LOITER}  # COM_OBL_RC_ACT; the rest is RTL without a stick
+_OBL_TERMINATE = 6
+
+
+class Result(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+class SystemStatus(IntEnum):
+    """MAV_STATE, the values in use."""
+
+    UNINIT = 0
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+    FLIGHT_TERMINATION = 8
+
+
+class LandedState(IntEnum):
+    """MAV_LANDED_STATE."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKEOFF = 3
+    LANDING = 4
+
+
+class Commander:
+    """Owns the mode and the arming state.
+
+    Attributes:
+        mode: the mode that flies: what the user chose, or the failsafe's.
+        armed: whether it is armed.
+        terminated: whether flight termination has stopped the motors for good.
+        texts: severity and words of what there is to say; the owner takes them away.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._detector = LandDetector()
+        self.stamp_us = 0
+        self.user_mode = Mode.LOITER
+        self.failsafe: Mode | None = None
+        self.armed = False
+        self.terminated = False
+        self.texts: list[tuple[Severity, str]] = []
+        self._armed_us = 0
+        self._landed_us = 0
+        self._flown_since_arming = False
+        self._offboard_us: int | None = None  # newest accepted setpoint
+        self._sticks_us: int | None = None  # newest stick message
+        self._control_back_us: int | None = None
+        self._battery_warned = 0
+
+    @property
+    def mode(self) -> Mode:
+        """The mode in force."""
+        return self.failsafe or self.user_mode
+
+    @property
+    def landed(self) -> bool:
+        """Whether the vehicle stands on the ground."""
+        return self._detector.landed
+
+    @property
+    def armed_for_s(self) -> float:
+        """Time since arming; meaningless while disarmed."""
+        return (self.stamp_us - self._armed_us) * 1e-6
+
+    @property
+    def has_gps_fix(self) -> bool:
+        """Whether GPS has its fix and home is known."""
+        return self.stamp_us >= GPS_FIX_US
+
+    @property
+    def has_global_position(self) -> bool:
+        """Whether the estimator has taken in the GPS."""
+        return self.stamp_us >= POSITION_US
+
+    @property
+    def can_arm(self) -> bool:
+        """The PREARM_CHECK health bit."""
+        return (
+            self.stamp_us >= READY_US
+            and not self.terminated
+            and self.mode not in _UNARMABLE
+            and self.is_available(self.user_mode)
+        )
+
+    @property
+    def system_status(self) -> SystemStatus:
+        """HEARTBEAT.system_status."""
+        if self.terminated:
+            return SystemStatus.FLIGHT_TERMINATION
+        if self.failsafe is not None:
+            return SystemStatus.CRITICAL
+        if self.armed:
+            return SystemStatus.ACTIVE
+        return SystemStatus.STANDBY if self.can_arm else SystemStatus.UNINIT
+
+    @property
+    def landed_state(self) -> LandedState:
+        """EXTENDED_SYS_STATE.landed_state."""
+        if self.landed:
+            return LandedState.ON_GROUND
+        special = {Mode.TAKEOFF: LandedState.TAKEOFF, Mode.LAND: LandedState.LANDING}
+        return special.get(self.mode, LandedState.IN_AIR)
+
+    def is_available(self, mode: Mode) -> bool:
+        """Whether the mode has what it needs: OFFBOARD its setpoints, POSCTL its sticks."""
+        if mode is Mode.OFFBOARD:
+            return self._is_fresh(self._offboard_us, "COM_OF_LOSS_T")
+        if mode is Mode.POSCTL:
+            return self._is_fresh(self._sticks_us, "COM_RC_LOSS_T")
+        return mode is not Mode.MANUAL  # attitude sticks: there is no radio control
+
+    def _is_fresh(self, stamp_us: int | None, parameter: str) -> bool:
+        if stamp_us is None:
+            return False
+        return self.stamp_us - stamp_us <= self._parameters.effective(parameter) * 1e6
+
+    def offboard_setpoint_arrived(self) -> None:
+        """Feed the watchdog of OFFBOARD."""
+        self._offboard_us = self.stamp_us
+
+    def sticks_arrived(self) -> None:
+        """Feed the watchdog of POSCTL."""
+        self._sticks_us = self.stamp_us
+
+    def say(self, severity: Severity, text: str) -> None:
+        """Queue a text for every client."""
+        self.texts.append((severity, text))
+
+    # Requests of a client.
+
+    def request_mode(self, mode: Mode | None) -> Result:
+        """Change the user's mode; disarmed, any mode will do."""
+        if mode is None:
+            return Result.TEMPORARILY_REJECTED
+        if self.armed and not self.is_available(mode):
+            self.say(Severity.CRITICAL, f"Switching to {mode.label} is currently not available")
+            return Result.TEMPORARILY_REJECTED
+        self.user_mode = mode
+        self.failsafe = None
+        return Result.ACCEPTED
+
+    def request_arm(self, *, force: bool) -> Result:
+        """Arm, after the checks unless forced."""
+        if self.armed:
+            return Result.ACCEPTED
+        if self.terminated or not (force or self.can_arm):
+            text = "Arming denied: Resolve system health failures first"
+            self.say(Severity.CRITICAL, text)
+            return Result.TEMPORARILY_REJECTED
+        self.armed = True
+        self._armed_us = self.stamp_us
+        self._flown_since_arming = False
+        self.say(Severity.INFO, "Armed by external command")
+        return Result.ACCEPTED
+
+    def request_disarm(self, *, force: bool) -> Result:
+        """Disarm; in the air only when forced."""
+        if self.armed and not self.landed and not force:
+            self.say(Severity.CRITICAL, "Disarming denied: not landed")
+            return Result.TEMPORARILY_REJECTED
+        if self.armed:
+            self._disarm("external command")
+        return Result.ACCEPTED
+
+    def terminate(self, text: str) -> None:
+        """Stop the motors for good."""
+        if not self.terminated:
+            self.terminated = True
+            self.say(Severity.EMERGENCY, text)
+
+    # What time brings.
+
+    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool) -> None:
+        """Advance to a stamp with the newest state of the vehicle.
+
+        Args:
+            stamp_us: boot clock.
+            truth: the vehicle.
+            wants_up: whether the setpoint in force climbs.
+        """
+        self.stamp_us = stamp_us
+        trigger = self._parameters.effective("LNDMC_TRIG_TIME")
+        if self._detector.update(stamp_us, truth, wants_up=wants_up, trigger_s=trigger):
+            self._note_landing()
+        if self.armed:
+            self._watch_control()
+            self._auto_disarm()
+        self._watch_battery(truth.battery_remaining)
+
+    def takeoff_finished(self) -> None:
+        """Take-off height reached: AUTO.TAKEOFF hands over to AUTO.LOITER."""
+        if self.mode is Mode.TAKEOFF:
+            self.user_mode = Mode.LOITER
+
+    def _note_landing(self) -> None:
+        self._landed_us = self.stamp_us
+        if not self.landed:
+            self._flown_since_arming = True
+        if self.armed:
+            what = "Landing" if self.landed else "Takeoff"
+            self.say(Severity.INFO, f"{what} detected")
+
+    def _watch_control(self) -> None:
+        """Lose, and find again, what the user's mode lives on."""
+        if self.is_available(self.user_mode):
+            if self.failsafe is None:
+                return
+            if self._control_back_us is None:
+                self._control_back_us = self.stamp_us
+            if self.stamp_us - self._control_back_us >= _CONTROL_BACK_US:
+                self.failsafe = None
+            return
+        self._control_back_us = None
+        if self.failsafe is not None or self.terminated:
+            return
+        action = int(self._parameters.effective("COM_OBL_RC_ACT"))
+        self.failsafe = _OBL_ACTIONS.get(action, Mode.RTL)
+        self.say(Severity.CRITICAL, "Failsafe activated")
+        if action >= _OBL_TERMINATE:
+            self.terminate("Flight termination active")
+
+    def _auto_disarm(self) -> None:
+        if not self.landed:
+            return
+        if self._flown_since_arming:
+            wait, since, reason = "COM_DISARM_LAND", self._landed_us, "landing"
+        else:
+            wait, since = "COM_DISARM_PRFLT", self._armed_us
+            reason = "auto preflight disarming"
+        limit_s = self._parameters.effective(wait)
+        if limit_s > 0.0 and self.stamp_us - since >= limit_s * 1e6:
+            self._disarm(reason)
+
+    def _disarm(self, reason: str) -> None:
+        self.armed = False
+        self.failsafe = None
+        self._control_back_us = None
+        self.say(Severity.INFO, f"Disarmed by {reason}")
+        if self.user_mode in _RETRIED_MODES:
+            self.user_mode = Mode.LOITER
+
+    def _watch_battery(self, remaining: float) -> None:
+        levels = (("BAT_LOW_THR", "Low battery level"), ("BAT_CRIT_THR", "Critical battery level"))
+        if self._battery_warned == len(levels):
+            return
+        threshold, text = levels[self._battery_warned]
+        if remaining < self._parameters.effective(threshold):
+            self._battery_warned += 1
+            self.say(Severity.WARNING, text)

@@ -1,0 +1,201 @@
+"""The flight modes: each turns the situation into a setpoint.
+
+Speeds and heights are PX4's parameters; the shapes (brake, then hold; climb, then cross, then
+come down) are those of its multicopter modes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import Enum, auto
+
+import numpy as np
+
+from sitl.autopilot.guidance import (
+    ALL_AXES,
+    HORIZONTAL,
+    Anchor,
+    Situation,
+    approach,
+    limit_velocity,
+)
+from sitl.autopilot.setpoint import Setpoint
+from sitl.autopilot.truth import Vector
+
+_TAKEOFF_FIRST_MPS = 0.4
+_TAKEOFF_NEAR_M = 0.2
+_ARRIVED_M = 0.5
+_STICK_INVALID = 32767
+
+
+class Hold:
+    """AUTO.LOITER: go to a place if one is given, then stay."""
+
+    def __init__(self, target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> None:
+        self._target = target_ned_m
+        self._yaw_rad = yaw_rad
+        self._anchor = Anchor(ALL_AXES, target_ned_m)
+
+    def fly(self, now: Situation, out: Setpoint) -> None:
+        """Move in a straight line while far away; stay otherwise."""
+        out[9] = self._yaw_rad
+        if self._target is not None:
+            delta = self._target - now.truth.position_ned_m
+            if float(delta @ delta) > _ARRIVED_M**2:
+                _go(now, out, delta)
+                return
+        self._anchor.hold(now, out)
+
+
+class Takeoff:
+    """AUTO.TAKEOFF: straight up to a height, then hand over."""
+
+    def __init__(self, target_down_m: float, finished: Callable[[], None]) -> None:
+        self._target_down_m = target_down_m
+        self._finished = finished
+        self._anchor = Anchor(HORIZONTAL)
+        self._climbing_s = 0.0
+
+    def fly(self, now: Situation, out: Setpoint) -> None:
+        """Climb with a speed that ramps up over MPC_TKO_RAMP_T."""
+        self._anchor.hold(now, out)
+        delta = self._target_down_m - float(now.truth.position_ned_m[2])
+        if not now.landed and delta > -_TAKEOFF_NEAR_M:
+            out[2] = self._target_down_m
+            self._finished()
+            return
+        if now.spooled_up:
+            self._climbing_s += now.dt_s
+        ramp_s = max(now.parameters.effective("MPC_TKO_RAMP_T"), now.dt_s)
+        fastest = now.parameters.effective("MPC_TKO_SPEED") * min(1.0, self._climbing_s / ramp_s)
+        out[5] = -min(max(fastest, _TAKEOFF_FIRST_MPS), max(-delta, _TAKEOFF_FIRST_MPS))
+
+
+class Land:
+    """AUTO.LAND: straight down, slower near the ground."""
+
+    def __init__(self, over: Vector | None = None) -> None:
+        self._anchor = Anchor(HORIZONTAL, over)
+
+    def fly(self, now: Situation, out: Setpoint) -> None:
+        """Descend at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2."""
+        self._anchor.hold(now, out)
+        value = now.parameters.effective
+        height = float(now.home_ned_m[2] - now.truth.position_ned_m[2])
+        high, low = value("MPC_LAND_ALT1"), value("MPC_LAND_ALT2")
+        share = (height - low) / (high - low) if high > low else float(height > low)
+        slow = value("MPC_LAND_SPEED")
+        out[5] = slow + (value("MPC_Z_V_AUTO_DN") - slow) * min(max(share, 0.0), 1.0)
+
+
+class _Leg(Enum):
+    CLIMB = auto()
+    CROSS = auto()
+    LAND = auto()
+
+
+class Return:
+    """AUTO.RTL: climb, cross, descend and land at home."""
+
+    def __init__(self, announce: Callable[[float], None]) -> None:
+        self._announce = announce
+        self._leg: _Leg | None = None
+        self._down_m = 0.0
+        self._anchor = Anchor(HORIZONTAL)
+        self._landing: Land | None = None
+
+    def fly(self, now: Situation, out: Setpoint) -> None:
+        """Fly the leg in force, and begin the next where it ends."""
+        if now.landed:
+            out[5] = now.parameters.effective("MPC_LAND_SPEED")
+            return
+        if self._leg is None:
+            self._begin(now)
+        to_home = now.home_ned_m - now.truth.position_ned_m
+        rise = self._down_m - float(now.truth.position_ned_m[2])
+        if self._leg is _Leg.CLIMB:
+            self._anchor.hold(now, out)
+            _go_vertical(now, out, rise)
+            if rise > -_ARRIVED_M:
+                self._leg = _Leg.CROSS
+        elif self._leg is _Leg.CROSS:
+            to_home[2] = rise
+            _go(now, out, to_home)
+            if math.hypot(to_home[0], to_home[1]) < _ARRIVED_M:
+                self._leg = _Leg.LAND
+                self._landing = Land(np.array(now.home_ned_m[:2]))
+        else:
+            self._come_down(now, out)
+
+    def _begin(self, now: Situation) -> None:
+        """Choose the height: a cone about home near it, RTL_RETURN_ALT far from it."""
+        value = now.parameters.effective
+        away = now.truth.position_ned_m - now.home_ned_m
+        distance, above = math.hypot(away[0], away[1]), -float(away[2])
+        height = value("RTL_RETURN_ALT")
+        cone = math.radians(value("RTL_CONE_ANG"))
+        if distance < value("RTL_MIN_DIST") and cone > 0.0:
+            in_cone = distance / math.tan(cone) if cone < math.pi / 2.0 else 0.0
+            height = min(height, max(in_cone, 2.0 * value("NAV_ACC_RAD")))
+        height = max(height, above)
+        self._down_m = float(now.home_ned_m[2]) - height
+        self._leg = _Leg.CLIMB
+        self._announce(height)
+
+    def _come_down(self, now: Situation, out: Setpoint) -> None:
+        assert self._landing is not None
+        self._landing.fly(now, out)
+
+
+class External:
+    """OFFBOARD: fly what the companion asks for."""
+
+    def __init__(self, newest: Callable[[], Setpoint]) -> None:
+        self._newest = newest
+
+    def fly(self, now: Situation, out: Setpoint) -> None:
+        """The newest accepted setpoint; an axis that it leaves free stands still."""
+        out[:] = self._newest()
+        for axis in range(3):
+            if math.isnan(out[axis]) and math.isnan(out[3 + axis]):
+                out[3 + axis] = 0.0
+        limit_velocity(out, now.parameters)
+
+
+class Sticks:
+    """POSCTL: velocity and yaw rate from MANUAL_CONTROL."""
+
+    def __init__(self, newest: Callable[[], tuple[int, int, int, int]]) -> None:
+        self._newest = newest
+
+    def fly(self, now: Situation, out: Setpoint) -> None:
+        """Sticks -1000..1000 to velocity in the heading frame; throttle 500 keeps the height."""
+        x, y, z, r = self._newest()
+        value = now.parameters.effective
+        forward, right = (_stick(s) * value("MPC_VEL_MANUAL") for s in (x, y))
+        cosine, sine = math.cos(now.heading_rad), math.sin(now.heading_rad)
+        out[3] = cosine * forward - sine * right
+        out[4] = sine * forward + cosine * right
+        lift = 0.0 if z == _STICK_INVALID else _stick(2 * z - 1000)
+        out[5] = -lift * value("MPC_Z_VEL_MAX_UP" if lift > 0.0 else "MPC_Z_VEL_MAX_DN")
+        out[10] = _stick(r) * math.radians(value("MPC_MAN_Y_MAX"))
+        limit_velocity(out, now.parameters)
+
+
+def _stick(value: int) -> float:
+    return 0.0 if value == _STICK_INVALID else min(max(value / 1000.0, -1.0), 1.0)
+
+
+def _go(now: Situation, out: Setpoint, delta: Vector) -> None:
+    value = now.parameters.effective
+    out[3:5] = approach(
+        delta[:2], speed_mps=value("MPC_XY_CRUISE"), acceleration_mps2=value("MPC_ACC_HOR")
+    )
+    _go_vertical(now, out, float(delta[2]))
+
+
+def _go_vertical(now: Situation, out: Setpoint, delta_m: float) -> None:
+    name = "MPC_Z_V_AUTO_UP" if delta_m < 0.0 else "MPC_Z_V_AUTO_DN"
+    limit = now.parameters.effective(name)
+    out[5] = approach(np.array([delta_m]), speed_mps=limit, acceleration_mps2=3.0)[0]

@@ -1,0 +1,29 @@
+"""One client of the autopilot: its streams and what waits to be sent to it."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from sitl.autopilot.streams import Preset, Streams
+
+
+class Link:
+    """The autopilot's end of one connection; knows nothing of sockets.
+
+    Attributes:
+        streams: the telemetry of this client.
+        outbox: messages that wait for the next collection, oldest first.
+        parameters_left: indices of parameters still to be listed.
+    """
+
+    __slots__ = ("outbox", "parameters_left", "streams")
+
+    def __init__(self, preset: Preset) -> None:
+        self.streams = Streams(preset)
+        self.outbox: list[Any] = []
+        self.parameters_left: deque[int] = deque()
+
+    def send(self, message: Any) -> None:
+        """Queue a message for this client."""
+        self.outbox.append(message)

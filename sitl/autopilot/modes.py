@@ -1,0 +1,67 @@
+"""Flight modes of a PX4 and how HEARTBEAT and DO_SET_MODE spell them.
+
+custom_mode = main << 16 | sub << 24 (PX4's px4_custom_mode.h, as seen on the wire of v1.17).
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+_CUSTOM_MODE_ENABLED = 0x01
+_AUTO_ENABLED = 0x04
+_GUIDED_ENABLED = 0x08
+_STABILIZE_ENABLED = 0x10
+_MANUAL_INPUT_ENABLED = 0x40
+SAFETY_ARMED = 0x80
+
+
+class Mode(Enum):
+    """A flight mode: PX4's main mode, its sub mode, and the name that PX4's texts use."""
+
+    MANUAL = (1, 0, "Manual")
+    POSCTL = (3, 0, "Position")
+    TAKEOFF = (4, 2, "Takeoff")
+    LOITER = (4, 3, "Hold")
+    RTL = (4, 5, "Return")
+    LAND = (4, 6, "Land")
+    OFFBOARD = (6, 0, "Offboard")
+
+    def __init__(self, main: int, sub: int, label: str) -> None:
+        self.main = main
+        self.sub = sub
+        self.label = label
+        self.custom_mode = main << 16 | sub << 24
+
+    @property
+    def is_auto(self) -> bool:
+        """Whether the autopilot flies by itself in this mode."""
+        return self.main == 4
+
+
+_BY_NUMBERS = {(mode.main, mode.sub): mode for mode in Mode}
+
+
+def mode_from_numbers(main: int, sub: int) -> Mode | None:
+    """The mode of a DO_SET_MODE's param2 and param3; None where there is none like it.
+
+    The sub mode counts only for AUTO, and AUTO without one is LOITER.
+    """
+    if main == 4:
+        return _BY_NUMBERS.get((4, sub or Mode.LOITER.sub))
+    return _BY_NUMBERS.get((main, 0))
+
+
+def mode_from_custom(custom_mode: int) -> Mode | None:
+    """The mode of a SET_MODE's custom_mode; None where there is none like it."""
+    return mode_from_numbers(custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF)
+
+
+def base_mode(mode: Mode, *, armed: bool) -> int:
+    """HEARTBEAT.base_mode of a mode, as PX4 v1.17 sends it."""
+    flags = _CUSTOM_MODE_ENABLED | (SAFETY_ARMED if armed else 0)
+    if mode.is_auto:
+        return flags | _AUTO_ENABLED | _GUIDED_ENABLED | _STABILIZE_ENABLED
+    if mode is Mode.OFFBOARD:
+        return flags | _STABILIZE_ENABLED
+    stabilized = _STABILIZE_ENABLED if mode is Mode.POSCTL else 0
+    return flags | _MANUAL_INPUT_ENABLED | stabilized

@@ -1,0 +1,131 @@
+"""Small MAVLink services: parameters, missions, files, logs, time and ping."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.link.codec import dialect
+from sitl.autopilot.link import Link
+from sitl.autopilot.parameters import HASH_INDEX, HASH_NAME, SetResult
+
+if TYPE_CHECKING:
+    from sitl.autopilot.autopilot import Autopilot
+
+PARAMETERS_A_TICK = 20  # about the thousand a second that a PX4 lists
+
+_FTP_NAK = 129
+_FTP_FILE_NOT_FOUND = 10
+_MISSION_ACCEPTED = 0
+_MISSION_UNSUPPORTED = 3
+_MISSION_INVALID_SEQUENCE = 13
+
+
+def param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
+    """List all parameters, the hash first, the rest a few at a time."""
+    link.send(autopilot.parameters.hash_message())
+    link.parameters_left.clear()
+    link.parameters_left.extend(range(len(autopilot.parameters)))
+
+
+def param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Send one parameter by index, or by name where the index is -1; silence if unknown."""
+    if message.param_index < 0:
+        if message.param_id == HASH_NAME:
+            link.send(autopilot.parameters.hash_message())
+            return
+        index = autopilot.parameters.index(message.param_id)
+    elif message.param_index == HASH_INDEX:
+        index = None
+    else:
+        index = message.param_index
+    if index is not None and index < len(autopilot.parameters):
+        link.send(autopilot.parameters.message(index))
+
+
+def param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Store a value; answered on this link, and a change is broadcast on all."""
+    if message.param_id == HASH_NAME:
+        link.parameters_left.clear()  # the client's cache is good, it needs no list
+        return
+    store = autopilot.parameters
+    result = store.write(message.param_id, message.param_value, message.param_type)
+    index = store.index(message.param_id)
+    if result is SetResult.IGNORED or index is None:
+        return
+    link.send(store.message(index))
+    if result is SetResult.CHANGED:
+        autopilot.broadcast(store.message(index))
+
+
+def list_parameters(autopilot: Autopilot, link: Link) -> None:
+    """Send the next few parameters of a list in progress."""
+    for _ in range(min(PARAMETERS_A_TICK, len(link.parameters_left))):
+        link.send(autopilot.parameters.message(link.parameters_left.popleft()))
+
+
+def mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> None:
+    """There are no items of any kind."""
+    link.send(
+        dialect.MAVLink_mission_count_message(
+            message.get_srcSystem(), message.get_srcComponent(), 0, message.mission_type
+        )
+    )
+
+
+def mission_count(_autopilot: Autopilot, message: Any, link: Link) -> None:
+    """An upload: an empty one is a way to clear, any other is refused."""
+    empty = message.count == 0
+    _mission_ack(message, link, _MISSION_ACCEPTED if empty else _MISSION_UNSUPPORTED)
+
+
+def mission_clear_all(_autopilot: Autopilot, message: Any, link: Link) -> None:
+    """There is nothing left to clear."""
+    _mission_ack(message, link, _MISSION_ACCEPTED)
+
+
+def mission_request(_autopilot: Autopilot, message: Any, link: Link) -> None:
+    """No item has any number."""
+    _mission_ack(message, link, _MISSION_INVALID_SEQUENCE)
+
+
+def _mission_ack(message: Any, link: Link, result: int) -> None:
+    link.send(
+        dialect.MAVLink_mission_ack_message(
+            message.get_srcSystem(), message.get_srcComponent(), result, message.mission_type
+        )
+    )
+
+
+def file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
+    """There are no files; the NAK spares a client its retries."""
+    request = bytes(message.payload)
+    sequence, session, opcode = struct.unpack_from("<HBB", request)
+    reply = struct.pack(
+        "<HBBBBBxIB", (sequence + 1) & 0xFFFF, session, _FTP_NAK, 1, opcode, 0, 0,
+        _FTP_FILE_NOT_FOUND,
+    )  # fmt: skip
+    link.send(
+        dialect.MAVLink_file_transfer_protocol_message(
+            0, message.get_srcSystem(), message.get_srcComponent(), reply.ljust(251, b"\0")
+        )
+    )
+
+
+def log_request_list(_autopilot: Autopilot, _message: Any, link: Link) -> None:
+    """There are no logs."""
+    link.send(dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
+
+
+def timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Answer a request (tc1 = 0) with the boot clock, ns."""
+    if message.tc1 == 0:
+        now_ns = max(autopilot.snapshot.stamp_us * 1000, 1)
+        link.send(dialect.MAVLink_timesync_message(now_ns, message.ts1))
+
+
+def ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Echo a ping that asks everybody; its answer carries the asker's ids."""
+    if message.target_system == 0 and message.target_component == 0:
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, system, component))

@@ -1,0 +1,158 @@
+"""Telemetry streams: which message goes out on which link, and how often."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Any
+
+from mavfi_cli.link.codec import dialect
+from sitl.autopilot import telemetry_motion as motion
+from sitl.autopilot import telemetry_status as status
+from sitl.autopilot.snapshot import Snapshot
+
+Builder = Callable[[Snapshot], Any]
+
+TICK_US = 20_000  # nothing is sent more often than the control loop runs
+
+BUILDERS: Mapping[int, Builder] = {
+    dialect.MAVLINK_MSG_ID_HEARTBEAT: status.heartbeat,
+    dialect.MAVLINK_MSG_ID_SYS_STATUS: status.sys_status,
+    dialect.MAVLINK_MSG_ID_SYSTEM_TIME: status.system_time,
+    dialect.MAVLINK_MSG_ID_PING: status.ping_request,
+    dialect.MAVLINK_MSG_ID_GPS_RAW_INT: motion.gps_raw_int,
+    dialect.MAVLINK_MSG_ID_ATTITUDE: motion.attitude,
+    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: motion.global_position_int,
+    dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: motion.servo_output_raw,
+    dialect.MAVLINK_MSG_ID_MISSION_CURRENT: status.mission_current,
+    dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: status.gps_global_origin,
+    dialect.MAVLINK_MSG_ID_VFR_HUD: motion.vfr_hud,
+    dialect.MAVLINK_MSG_ID_ATTITUDE_TARGET: motion.attitude_target,
+    dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: motion.position_target_local_ned,
+    dialect.MAVLINK_MSG_ID_HIGHRES_IMU: motion.highres_imu,
+    dialect.MAVLINK_MSG_ID_TIMESYNC: status.timesync_request,
+    dialect.MAVLINK_MSG_ID_ALTITUDE: motion.altitude,
+    dialect.MAVLINK_MSG_ID_BATTERY_STATUS: status.battery_status,
+    dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION: status.autopilot_version,
+    dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: status.estimator_status,
+    dialect.MAVLINK_MSG_ID_VIBRATION: status.vibration,
+    dialect.MAVLINK_MSG_ID_HOME_POSITION: status.home_position,
+    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: status.extended_sys_state,
+    dialect.MAVLINK_MSG_ID_ODOMETRY: motion.odometry,
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: motion.attitude_quaternion,
+    # Last, because on a lockstep link it closes the tick's batch.
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: motion.local_position_ned,
+}
+"""Every message that can be streamed or requested, in the order of sending."""
+
+_SLOW: Mapping[str, float] = {
+    "HEARTBEAT": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "PING": 1.0,
+    "ESTIMATOR_STATUS": 1.0,
+    "MISSION_CURRENT": 1.0,
+    "GPS_GLOBAL_ORIGIN": 1.0,
+    "BATTERY_STATUS": 0.5,
+    "HOME_POSITION": 0.5,
+    "VIBRATION": 0.5,
+}
+
+
+class Preset(Enum):
+    """Which default rates a link has."""
+
+    ONBOARD = "onboard"  # PX4 v1.17's link to a companion
+    GCS = "gcs"  # PX4 v1.17's link to a ground station
+    LOCKSTEP = "lockstep"  # lean: what a companion in lockstep needs
+
+
+_RATES_HZ: Mapping[Preset, Mapping[str, float]] = {
+    Preset.ONBOARD: {
+        **_SLOW, "ATTITUDE": 50.0, "HIGHRES_IMU": 50.0, "ATTITUDE_QUATERNION": 50.0,
+        "GLOBAL_POSITION_INT": 50.0, "LOCAL_POSITION_NED": 30.0, "ODOMETRY": 30.0,
+        "TIMESYNC": 10.0, "ALTITUDE": 10.0, "ATTITUDE_TARGET": 10.0,
+        "POSITION_TARGET_LOCAL_NED": 10.0, "SERVO_OUTPUT_RAW": 10.0, "VFR_HUD": 10.0,
+        "GPS_RAW_INT": 8.0, "SYS_STATUS": 5.0, "EXTENDED_SYS_STATE": 5.0,
+    },
+    Preset.GCS: {
+        **_SLOW, "LOCAL_POSITION_NED": 50.0, "ATTITUDE": 50.0, "GLOBAL_POSITION_INT": 50.0,
+        "ATTITUDE_TARGET": 50.0, "POSITION_TARGET_LOCAL_NED": 50.0, "SERVO_OUTPUT_RAW": 50.0,
+        "TIMESYNC": 10.0, "GPS_RAW_INT": 5.0, "VFR_HUD": 4.0, "SYS_STATUS": 1.0,
+        "EXTENDED_SYS_STATE": 1.0, "ALTITUDE": 1.0,
+    },
+    Preset.LOCKSTEP: {
+        "LOCAL_POSITION_NED": 50.0, "ATTITUDE_QUATERNION": 50.0, "HEARTBEAT": 1.0,
+        "SYS_STATUS": 1.0, "EXTENDED_SYS_STATE": 5.0, "BATTERY_STATUS": 0.5,
+        "HOME_POSITION": 0.5,
+    },
+}  # fmt: skip
+
+
+class _Stream:
+    __slots__ = ("build", "due_us", "interval_us")
+
+    def __init__(self, build: Builder, interval_us: int) -> None:
+        self.build = build
+        self.interval_us = interval_us  # 0: not streamed
+        self.due_us = 0
+
+
+class Streams:
+    """The streams of one link.
+
+    Args:
+        preset: the rates that a client's "default" means.
+    """
+
+    def __init__(self, preset: Preset) -> None:
+        self._rates_hz = _RATES_HZ[preset]
+        self._streams = {
+            number: _Stream(build, self._default_us(number)) for number, build in BUILDERS.items()
+        }
+        self._active: tuple[_Stream, ...] = ()
+        self._choose_active()
+
+    def interval_us(self, message_id: int) -> int | None:
+        """The interval of a message; 0 where it is not streamed, None where it is unknown."""
+        stream = self._streams.get(message_id)
+        return None if stream is None else stream.interval_us
+
+    def set_interval(self, message_id: int, interval_us: float, stamp_us: int) -> bool:
+        """Set a rate: a negative interval stops, 0 restores the default; False if unknown."""
+        stream = self._streams.get(message_id)
+        if stream is None:
+            return False
+        if interval_us < 0:
+            stream.interval_us = 0
+        elif interval_us == 0:
+            stream.interval_us = self._default_us(message_id)
+        else:
+            stream.interval_us = int(min(max(interval_us, TICK_US), 3.6e9))
+        stream.due_us = stamp_us
+        self._choose_active()
+        return True
+
+    def hasten(self, message_id: int, stamp_us: int) -> None:
+        """Make a streamed message due now, because what it tells has changed."""
+        self._streams[message_id].due_us = stamp_us
+
+    def due(self, stamp_us: int, snapshot: Snapshot) -> list[Any]:
+        """The messages due at a stamp; a stream that fell behind skips what it missed."""
+        messages = []
+        for stream in self._active:
+            if stream.due_us > stamp_us:
+                continue
+            stream.due_us += stream.interval_us
+            if stream.due_us <= stamp_us:
+                stream.due_us = stamp_us + stream.interval_us
+            message = stream.build(snapshot)
+            if message is not None:
+                messages.append(message)
+        return messages
+
+    def _default_us(self, message_id: int) -> int:
+        rate_hz = self._rates_hz.get(dialect.mavlink_map[message_id].msgname, 0.0)
+        return round(1e6 / rate_hz) if rate_hz else 0
+
+    def _choose_active(self) -> None:
+        self._active = tuple(s for s in self._streams.values() if s.interval_us)
