@@ -206,9 +206,7 @@ def _pieces(length_m: float, spacing_m: float) -> int:
 @compiled
 def _flyable(first: FloatArray, x: float, y: float, z: float, farthest_m: float) -> bool:
     limit = farthest_m
-    return (
-        abs(x - first[0]) <= limit and abs(y - first[1]) <= limit and abs(z - first[2]) <= limit
-    )
+    return abs(x - first[0]) <= limit and abs(y - first[1]) <= limit and abs(z - first[2]) <= limit
 
 
 @compiled

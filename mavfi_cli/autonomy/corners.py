@@ -206,9 +206,13 @@ def _straight(
     peak = math.sqrt(max(0.0, a * distance + 0.5 * (first * first + last * last)))
     peak = max(min(peak, cap), last)
     used = (abs(peak * peak - first * first) + abs(peak * peak - last * last)) / (2.0 * a)
-    for begin, end in ((first, peak), (peak, last)):
-        if end != begin:
-            rate = math.copysign(a, end - begin)
-            phases.add((end - begin) / rate, begin * direction, rate * direction)
-        if (begin, end) == (first, peak) and peak > 0.0:
-            phases.add((distance - used) / peak, peak * direction, np.zeros(3))
+    _change(phases, direction, first, peak, a)
+    if peak > 0.0:
+        phases.add((distance - used) / peak, peak * direction, np.zeros(3))
+    _change(phases, direction, peak, last, a)
+
+
+def _change(phases: _Phases, direction: FloatArray, begin: float, end: float, a: float) -> None:
+    """From one speed to another along a line."""
+    rate = math.copysign(a, end - begin)
+    phases.add((end - begin) / rate, begin * direction, rate * direction)

@@ -71,7 +71,7 @@ def build(snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> O
         _dilate(occupied, run_half_widths(radius_m, resolution), blocked)
     return ObstacleGrid(
         blocked=blocked,
-        origin_enu_m=low * resolution,
+        origin_enu_m=low.astype(np.float64) * resolution,
         resolution_m=resolution,
         bounds_enu_m=np.asarray(bounds_enu_m, np.float64),
         radius_m=radius_m,
@@ -178,8 +178,16 @@ def segment_free(
     nx, ny, nz = blocked.shape
     if nz == 0 or ny == 0 or nx == 0:
         return True
-    sx, sy, sz = (x0 - origin[0]) / resolution, (y0 - origin[1]) / resolution, (z0 - origin[2]) / resolution
-    ex, ey, ez = (x1 - origin[0]) / resolution, (y1 - origin[1]) / resolution, (z1 - origin[2]) / resolution
+    sx, sy, sz = (
+        (x0 - origin[0]) / resolution,
+        (y0 - origin[1]) / resolution,
+        (z0 - origin[2]) / resolution,
+    )
+    ex, ey, ez = (
+        (x1 - origin[0]) / resolution,
+        (y1 - origin[1]) / resolution,
+        (z1 - origin[2]) / resolution,
+    )
     i, j, k = math.floor(sx), math.floor(sy), math.floor(sz)
     steps = abs(math.floor(ex) - i) + abs(math.floor(ey) - j) + abs(math.floor(ez) - k)
     dx, dy, dz = ex - sx, ey - sy, ez - sz
@@ -233,7 +241,7 @@ def blend(
     to_inner = np.rint((grid.origin_enu_m - inner.origin_enu_m) / resolution).astype(np.int64)
     indices = np.indices(blocked.shape, sparse=True)
     centre = (centre_enu_m - grid.origin_enu_m) / resolution - 0.5
-    near = sum((index - c) ** 2 for index, c in zip(indices, centre, strict=True))
+    near = sum((indices[axis] - centre[axis]) ** 2 for axis in range(3))
     chosen = np.argwhere(near <= (radius_m / resolution) ** 2)
     inside = chosen + to_inner
     known = ((inside >= 0) & (inside < inner.blocked.shape)).all(axis=1)

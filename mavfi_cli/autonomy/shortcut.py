@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from mavfi_cli.autonomy.grid import ObstacleGrid
@@ -28,7 +30,7 @@ def shortcut(path_enu_m: FloatArray, grid: ObstacleGrid) -> FloatArray:
 def subdivided(path_enu_m: FloatArray, spacing_m: float) -> FloatArray:
     """The same path with vertices at most `spacing_m` apart, (m, 3)."""
     pieces = [path_enu_m[:1]]
-    for start, end in zip(path_enu_m[:-1], path_enu_m[1:], strict=True):
+    for start, end in itertools.pairwise(path_enu_m):
         count = max(1, int(np.ceil(np.linalg.norm(end - start) / spacing_m)))
         shares = np.arange(1, count + 1)[:, None] / count
         pieces.append(start + shares * (end - start))

@@ -29,8 +29,7 @@ from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.heading import headings, turn_time_s
 from mavfi_cli.core.types import FloatArray, Trajectory
 
-
-NEGLIGIBLE_MPS = 0.05  # slower than this counts as at rest
+NEGLIGIBLE_MPS = 0.1  # slower than this counts as at rest
 RUN_OUT_RESERVE = 1.02  # stopping distance, with a little to spare for rounding
 SLOWEST_SQUARED = 0.1  # a corner slower than this (squared, m^2/s^2) becomes a stop
 
@@ -116,8 +115,8 @@ def smooth(
         if not blamed:
             break
         caps[blamed] = np.where(q[blamed] > SLOWEST_SQUARED, 0.25 * q[blamed], 0.0)
-    free = free and _piecewise_free(spline, grid).all()
-    return Smoothed(trajectory=_waypoints(spline, departure, sequence, params), free=bool(free))
+    free = free and bool(_piecewise_free(spline, grid).all())
+    return Smoothed(trajectory=_waypoints(spline, departure, sequence, params), free=free)
 
 
 def brake(
@@ -168,7 +167,7 @@ class _Flight:
         moving = corners.motion(self._line, q, self._dwells(q), acceleration)
         period = self._params.sample_period_s
         count = math.ceil(moving.duration_s / period) + 2
-        ahead = moving.position(np.arange(count) * period)
+        ahead = moving.position(np.arange(count, dtype=np.float64) * period)
         before = self._start - 0.5 * period * self._velocity
         return q, moving, np.vstack([before, ahead])
 
@@ -196,9 +195,11 @@ def _cut(velocity: FloatArray, limit: float) -> FloatArray:
     if not np.isfinite(velocity).all():
         return np.zeros(3)
     largest = float(np.abs(velocity).max())
-    if largest < NEGLIGIBLE_MPS:
+    if largest == 0.0:
         return np.zeros(3)
     speed = largest * float(np.linalg.norm(velocity / largest))
+    if speed < NEGLIGIBLE_MPS:
+        return np.zeros(3)
     return velocity if speed <= limit else velocity / largest * (limit * largest / speed)
 
 

@@ -53,7 +53,9 @@ class PlanResult:
 class Planner(Protocol):
     """A path planner whose result is a function of problem and seed alone."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What the planner is found by."""
 
     def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
         """Find a path from the problem's start to its goal.

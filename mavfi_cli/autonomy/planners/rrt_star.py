@@ -16,8 +16,9 @@ class RRTStar:
     """Goal bias and rewiring factor as OMPL ships them.
 
     Once there is a solution, only states that could shorten it are sampled (Gammell et al. 2014);
-    300 iterations then give shorter paths than 500 without, at half the cost. Where the iterations end without a solution, the search is repeated once with
-    `patience` times as many: most maps are easy, and only hard ones shall cost more.
+    300 iterations then give shorter paths than 500 without, at half the cost. Where the
+    iterations end without a solution, the search is repeated once with `patience` times as many:
+    most maps are easy, and only hard ones shall cost more.
     """
 
     name: ClassVar[str] = "rrtstar"

@@ -1,0 +1,70 @@
+"""Running every kernel once on a toy scene, so that each is loaded before the first tick."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mavfi_cli.autonomy import collision, planning, point_cloud, tracking
+from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
+from mavfi_cli.autonomy.planners import find, names
+from mavfi_cli.autonomy.smoothing import Departure, Sequence
+from mavfi_cli.autonomy.trajectory import reference_waypoint
+from mavfi_cli.core.types import DepthFrame, Trajectory
+
+_BOUNDS = np.array([-5.0, -10.0, 0.0, 15.0, 10.0, 10.0])
+
+
+def run_every_kernel() -> None:
+    """See a wall, map it, plan round it, check the plan, track it."""
+    snapshot = _see_a_wall()
+    start, goal = np.array([0.0, 0.0, 5.0]), np.array([9.0, 0.0, 5.0])
+    trajectory: Trajectory | None = None
+    for name in ("rrtstar", "rrt", "rrtconnect"):
+        assert name in names()
+        inputs = planning.StageInputs(
+            snapshot=snapshot,
+            position_enu_m=start,
+            departure=Departure(stamp_s=0.0, velocity_enu_mps=np.array([0.0, 1.0, 0.0]), yaw_rad=0),
+            goal_enu_m=goal,
+            bounds_enu_m=_BOUNDS,
+            sequence=Sequence(),
+            seed=1,
+        )
+        trajectory = planning.plan(find(name), inputs, planning.StageParams()).trajectory
+    _check_and_track(snapshot, trajectory)
+
+
+def _see_a_wall() -> MapSnapshot:
+    depth = np.full((48, 64), math.inf)
+    depth[:, 20:44] = 4.0
+    frame = DepthFrame(
+        stamp_s=0.0,
+        depth_m=depth,
+        hfov_rad=math.pi / 2.0,
+        position_enu_m=np.array([0.0, 0.0, 5.0]),
+        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
+    )
+    occupancy = OccupancyMap(OccupancyParams())
+    occupancy.insert(point_cloud.generate(frame, point_cloud.PointCloudParams()))
+    return occupancy.snapshot()
+
+
+def _check_and_track(snapshot: MapSnapshot, trajectory: Trajectory | None) -> None:
+    checked = collision.CollisionInputs(
+        stamp_s=0.0, snapshot=snapshot, trajectory=trajectory, time_s=0.0
+    )
+    collision.step(collision.CollisionState(), checked, collision.CollisionParams())
+    if trajectory is not None:
+        reference_waypoint(trajectory, 0.0)
+    tracked = tracking.TrackingInputs(
+        stamp_s=0.02,
+        position_enu_m=np.zeros(3),
+        velocity_enu_mps=np.zeros(3),
+        trajectory=trajectory,
+        hold_enu_m=np.zeros(3),
+        hold_yaw_rad=0.0,
+    )
+    state = tracking.TrackingState(yaw_rad=0.0, stamp_s=0.0)
+    tracking.step(state, tracked, tracking.TrackingParams())
