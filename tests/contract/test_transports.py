@@ -1,0 +1,354 @@
+"""Every transport passes the same suite: a pair of ends, by whatever URL."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import threading
+import tty
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.transport import Transport, open_listener, open_transport
+
+Pair = tuple[Transport, Transport]
+WAIT_S = 5.0
+
+
+def _socket_pair() -> Iterator[Pair]:
+    ends = socket.socketpair()
+    near, far = (open_transport(f"fd:{end.detach()}") for end in ends)
+    yield near, far
+    near.close()
+    far.close()
+
+
+def _udp() -> Iterator[Pair]:
+    near = open_transport("udpin:127.0.0.1:0")
+    far = open_transport(f"udpout:127.0.0.1:{near.port}")  # type: ignore[attr-defined]
+    yield near, far
+    near.close()
+    far.close()
+
+
+def _tcp() -> Iterator[Pair]:
+    near = open_transport("tcpin:127.0.0.1:0")
+    far = open_transport(f"tcp:127.0.0.1:{near.port}")  # type: ignore[attr-defined]
+    yield near, far
+    near.close()
+    far.close()
+
+
+def _listened(scheme: str, caller: str) -> Iterator[Pair]:
+    listener = open_listener(f"{scheme}:127.0.0.1:0")
+    far = open_transport(f"{caller}:127.0.0.1:{listener.port}")  # type: ignore[attr-defined]
+    far.send(Codec(9, 9).encode(_message(0)))
+    peers: list[Transport] = []
+    while not peers:
+        assert _wait_readable(listener.fileno())
+        peers += listener.accept_ready()
+    assert Codec(8, 8).decode(peers[0].receive(WAIT_S))
+    yield peers[0], far
+    peers[0].close()
+    far.close()
+    listener.close()
+
+
+def _serial() -> Iterator[Pair]:
+    """Two pseudo-terminals, and a thread that carries bytes between their controlling ends."""
+    (left, left_name), (right, right_name) = _raw_terminal(), _raw_terminal()
+    near, far = open_transport(f"serial:{left_name}:115200"), open_transport(f"serial:{right_name}")
+    stop_read, stop_write = os.pipe()
+    carrier = threading.Thread(target=_carry, args=(left, right, stop_read))
+    carrier.start()
+    yield near, far
+    os.close(stop_write)
+    carrier.join()
+    near.close()
+    far.close()
+    for descriptor in (left, right, stop_read):
+        os.close(descriptor)
+
+
+def _raw_terminal() -> tuple[int, str]:
+    controller, terminal = pty.openpty()
+    tty.setraw(terminal)
+    name = os.ttyname(terminal)
+    _OPEN_TERMINALS.append(terminal)  # or the terminal hangs up before it is opened by name
+    return controller, name
+
+
+_OPEN_TERMINALS: list[int] = []
+
+
+def _carry(left: int, right: int, stop: int) -> None:
+    import select
+
+    while True:
+        ready, _, _ = select.select([left, right, stop], [], [])
+        if stop in ready:
+            return
+        for source, sink in ((left, right), (right, left)):
+            if source in ready:
+                os.write(sink, os.read(source, 4096))
+
+
+def _wait_readable(descriptor: int) -> bool:
+    from mavfi_cli.link.waiting import readable
+
+    return readable(descriptor, WAIT_S)
+
+
+MAKERS: dict[str, Callable[[], Iterator[Pair]]] = {
+    "socket pair": _socket_pair,
+    "udp": _udp,
+    "tcp": _tcp,
+    "udp listener": lambda: _listened("udpin", "udpout"),
+    "tcp listener": lambda: _listened("tcpin", "tcp"),
+    "serial": _serial,
+}
+STREAMS = ("socket pair", "tcp", "tcp listener")
+
+
+@pytest.fixture(params=MAKERS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def pair(kind: str) -> Iterator[Pair]:
+    yield from MAKERS[kind]()
+    while _OPEN_TERMINALS:
+        os.close(_OPEN_TERMINALS.pop())
+
+
+def _message(number: int) -> object:
+    return dialect.MAVLink_local_position_ned_message(number, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
+
+
+def _send(transport: Transport, codec: Codec, numbers: range) -> None:
+    transport.send(b"".join(codec.encode(_message(number)) for number in numbers))
+
+
+def _receive(transport: Transport, count: int) -> list[int]:
+    codec, numbers = Codec(7, 7), []
+    while len(numbers) < count:
+        data = transport.receive(WAIT_S)
+        assert data, f"only {numbers} came"
+        numbers += [m.time_boot_ms for m in codec.decode(data, datagram=transport.datagram)]
+    assert codec.bad_bytes == 0
+    return numbers
+
+
+def _introduce(near: Transport, far: Transport) -> None:
+    """The caller speaks first, so that a listening end knows it."""
+    _send(far, Codec(2, 2), range(1))
+    assert _receive(near, 1) == [0]
+
+
+def test_messages_arrive_in_both_directions_whole_and_in_order(pair: Pair) -> None:
+    near, far = pair
+    _introduce(near, far)
+    _send(near, Codec(1, 1), range(5))
+    assert _receive(far, 5) == list(range(5))
+    _send(far, Codec(2, 2), range(5, 10))
+    assert _receive(near, 5) == list(range(5, 10))
+
+
+def test_a_batch_larger_than_a_packet_arrives_whole(pair: Pair) -> None:
+    near, far = pair
+    _introduce(near, far)
+    _send(near, Codec(1, 1), range(80))  # 3200 bytes, more than two Ethernet packets
+    assert _receive(far, 80) == list(range(80))
+
+
+def test_nothing_to_receive_gives_no_bytes(pair: Pair) -> None:
+    near, far = pair
+    _introduce(near, far)
+    for timeout_s in (0.0, 0.01):
+        assert near.receive(timeout_s) == b""
+        assert far.receive(timeout_s) == b""
+
+
+def test_the_descriptor_becomes_readable(pair: Pair) -> None:
+    near, far = pair
+    _introduce(near, far)
+    _send(near, Codec(1, 1), range(1))
+    assert _wait_readable(far.fileno())
+    assert _receive(far, 1) == [0]
+
+
+def test_closing_twice_is_harmless(pair: Pair) -> None:
+    for transport in pair:
+        transport.close()
+        transport.close()
+
+
+def test_a_wait_without_end_is_ended_by_data(pair: Pair) -> None:
+    near, far = pair
+    _introduce(near, far)
+    sender = threading.Timer(0.01, _send, (near, Codec(1, 1), range(1)))
+    sender.start()
+    assert far.receive(float("inf"))
+    sender.join()
+
+
+@pytest.mark.parametrize("kind", STREAMS, indirect=True)
+def test_a_closed_stream_is_a_lost_link_at_the_other_end(pair: Pair) -> None:
+    near, far = pair
+    _introduce(near, far)
+    _send(far, Codec(2, 2), range(3))
+    far.close()
+    assert _receive(near, 3) == [0, 1, 2]  # what was sent before still arrives
+    with pytest.raises(LinkLost):
+        near.receive(WAIT_S)
+
+
+def test_a_serial_device_that_goes_away_is_a_lost_link() -> None:
+    controller, name = _raw_terminal()
+    port = open_transport(f"serial:{name}:57600")
+    os.close(controller)
+    with pytest.raises(LinkLost, match="serial device failed"):
+        port.receive(WAIT_S)
+    port.close()
+    os.close(_OPEN_TERMINALS.pop())
+
+
+@pytest.mark.parametrize("kind", ["udp", "udp listener"], indirect=True)
+def test_a_udp_peer_that_is_not_there_is_no_error(pair: Pair) -> None:
+    near, far = pair
+    near.close()
+    for _ in range(3):
+        far.send(Codec(1, 1).encode(_message(0)))
+        assert far.receive(0.0) == b""
+
+
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
+def test_a_port_in_use_is_one_clear_line(scheme: str) -> None:
+    first = open_transport(f"{scheme}:127.0.0.1:0")
+    port = first.port  # type: ignore[attr-defined]
+    for opener in (open_transport, open_listener):
+        with pytest.raises(EndpointError, match=f"port {port} is in use"):
+            opener(f"{scheme}:127.0.0.1:{port}")
+    first.close()
+
+
+def test_nobody_listening_is_one_clear_line() -> None:
+    vacant = socket.socket()
+    vacant.bind(("127.0.0.1", 0))
+    port = vacant.getsockname()[1]
+    with pytest.raises(EndpointError, match="nothing listens there"):
+        open_transport(f"tcp:127.0.0.1:{port}")
+    vacant.close()
+
+
+def test_an_inherited_descriptor_must_be_a_connected_stream_socket() -> None:
+    read, write = os.pipe()
+    lonely = socket.socket()
+    packets = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    cases = {
+        f"fd:{read}": "not a socket",
+        f"fd:{lonely.fileno()}": "not a connected socket",
+        f"fd:{packets[0].fileno()}": "not a stream socket",
+        "fd:9999": "not an open descriptor",
+    }
+    for url, problem in cases.items():
+        with pytest.raises(EndpointError, match=problem):
+            open_transport(url)
+    for descriptor in (read, write):
+        os.close(descriptor)
+    for opened in (lonely, *packets):
+        opened.close()
+
+
+def test_several_clients_of_one_listener_are_kept_apart() -> None:
+    for scheme, caller in (("udpin", "udpout"), ("tcpin", "tcp")):
+        listener = open_listener(f"{scheme}:127.0.0.1:0")
+        url = f"{caller}:127.0.0.1:{listener.port}"  # type: ignore[attr-defined]
+        callers = [open_transport(url) for _ in range(3)]
+        peers: list[Transport] = []
+        for number, client in enumerate(callers):
+            _send(client, Codec(2, 2), range(number, number + 1))
+            while len(peers) <= number:
+                assert _wait_readable(listener.fileno())
+                peers += listener.accept_ready()
+        for number, (peer, client) in enumerate(zip(peers, callers, strict=True)):
+            assert _receive(peer, 1) == [number]
+            _send(peer, Codec(1, 1), range(10 + number, 11 + number))
+            assert _receive(client, 1) == [10 + number]
+        for opened in (*callers, *peers, listener):
+            opened.close()
+
+
+def test_a_flood_of_udp_callers_pushes_out_the_silent_ones_only() -> None:
+    from mavfi_cli.link.datagrams import MAX_PEERS
+
+    listener = open_listener("udpin:127.0.0.1:0")
+    url = f"udpout:127.0.0.1:{listener.port}"  # type: ignore[attr-defined]
+    callers = [open_transport(url) for _ in range(MAX_PEERS + 2)]
+    peers: list[Transport] = []
+    for client in callers:
+        _send(client, Codec(2, 2), range(1))
+        assert _wait_readable(listener.fileno())
+        peers += listener.accept_ready()
+    assert [_is_lost(peer) for peer in peers] == [True, True, *[False] * MAX_PEERS]
+    for opened in (*callers, *peers, listener):
+        opened.close()
+
+
+def _is_lost(peer: Transport) -> bool:
+    try:
+        while peer.receive(0.0):
+            pass
+    except LinkLost:
+        return True
+    return False
+
+
+def test_noise_does_not_make_a_udp_peer() -> None:
+    listener = open_listener("udpin:127.0.0.1:0")
+    address = ("127.0.0.1", listener.port)  # type: ignore[attr-defined]
+    noise = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for datagram in (b"", b"GET / HTTP/1.1\r\n", b"\x00" * 9):
+        noise.sendto(datagram, address)
+        assert _wait_readable(listener.fileno())
+        assert listener.accept_ready() == []
+    noise.close()
+    listener.close()
+
+
+def test_a_slow_reader_of_a_listener_loses_whole_batches_and_blocks_nobody() -> None:
+    listener = open_listener("tcpin:127.0.0.1:0")
+    client = open_transport(f"tcp:127.0.0.1:{listener.port}")  # type: ignore[attr-defined]
+    assert _wait_readable(listener.fileno())
+    (peer,) = listener.accept_ready()
+    codec, sent = Codec(1, 1), 0
+    for _ in range(400):
+        batch = b"".join(codec.encode(_message(number)) for number in range(1000))
+        peer.send(batch)
+        sent += 1000
+    decoder, got = Codec(2, 2), 0
+    while data := client.receive(0.2):
+        got += len(decoder.decode(data))
+        peer.send(b"")  # lets the rest of a half-sent batch out
+    assert 0 < got < sent
+    assert decoder.bad_bytes == 0
+    for opened in (client, peer, listener):
+        opened.close()
+
+
+def test_one_peer_endpoints_serve_as_listeners_too() -> None:
+    ends = socket.socketpair()
+    far = open_transport(f"fd:{ends[1].detach()}")
+    listener = open_listener(f"fd:{ends[0].detach()}")
+    (peer,) = listener.accept_ready()
+    assert listener.accept_ready() == []
+    _send(far, Codec(2, 2), range(1))
+    assert _wait_readable(listener.fileno())
+    assert _receive(peer, 1) == [0]
+    far.close()
+    listener.close()
