@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.control import layout
+from sitl.vehicle.model import INFLOW_SLOPE
 from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
 
 RATE_DAMPING = 0.75
-RATE_BANDWIDTH_PER_LAG = 1.1  # natural frequency of the tilt-rate loop x motor time constant
-TILT_TO_RATE = 0.32  # tilt gain / natural frequency of the rate loop
+RATE_BANDWIDTH_PER_LAG = 1.6  # natural frequency of the tilt-rate loop x motor time constant
+TILT_TO_RATE = 0.36  # tilt gain / natural frequency of the rate loop
 
 
 def gains_for(profile: VehicleProfile, dt_s: float) -> NDArray[np.float64]:
@@ -29,6 +30,7 @@ def gains_for(profile: VehicleProfile, dt_s: float) -> NDArray[np.float64]:
     gains[layout.G_INERTIA : layout.G_INERTIA + 3] = profile.inertia_kgm2
     _inner(gains, profile)
     _outer(gains, profile)
+    _drag(gains, profile)
     _mixer(gains, profile)
     return gains
 
@@ -58,7 +60,7 @@ def _outer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
     tilt_lag_s = 1.0 / gains[layout.G_TILT_P]
     lift_lag_s = profile.rotor.time_constant_s(profile.total_mass_kg * GRAVITY_MPS2 / 4.0)
     gains[layout.G_POSITION_P : layout.G_POSITION_P + 3] = (1.0, 1.0, 1.2)
-    gains[layout.G_MODEL_P : layout.G_MODEL_P + 3] = (3.0, 3.0, 4.0)
+    gains[layout.G_MODEL_P : layout.G_MODEL_P + 3] = (3.5, 3.5, 4.0)
     gains[layout.G_MODEL_LAG : layout.G_MODEL_LAG + 3] = (tilt_lag_s, tilt_lag_s, lift_lag_s)
     gains[layout.G_VELOCITY_P : layout.G_VELOCITY_P + 3] = (2.2, 2.2, 4.0)
     gains[layout.G_VELOCITY_I : layout.G_VELOCITY_I + 3] = (0.8, 0.8, 2.0)
@@ -69,6 +71,19 @@ def _outer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
     gains[layout.G_CLIMB_LIMIT] = limits.climb_mps
     gains[layout.G_DESCENT_LIMIT] = limits.descent_mps
     gains[layout.G_TILT_TANGENT] = tangent
+
+
+def _drag(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+    """Body drag, and the thrust that climbing rotors lose: dT/dV = slope T / (J0 n D)."""
+    rotor, mass_kg = profile.rotor, profile.total_mass_kg
+    hover_n = mass_kg * GRAVITY_MPS2 / 4.0
+    speed_hz = math.sqrt(hover_n / rotor.max_thrust_n) * rotor.max_rpm / 60.0
+    inflow = 4.0 * hover_n * INFLOW_SLOPE
+    inflow /= rotor.zero_thrust_advance_ratio * speed_hz * rotor.diameter_m
+    linear = np.array(profile.drag.linear_nspm) + np.array([0.0, 0.0, inflow])
+    gains[layout.G_DRAG_LINEAR : layout.G_DRAG_LINEAR + 3] = linear / mass_kg
+    quadratic = np.array(profile.drag.quadratic_ns2pm2)
+    gains[layout.G_DRAG_QUADRATIC : layout.G_DRAG_QUADRATIC + 3] = quadratic / mass_kg
 
 
 def _mixer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:

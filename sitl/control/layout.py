@@ -21,7 +21,7 @@ M_RATES = 10  # body FRD, rad/s
 M_ON_GROUND = 13  # 0 or 1
 MEASUREMENT_SIZE = 14
 
-# Controller state (20,)
+# Controller state (21,)
 S_VELOCITY_INTEGRAL = 0  # NED, m/s^2
 S_MODEL_VELOCITY = 3  # reference model, NED, m/s
 S_MODEL_ACCELERATION = 6  # reference model after the attitude lag, NED, m/s^2
@@ -30,7 +30,8 @@ S_LAST_RATES = 12  # body, rad/s
 S_HEADING = 15  # reference, rad
 S_HEADING_RATE = 16  # reference, rad/s
 S_FLYING = 17  # 0 on the ground with idling rotors, 1 flying
-STATE_SIZE = 18
+S_LAGGED_FORWARD = 18  # acceleration feed-forward after the attitude lag, NED, m/s^2
+STATE_SIZE = 21
 
 # Gains (n,), filled by sitl.control.gains
 G_DT = 0
@@ -61,4 +62,6 @@ G_ROTOR_THRUST = 45  # largest of one rotor, N
 G_ROTOR_OFFSET = 46  # along each body axis, m
 G_TORQUE_PER_THRUST = 47  # m
 G_THROTTLE = 48  # 3: constant, linear and quadratic in relative rotor speed
-GAINS_SIZE = 51
+G_DRAG_LINEAR = 51  # 3: 1/s
+G_DRAG_QUADRATIC = 54  # 3: 1/m
+GAINS_SIZE = 57

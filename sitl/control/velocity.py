@@ -18,6 +18,8 @@ from sitl.control.layout import (
     G_ACCELERATION_LIMIT,
     G_CLIMB_LIMIT,
     G_DESCENT_LIMIT,
+    G_DRAG_LINEAR,
+    G_DRAG_QUADRATIC,
     G_DT,
     G_INTEGRAL_LIMIT,
     G_MODEL_LAG,
@@ -28,6 +30,7 @@ from sitl.control.layout import (
     G_VELOCITY_P,
     M_POSITION,
     M_VELOCITY,
+    S_LAGGED_FORWARD,
     S_MODEL_ACCELERATION,
     S_MODEL_VELOCITY,
     S_VELOCITY_INTEGRAL,
@@ -70,15 +73,23 @@ def velocity_target(clean: Vector, measurement: Vector, gains: Vector) -> Vector
 
 @compiled
 def model_acceleration(target: Vector, clean: Vector, state: Vector, gains: Vector) -> Vector:
-    """Acceleration (3,) that takes the reference model to its target, NED m/s^2, limited."""
+    """Acceleration (3,) that takes the reference model to its target, NED m/s^2, limited.
+
+    What the feed-forward has not yet brought because of the lag is left out of the velocity
+    error: a trajectory with its own acceleration is followed one lag late, not overtaken.
+    """
     wanted = np.empty(3)
     for axis in range(3):
         forward = clean[SP_ACCELERATION + axis]
         wanted[axis] = forward if math.isfinite(forward) else 0.0
+        lag = gains[G_MODEL_LAG + axis]
+        state[S_LAGGED_FORWARD + axis] += (wanted[axis] - state[S_LAGGED_FORWARD + axis]) * (
+            gains[G_DT] / (lag + gains[G_DT])
+        )
         if math.isfinite(target[axis]):
-            wanted[axis] += gains[G_MODEL_P + axis] * (
-                target[axis] - state[S_MODEL_VELOCITY + axis]
-            )
+            reachable = target[axis] - lag * state[S_LAGGED_FORWARD + axis]
+            error = reachable - state[S_MODEL_VELOCITY + axis]
+            wanted[axis] += gains[G_MODEL_P + axis] * error
     limit_horizontal(wanted, 0, gains[G_ACCELERATION_LIMIT])
     limit = gains[G_ACCELERATION_LIMIT + 1]
     wanted[2] = clip(wanted[2], -limit, limit)
@@ -86,27 +97,40 @@ def model_acceleration(target: Vector, clean: Vector, state: Vector, gains: Vect
 
 
 @compiled
+def drag(velocity_mps: Vector, axis: int, gains: Vector) -> float:
+    """Deceleration by drag and inflow along one NED axis at a velocity (3,), m/s^2."""
+    v: float = velocity_mps[axis]
+    slowing: float = gains[G_DRAG_LINEAR + axis] + gains[G_DRAG_QUADRATIC + axis] * abs(v)
+    return v * slowing
+
+
+@compiled
 def acceleration_target(
     target: Vector, clean: Vector, measurement: Vector, state: Vector, gains: Vector
 ) -> Vector:
-    """Acceleration to fly (3,), NED m/s^2; moves the model and the integral in `state` on."""
+    """Acceleration to ask of the rotors (3,), NED m/s^2; moves model and integral in `state` on.
+
+    Feed-forward of the model's acceleration and of drag, P on the difference between model and
+    vehicle, and a limited integral of it.
+    """
     dt = gains[G_DT]
     wanted = model_acceleration(target, clean, state, gains)
+    model = state[S_MODEL_VELOCITY : S_MODEL_VELOCITY + 3]
     total = np.empty(3)
     for axis in range(3):
         measured = measurement[M_VELOCITY + axis]
         if not math.isfinite(target[axis]):
-            state[S_MODEL_VELOCITY + axis] = measured
-        share = dt / (gains[G_MODEL_LAG + axis] + dt)
-        lagged = state[S_MODEL_ACCELERATION + axis]
-        lagged += share * (wanted[axis] - lagged)
-        state[S_MODEL_ACCELERATION + axis] = lagged
-        error = state[S_MODEL_VELOCITY + axis] - measured
-        state[S_MODEL_VELOCITY + axis] += dt * lagged
+            model[axis] = measured
+        error = model[axis] - measured
+        total[axis] = wanted[axis] + drag(model, axis, gains)
+        total[axis] += gains[G_VELOCITY_P + axis] * error
         limit = gains[G_INTEGRAL_LIMIT + axis]
         integral = state[S_VELOCITY_INTEGRAL + axis] + dt * gains[G_VELOCITY_I + axis] * error
         state[S_VELOCITY_INTEGRAL + axis] = clip(integral, -limit, limit)
-        total[axis] = (
-            wanted[axis] + gains[G_VELOCITY_P + axis] * error + state[S_VELOCITY_INTEGRAL + axis]
+        total[axis] += state[S_VELOCITY_INTEGRAL + axis]
+        share = dt / (gains[G_MODEL_LAG + axis] + dt)
+        state[S_MODEL_ACCELERATION + axis] += share * (
+            wanted[axis] - state[S_MODEL_ACCELERATION + axis]
         )
+        model[axis] += dt * state[S_MODEL_ACCELERATION + axis]
     return total

@@ -76,9 +76,9 @@ def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
 def battery_current(power_w: float, open_circuit_v: float, resistance_ohm: float) -> float:
     """Current, A, at which the loaded pack delivers a power; the most it can where it cannot.
 
-    The smaller root of P = I (V - I R).
+    The smaller root of P = I (V - I R), in the form that does not cancel.
     """
-    root = open_circuit_v * open_circuit_v - 4.0 * resistance_ohm * power_w
-    if resistance_ohm <= 0.0:
-        return power_w / open_circuit_v
-    return (open_circuit_v - math.sqrt(max(root, 0.0))) / (2.0 * resistance_ohm)
+    if 4.0 * resistance_ohm * power_w > open_circuit_v * open_circuit_v:
+        return open_circuit_v / (2.0 * resistance_ohm)
+    root = math.sqrt(open_circuit_v * open_circuit_v - 4.0 * resistance_ohm * power_w)
+    return 2.0 * power_w / (open_circuit_v + root)

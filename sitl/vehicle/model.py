@@ -130,14 +130,17 @@ def _motor(rotor: Rotor) -> ET.Element:
     return motor
 
 
+INFLOW_SLOPE = 0.35  # of the thrust share at J = 0
+
+
 def thrust_share(relative_advance: float) -> float:
     """C_T / static C_T at J / J(zero thrust): a shape common to fixed-pitch propellers.
 
     Falls slowly at first and then faster; assumption, within 5 % of published 9-inch data.
     """
     if relative_advance < 0.0:
-        return 1.0 - 0.35 * relative_advance
-    return 1.0 - 0.35 * relative_advance - 0.65 * relative_advance**2
+        return 1.0 - INFLOW_SLOPE * relative_advance
+    return 1.0 - INFLOW_SLOPE * relative_advance - (1.0 - INFLOW_SLOPE) * relative_advance**2
 
 
 def power_share(relative_advance: float) -> float:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mavfi_cli.core.config import load_toml
 from mavfi_cli.core.errors import ConfigError, UnknownName
@@ -13,7 +16,20 @@ AIR_DENSITY_KGPM3 = 1.225  # ISA sea level, which is where the physics world lie
 GRAVITY_MPS2 = 9.80665
 MIN_THRUST_TO_WEIGHT = 1.15  # below it there is nothing left to steer and climb with
 
+LARGEST_TILT_DEG = 60.0
+
 Triple = tuple[float, float, float]
+
+_ANY_SIGN = ("camera_mount_flu_m", "rotor.height_m", "energy.")
+_MAY_BE_ZERO = (
+    "extra_payload_kg",
+    "drag.linear_nspm",
+    "drag.quadratic_ns2pm2",
+    "gear.friction",
+    "rotor.motor_no_load_current_a",
+    "battery.resistance_ohm",
+    "battery.avionics_w",
+)
 
 _PROFILES = Path(__file__).parent / "profiles"
 
@@ -152,8 +168,10 @@ class VehicleProfile:
     energy: EnergyRegression
 
     def __post_init__(self) -> None:
+        for key, value in _numbers(self):
+            _check_sign(key, value)
         self._check_lift()
-        self._check_physical()
+        self._check_ranges()
 
     def _check_lift(self) -> None:
         ratio = self.max_thrust_n / (self.total_mass_kg * GRAVITY_MPS2)
@@ -165,27 +183,16 @@ class VehicleProfile:
                 f"{ratio:.2f}, at least {MIN_THRUST_TO_WEIGHT:g} is needed"
             )
 
-    def _check_physical(self) -> None:
-        positive = {
-            "mass_kg": self.mass_kg,
-            "inertia_kgm2": min(self.inertia_kgm2),
-            "body_box_m": min(self.body_box_m),
-            "gear.height_m": self.gear.height_m,
-            "battery.cells": self.battery.cells,
-            "battery.capacity_ah": self.battery.capacity_ah,
-            "battery.drive_efficiency": self.battery.drive_efficiency,
-            "limits.tilt_deg": self.limits.tilt_deg,
-        }
-        for key, value in positive.items():
-            if value <= 0.0:
-                raise ConfigError(f"must be above zero, is {value:g}", key=key)
-        if self.extra_payload_kg < 0.0:
+    def _check_ranges(self) -> None:
+        if self.limits.tilt_deg > LARGEST_TILT_DEG:
             raise ConfigError(
-                f"must not be negative, is {self.extra_payload_kg:g}", key="extra_payload_kg"
+                f"must be at most {LARGEST_TILT_DEG:g}, is {self.limits.tilt_deg:g}",
+                key="limits.tilt_deg",
             )
-        if self.limits.tilt_deg > 60.0:
+        if self.battery.drive_efficiency > 1.0:
             raise ConfigError(
-                f"must be at most 60, is {self.limits.tilt_deg:g}", key="limits.tilt_deg"
+                f"must be at most 1, is {self.battery.drive_efficiency:g}",
+                key="battery.drive_efficiency",
             )
         nominal_v = self.battery.cells * self.battery.cell_nominal_v
         if self.rotor.full_throttle_voltage_v > nominal_v:
@@ -214,6 +221,27 @@ class VehicleProfile:
         """Height of the centre of mass above the ground when standing on its legs, m."""
         sag_m = GRAVITY_MPS2 / self.gear.natural_frequency_radps**2
         return self.gear.height_m - sag_m
+
+
+def _numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Every number of a nested dataclass with its dotted key."""
+    for field in dataclasses.fields(record):
+        value, key = getattr(record, field.name), f"{prefix}{field.name}"
+        if dataclasses.is_dataclass(value):
+            yield from _numbers(value, f"{key}.")
+        elif isinstance(value, tuple):
+            yield from ((key, item) for item in value)
+        elif not isinstance(value, str):
+            yield key, value
+
+
+def _check_sign(key: str, value: float) -> None:
+    if key.startswith(_ANY_SIGN):
+        return
+    if value < 0.0 and key in _MAY_BE_ZERO:
+        raise ConfigError(f"must not be negative, is {value:g}", key=key)
+    if value <= 0.0 and key not in _MAY_BE_ZERO:
+        raise ConfigError(f"must be above zero, is {value:g}", key=key)
 
 
 def profile_names() -> list[str]:

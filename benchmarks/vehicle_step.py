@@ -1,0 +1,51 @@
+"""Prints what one 4 ms step of the vehicle costs, in microseconds, and where the time goes."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from sitl.control.cascade import control_step
+from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.vehicle import Vehicle
+
+STEPS = 500
+ROUNDS = 20
+
+
+def median_us(work: Callable[[], object]) -> float:
+    """Median over rounds of the mean time of one call, us."""
+    rounds = []
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        for _ in range(STEPS):
+            work()
+        rounds.append((time.perf_counter() - start) / STEPS * 1e6)
+    return statistics.median(rounds)
+
+
+def main() -> None:
+    """Time every shipped profile in forward flight."""
+    setpoint = np.array([np.nan] * 3 + [1.0, 0.5, -0.2] + [np.nan] * 3 + [0.3, np.nan])
+    for name in profile_names():
+        vehicle = Vehicle(load_profile(name), position_enu_m=(0.0, 0.0, 5.0), yaw_enu_rad=0.0)
+        for _ in range(STEPS):
+            vehicle.step(setpoint, armed=True)
+        whole = median_us(lambda vehicle=vehicle: vehicle.step(setpoint, armed=True))
+        control = median_us(
+            lambda v=vehicle: control_step(v._state, v._measurement, setpoint, v._gains, True)  # noqa: FBT003
+        )
+        commands = vehicle.truth.motor_commands.copy()
+        physics = median_us(lambda v=vehicle, c=commands: v._physics.advance(c))
+        reading = median_us(lambda v=vehicle: v._physics.read(v._raw))
+        print(
+            f"{name}: step {whole:.1f} us; alone: JSBSim {physics:.1f}, reading {reading:.1f}, "
+            f"controller {control:.1f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Cleaning keeps what is sane, and lets nothing else through."""
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sitl.control import layout
+from sitl.control.gains import gains_for
+from sitl.control.setpoint import FARTHEST_M, clean_setpoint, wrap
+from sitl.vehicle.profile import load_profile
+
+GAINS = gains_for(load_profile("solo"), 0.004)
+anything = st.lists(st.floats(), min_size=11, max_size=11).map(np.array)
+sane = st.lists(st.floats(-1.0, 1.0), min_size=11, max_size=11).map(np.array)
+
+
+@given(sane)
+def test_sane_setpoints_pass_unchanged(setpoint):
+    np.testing.assert_allclose(clean_setpoint(setpoint, GAINS), setpoint, rtol=0, atol=1e-15)
+
+
+@given(anything)
+def test_everything_is_limited(setpoint):
+    given_setpoint = setpoint.copy()
+    clean = clean_setpoint(setpoint, GAINS)
+    np.testing.assert_array_equal(setpoint, given_setpoint)
+    np.testing.assert_array_equal(np.isnan(clean), ~np.isfinite(setpoint))
+    finite = np.nan_to_num(clean)
+    assert (np.abs(finite[:3]) <= FARTHEST_M).all()
+    assert np.hypot(finite[3], finite[4]) <= GAINS[layout.G_SPEED_LIMIT] * (1 + 1e-12)
+    assert -GAINS[layout.G_CLIMB_LIMIT] <= finite[5] <= GAINS[layout.G_DESCENT_LIMIT]
+    assert np.hypot(finite[6], finite[7]) <= GAINS[layout.G_ACCELERATION_LIMIT] * (1 + 1e-12)
+    assert abs(finite[8]) <= GAINS[layout.G_ACCELERATION_LIMIT + 1]
+    assert -math.pi <= finite[9] <= math.pi
+    assert abs(finite[10]) <= GAINS[layout.G_YAW_RATE_LIMIT]
+
+
+@given(st.floats(-12.0, 12.0), st.floats(-12.0, 12.0))
+def test_speed_limit_keeps_the_direction(x, y):
+    setpoint = np.full(11, math.nan)
+    setpoint[3:5] = 10.0 * x, 10.0 * y
+    clean = clean_setpoint(setpoint, GAINS)
+    np.testing.assert_allclose(clean[3] * setpoint[4], clean[4] * setpoint[3], atol=1e-9)
+
+
+@given(st.floats(-1e4, 1e4))
+def test_wrap_is_the_same_angle(angle):
+    wrapped = wrap(angle)
+    assert -math.pi <= wrapped <= math.pi
+    assert math.isclose(math.cos(wrapped), math.cos(angle), abs_tol=1e-9)
+    assert math.isclose(math.sin(wrapped), math.sin(angle), abs_tol=1e-9)
