@@ -1,0 +1,1 @@
+"""The running vehicle: autopilot, physics, camera and referee behind MAVLink endpoints."""

@@ -1,0 +1,111 @@
+"""One client: its connection, its codecs, and its place at the autopilot and the camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.signing import Signing
+from mavfi_cli.link.transport import Transport
+from sitl.autopilot.autopilot import COMPONENT
+from sitl.autopilot.streams import Preset
+from sitl.camera.component import COMPONENT_ID as CAMERA
+from sitl.server.simulation import Simulation
+
+_COMMANDS = (dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT)
+_FRAMES = (
+    dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED,
+    dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE,
+    dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA,
+)
+
+
+class Client:
+    """Turns bytes of one connection into calls of the simulation, and its messages into bytes.
+
+    Depth frames go to the clients that started the capture; everybody gets the camera's
+    heartbeat.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        transport: Transport,
+        preset: Preset,
+        *,
+        signing: Signing | None = None,
+    ) -> None:
+        self.transport = transport
+        self._simulation = simulation
+        self._link = simulation.autopilot.open_link(preset)
+        system = simulation.autopilot.system_id
+        self._codec = Codec(system, COMPONENT, signing=signing)
+        self._camera_codec = Codec(system, CAMERA, signing=signing)
+        self._camera_answers: list[Any] = []
+        self._wants_frames = False
+
+    def close(self) -> None:
+        """Leave the autopilot and release the connection."""
+        self._simulation.autopilot.close_link(self._link)
+        self.transport.close()
+
+    def receive(self, timeout_s: float) -> list[Any]:
+        """Handle what arrives next, waiting at most `timeout_s`; the messages handled.
+
+        Raises:
+            LinkLost: the peer is gone.
+        """
+        data = self.transport.receive(timeout_s)
+        return self._take(data) if data else []
+
+    def receive_some(self) -> bool:
+        """Handle one portion of what waits; False when nothing does.
+
+        Raises:
+            LinkLost: the peer is gone.
+        """
+        data = self.transport.receive(0.0)
+        self._take(data)
+        return bool(data)
+
+    def _take(self, data: bytes) -> list[Any]:
+        messages = self._codec.decode(data, datagram=self.transport.datagram)
+        for message in messages:
+            if message.get_msgId() in _COMMANDS:
+                self._offer_camera(message)
+            self._simulation.autopilot.handle(message, self._link)
+        return messages
+
+    def send_tick(self) -> None:
+        """Send everything due at this tick at once, the autopilot's streams last."""
+        encode = self._camera_codec.encode
+        camera = [
+            encode(message)
+            for message in (*self._camera_answers, *self._simulation.camera_due)
+            if self._wants_frames or message.get_msgId() not in _FRAMES
+        ]
+        self._camera_answers.clear()
+        messages = self._simulation.autopilot.collect(self._link)
+        encode = self._codec.encode
+        self._send(camera + [encode(message) for message in messages])
+
+    def send_answers(self) -> None:
+        """Send answers without waiting for the tick."""
+        frames = [self._camera_codec.encode(message) for message in self._camera_answers]
+        self._camera_answers.clear()
+        answers = self._simulation.autopilot.take_outbox(self._link)
+        self._send(frames + [self._codec.encode(message) for message in answers])
+
+    def _send(self, frames: list[bytes]) -> None:
+        if frames:
+            self.transport.send(b"".join(frames))
+
+    def _offer_camera(self, message: Any) -> None:
+        answers = self._simulation.camera.handle(message)
+        if not answers:
+            return
+        self._camera_answers += answers
+        if message.command == dialect.MAV_CMD_IMAGE_START_CAPTURE:
+            self._wants_frames = True
+        elif message.command == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
+            self._wants_frames = False

@@ -1,0 +1,132 @@
+"""Puts a server together from its options, runs it, and ends it well."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+from mavfi_cli.core.errors import ConfigError, MavfiError
+from mavfi_cli.link.signing import Signing, key_from_passphrase
+from mavfi_cli.link.transport import open_listener, open_transport
+from sitl.autopilot.streams import Preset
+from sitl.server.client import Client
+from sitl.server.lockstep import run_lockstep
+from sitl.server.options import Options, parse
+from sitl.server.realtime import Door, Realtime
+from sitl.server.simulation import Simulation
+from sitl.vehicle.profile import load_profile
+from sitl.world import load_world
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `python -m sitl`; the exit code. A known error is one line on stderr and 1."""
+    options = parse(sys.argv[1:] if arguments is None else arguments)
+    try:
+        serve(options)
+    except MavfiError as error:
+        print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the one boundary
+        return 1
+    return 0
+
+
+def serve(options: Options) -> None:
+    """Run until the peer closes, or SIGINT or SIGTERM; save the truth whatever ends it."""
+    stopped = _stop_on_signals()
+    simulation = _simulation(options)
+    run = _lockstep if options.lockstep_fd is not None else _realtime
+    try:
+        run(options, simulation, stopped)
+    finally:
+        if options.truth is not None:
+            simulation.save_truth(options.truth)
+
+
+def _simulation(options: Options) -> Simulation:
+    world = load_world(
+        options.world,
+        seed=options.seed,
+        start_enu_m=options.start_enu_m,
+        goal_enu_m=options.goal_enu_m,
+    )
+    return Simulation(
+        world,
+        load_profile(options.vehicle),
+        system_id=options.system_id,
+        camera_columns=options.camera_columns,
+        camera_rows=options.camera_rows,
+        camera_rate_hz=options.camera_rate_hz,
+    )
+
+
+def _stop_on_signals() -> Callable[[], bool]:
+    seen: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda signum, _frame: seen.append(signum))
+    return lambda: bool(seen)
+
+
+def _lockstep(options: Options, simulation: Simulation, stopped: Callable[[], bool]) -> None:
+    transport = open_transport(f"fd:{options.lockstep_fd}")
+    client = Client(simulation, transport, Preset.LOCKSTEP)
+    try:
+        run_lockstep(
+            simulation,
+            client,
+            speed=options.speed,
+            limit_s=options.answer_limit_s,
+            stopped=stopped,
+        )
+    finally:
+        client.close()
+
+
+def _realtime(options: Options, simulation: Simulation, stopped: Callable[[], bool]) -> None:
+    key = _key(options)
+    doors: list[Door] = []
+    server = Realtime(simulation, doors, speed=options.speed or 1.0)
+    try:
+        for preset, url in options.links:
+            inherited = url.startswith("fd:")
+            listener = open_listener(
+                url, signed=key is not None, allow_unsigned=options.allow_unsigned
+            )
+            signing = _signing_maker(None if inherited else key)
+            doors.append(
+                Door(listener=listener, preset=preset, signing=signing, ends_with_peer=inherited)
+            )
+        _announce(options, simulation)
+        server.run(stopped)
+    finally:
+        server.close()
+
+
+def _key(options: Options) -> bytes | None:
+    if options.key_file is None:
+        return None
+    try:
+        passphrase = options.key_file.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read the passphrase: {error}", path=options.key_file) from None
+    if not passphrase:
+        raise ConfigError("the passphrase is empty", path=options.key_file)
+    return key_from_passphrase(passphrase)
+
+
+def _signing_maker(key: bytes | None) -> Callable[[], Signing | None]:
+    return lambda: None if key is None else Signing(key, clock=time.time)
+
+
+def _announce(options: Options, simulation: Simulation) -> None:
+    world = simulation.referee.world
+    links = "\n".join(f"  {preset.value:9} {url}" for preset, url in options.links)
+    print(  # noqa: T201 - what a person who starts it by hand needs
+        f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
+        f"system {options.system_id}, {options.speed:g} x real time\n{links}\n"
+        "connect:  MAVSDK udpin://0.0.0.0:14540 · QGroundControl by itself on UDP 14550 · "
+        "mavproxy.py --master=tcp:127.0.0.1:5760\n"
+        "Ctrl-C ends it.",
+        file=sys.stderr,
+        flush=True,
+    )
