@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
@@ -24,6 +24,7 @@ def measured(quaternion):
     return measurement
 
 
+@settings(deadline=None)  # the first call may compile
 @given(angles, st.floats(-1.5, 1.5), angles)
 def test_rotation_is_the_one_of_the_frames_module(roll, pitch, yaw):
     quaternion = quaternion_from_euler(roll, pitch, yaw)
@@ -32,6 +33,7 @@ def test_rotation_is_the_one_of_the_frames_module(roll, pitch, yaw):
     )
 
 
+@settings(deadline=None)  # the first call may compile
 @given(st.sampled_from(profile_names()), accelerations)
 def test_force_keeps_tilt_and_thrust_limits_and_the_height(name, acceleration):
     gains = GAINS[name]
@@ -47,6 +49,7 @@ def test_force_keeps_tilt_and_thrust_limits_and_the_height(name, acceleration):
     assert force[0] * acceleration[1] == pytest.approx(force[1] * acceleration[0], abs=1e-9)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(angles, st.floats(-1.4, 1.4), angles, accelerations)
 def test_rates_turn_the_thrust_towards_the_force(roll, pitch, yaw, acceleration):
     gains = GAINS["solo"]

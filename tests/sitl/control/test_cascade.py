@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.core.frames import quaternion_from_euler
@@ -29,6 +29,7 @@ def measurements(draw, on_ground=0.0):
     return measurement
 
 
+@settings(deadline=None)  # the first call may compile
 @given(names, measurements(), st.lists(anything, min_size=1, max_size=5))
 def test_any_setpoint_leaves_state_finite_and_commands_in_range(name, measurement, setpoints):
     state = np.zeros(layout.STATE_SIZE)
@@ -39,6 +40,7 @@ def test_any_setpoint_leaves_state_finite_and_commands_in_range(name, measuremen
         assert (commands <= 1.0).all()
 
 
+@settings(deadline=None)  # the first call may compile
 @given(names, measurements(), anything)
 def test_step_is_pure(name, measurement, setpoint):
     state = np.zeros(layout.STATE_SIZE)
@@ -52,6 +54,7 @@ def test_step_is_pure(name, measurement, setpoint):
     assert first[1].tobytes() == second[1].tobytes()
 
 
+@settings(deadline=None)  # the first call may compile
 @given(names, measurements(), anything)
 def test_disarmed_motors_stand_still(name, measurement, setpoint):
     state, commands = control_step(
@@ -65,6 +68,7 @@ def test_disarmed_motors_stand_still(name, measurement, setpoint):
     assert state[layout.S_FLYING] == 0.0
 
 
+@settings(deadline=None)  # the first call may compile
 @given(names, measurements(on_ground=1.0), st.floats(-0.09, 1e9))
 def test_on_the_ground_only_a_climb_lifts_off(name, measurement, down):
     setpoint = np.full(layout.SETPOINT_SIZE, math.nan)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.control import layout
@@ -33,6 +33,7 @@ def wrench(shares, name):
     return collective, torque
 
 
+@settings(deadline=None)  # the first call may compile
 @given(
     names,
     st.floats(0.35, 0.65),
@@ -48,6 +49,7 @@ def test_inverts_the_geometry_when_nothing_saturates(name, level, roll, pitch, y
     np.testing.assert_allclose(made, torque, rtol=0, atol=1e-9 * unit)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(names, st.floats(-1e6, 1e6), torques)
 def test_commands_are_within_zero_and_one(name, collective_n, torque_nm):
     shares = thrust_shares(collective_n, torque_nm, GAINS[name])
@@ -58,6 +60,7 @@ def test_commands_are_within_zero_and_one(name, collective_n, torque_nm):
     assert (commands <= 1.0).all()
 
 
+@settings(deadline=None)  # the first call may compile
 @given(names, st.floats(-2.0, 3.0), torques)
 def test_roll_and_pitch_keep_their_direction_and_come_before_the_rest(name, level, torque_nm):
     gains = GAINS[name]
@@ -70,6 +73,7 @@ def test_roll_and_pitch_keep_their_direction_and_come_before_the_rest(name, leve
     assert made[2] * torque_nm[2] >= -1e-9 * unit * unit
 
 
+@settings(deadline=None)  # the first call may compile
 @given(names, st.floats(0.0, 1.0))
 def test_throttle_is_the_motor_equation(name, share):
     # V = rpm / Kv + R (Q / Kt + I0), Drela's first-order motor

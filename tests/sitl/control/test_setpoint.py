@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.control import layout
@@ -16,11 +16,13 @@ anything = st.lists(st.floats(), min_size=11, max_size=11).map(np.array)
 sane = st.lists(st.floats(-1.0, 1.0), min_size=11, max_size=11).map(np.array)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(sane)
 def test_sane_setpoints_pass_unchanged(setpoint):
     np.testing.assert_allclose(clean_setpoint(setpoint, GAINS), setpoint, rtol=0, atol=1e-15)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(anything)
 def test_everything_is_limited(setpoint):
     given_setpoint = setpoint.copy()
@@ -37,6 +39,7 @@ def test_everything_is_limited(setpoint):
     assert abs(finite[10]) <= GAINS[layout.G_YAW_RATE_LIMIT]
 
 
+@settings(deadline=None)  # the first call may compile
 @given(st.floats(-12.0, 12.0), st.floats(-12.0, 12.0))
 def test_speed_limit_keeps_the_direction(x, y):
     setpoint = np.full(11, math.nan)
@@ -45,6 +48,7 @@ def test_speed_limit_keeps_the_direction(x, y):
     np.testing.assert_allclose(clean[3] * setpoint[4], clean[4] * setpoint[3], atol=1e-9)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(st.floats(-1e4, 1e4))
 def test_wrap_is_the_same_angle(angle):
     wrapped = wrap(angle)

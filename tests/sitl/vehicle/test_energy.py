@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.vehicle.energy import (
@@ -28,6 +28,7 @@ def twin(velocity, acceleration, energy, payload_kg):
     return max(float(terms @ [e.b1, e.b2, e.b3, e.b4, e.b5, e.b6, e.b7, e.b9]), 0.0)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(components, components, st.floats(0.0, 1.0), st.sampled_from(profile_names()))
 def test_regression_is_its_twin(velocity, acceleration, payload_kg, name):
     energy = load_profile(name).energy
@@ -60,6 +61,7 @@ def test_open_circuit_voltage_rises_with_charge(name):
     assert volts[-1] == pytest.approx(battery.cells * battery.cell_full_v)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(st.floats(0.0, 200.0), st.floats(9.0, 17.0), st.floats(0.0, 0.1))
 def test_current_delivers_the_power(power_w, open_v, resistance_ohm):
     current = battery_current(power_w, open_v, resistance_ohm)

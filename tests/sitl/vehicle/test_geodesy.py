@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.vehicle.geodesy import (
@@ -20,6 +20,7 @@ metres = st.floats(-5000.0, 5000.0)
 E2 = FLATTENING * (2.0 - FLATTENING)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(metres, metres, metres, st.floats(-80.0, 80.0), st.floats(-179.0, 179.0))
 def test_there_and_back(north, east, down, latitude, longitude):
     origin = GeodeticPoint(latitude_deg=latitude, longitude_deg=longitude, altitude_m=100.0)
