@@ -205,8 +205,8 @@ def _pieces(length_m: float, spacing_m: float) -> int:
 
 @compiled
 def _flyable(first: FloatArray, x: float, y: float, z: float, farthest_m: float) -> bool:
-    limit = farthest_m
-    return abs(x - first[0]) <= limit and abs(y - first[1]) <= limit and abs(z - first[2]) <= limit
+    dx, dy, dz = abs(x - first[0]), abs(y - first[1]), abs(z - first[2])
+    return bool(dx <= farthest_m and dy <= farthest_m and dz <= farthest_m)
 
 
 @compiled

@@ -62,7 +62,7 @@ def build(snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> O
     """
     resolution = snapshot.resolution_m
     reach = math.ceil(radius_m / resolution) + 1
-    leaves = occupied_leaves(snapshot)
+    leaves = occupied_leaves(snapshot.payload)
     low, size = _extent(leaves, bounds_enu_m, resolution, reach)
     blocked = np.zeros(tuple(size), np.uint8)
     if blocked.size and len(leaves):
@@ -85,7 +85,7 @@ def _extent(
     if not len(leaves):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     low = leaves[:, :3].min(axis=0) - reach
-    high = (leaves[:, :3] + leaves[:, 3:]).max(axis=0) + reach
+    high = (leaves[:, :3] + leaves[:, 3:4]).max(axis=0) + reach
     # One reach beyond the bounds, so that obstacles just outside still dilate inwards.
     low = np.maximum(low, np.floor(bounds[:3] / resolution).astype(np.int64) - reach)
     high = np.minimum(high, np.ceil(bounds[3:] / resolution).astype(np.int64) + reach)
@@ -114,13 +114,13 @@ def run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
 
 @compiled
 def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Blocked) -> None:
-    """Set the voxels of every leaf (x, y, z, size, size, size) that lie in the grid."""
+    """Set the voxels of every leaf (x, y, z, size) that lie in the grid."""
     nx, ny, nz = occupied.shape
     for i in range(leaves.shape[0]):
         x, y, z = leaves[i, 0] - low[0], leaves[i, 1] - low[1], leaves[i, 2] - low[2]
         for m in range(max(x, 0), min(x + leaves[i, 3], nx)):
-            for j in range(max(y, 0), min(y + leaves[i, 4], ny)):
-                for k in range(max(z, 0), min(z + leaves[i, 5], nz)):
+            for j in range(max(y, 0), min(y + leaves[i, 3], ny)):
+                for k in range(max(z, 0), min(z + leaves[i, 3], nz)):
                     occupied[m, j, k] = 1
 
 

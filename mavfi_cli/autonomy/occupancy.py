@@ -13,7 +13,8 @@ import numpy as np
 import pyoctomap
 from numpy.typing import NDArray
 
-from mavfi_cli.core.types import PointCloud
+from mavfi_cli.autonomy import octree
+from mavfi_cli.core.types import FloatArray, PointCloud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,11 +38,11 @@ class OccupancyParams:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=True)
 class MapSnapshot:
-    """The map at one moment, as the maximum-likelihood octree of OctoMap's `.bt` format."""
+    """The map at one moment, as the occupied voxels in OctoMap's `.bt` format."""
 
     stamp_s: float
     resolution_m: float
-    payload: bytes  # the node stream after the header's `data` line
+    payload: bytes  # the node stream that follows the header's `data` line; empty: nothing known
 
     def signed_bytes(self) -> NDArray[np.int8]:
         """The payload as `fcl.OcTree` takes it, (n,)."""
@@ -49,11 +50,20 @@ class MapSnapshot:
 
 
 class OccupancyMap:
-    """An octree that integrates point clouds."""
+    """An octree that integrates point clouds, and which of its voxels are occupied.
+
+    Only a voxel that some ray has ended in can be occupied, so these are remembered, and those
+    that a cloud may have changed are looked up in the tree after it. That makes a snapshot cheap:
+    OctoMap's own binary export would have to visit every free node, and, worse, replaces the
+    tree's probabilities by their extremes, after which a new obstacle in cleared space needs
+    several sightings. For the same reason inner nodes are never summed up: nobody asks them.
+    """
 
     def __init__(self, params: OccupancyParams) -> None:
         self._params = params
         self._stamp_s = -math.inf
+        self._ended_in: octree.Codes = np.empty(0, np.int64)  # sorted
+        self._occupied = np.empty(0, np.bool_)  # of each of these
         self._tree = pyoctomap.OcTree(params.resolution_m)
         self._tree.setProbHit(params.probability_hit)
         self._tree.setProbMiss(params.probability_miss)
@@ -66,35 +76,69 @@ class OccupancyMap:
         """How many nodes the tree has."""
         return int(self._tree.size())
 
+    @property
+    def occupied_voxels(self) -> int:
+        """How many voxels are occupied."""
+        return int(self._occupied.sum())
+
     def insert(self, cloud: PointCloud) -> None:
         """Integrate one cloud: rays clear, end points within the range fill.
 
-        Points that are not finite are ignored, as is a whole cloud without a finite origin.
+        Points that are not finite, out of the octree's range or outside the height limits are
+        ignored, as is a whole cloud whose origin is.
         """
         self._stamp_s = cloud.stamp_s
-        points = cloud.points_enu_m
-        height = points[:, 2]
-        kept = (height >= self._params.z_min_m) & (height <= self._params.z_max_m)
-        kept &= np.isfinite(points).all(axis=1)
-        if not kept.all():
-            points = points[kept]
-        if not len(points) or not np.isfinite(cloud.origin_enu_m).all():
+        points = self._usable(cloud.points_enu_m)
+        origin = np.asarray(cloud.origin_enu_m, np.float64)
+        if not len(points) or not self._in_range(origin).all():
             return
         self._tree.insertPointCloud(
-            np.ascontiguousarray(points),
-            cloud.origin_enu_m,
-            max_range=self._params.max_range_m,
-            lazy_eval=True,
+            points, origin, max_range=self._params.max_range_m, lazy_eval=True
         )
-        self._tree.updateInnerOccupancy()
+        reach = self._params.max_range_m + self._params.resolution_m
+        ends = points[((points - origin) ** 2).sum(axis=1) <= reach**2]
+        self._remember(ends)
+        low = np.minimum(points.min(axis=0), origin)
+        high = np.maximum(points.max(axis=0), origin)
+        self._look_up(np.maximum(low, origin - reach), np.minimum(high, origin + reach))
 
     def snapshot(self) -> MapSnapshot:
         """The map as it is now; later insertions do not change it."""
         return MapSnapshot(
             stamp_s=self._stamp_s,
             resolution_m=self._params.resolution_m,
-            payload=_payload(self._tree),
+            payload=octree.encode(self._ended_in[self._occupied]),
         )
+
+    def _usable(self, points: FloatArray) -> FloatArray:
+        height = points[:, 2]
+        kept = (height >= self._params.z_min_m) & (height <= self._params.z_max_m)
+        kept &= self._in_range(points).all(axis=1)
+        return np.ascontiguousarray(points if kept.all() else points[kept])
+
+    def _in_range(self, coordinates: FloatArray) -> NDArray[np.bool_]:
+        """Which coordinates the octree can hold, with room for a ray's length; NaN is out."""
+        limit = octree.HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
+        inside: NDArray[np.bool_] = np.abs(coordinates) < limit
+        return inside
+
+    def _remember(self, ends: FloatArray) -> None:
+        """Add the voxels of ray ends (n, 3) to those that may be occupied."""
+        codes = np.empty(len(ends), np.int64)
+        count = octree.morton_codes(ends, self._params.resolution_m, codes)
+        fresh = np.setdiff1d(codes[:count], self._ended_in)
+        if len(fresh):
+            places = np.searchsorted(self._ended_in, fresh)
+            self._ended_in = np.insert(self._ended_in, places, fresh)
+            self._occupied = np.insert(self._occupied, places, False)
+
+    def _look_up(self, low: FloatArray, high: FloatArray) -> None:
+        """Ask the tree for the remembered voxels in the box from low to high, each (3,)."""
+        resolution = self._params.resolution_m
+        centres = np.empty((len(self._ended_in), 3))
+        octree.voxel_centres(self._ended_in, resolution, centres)
+        inside = ((centres >= low - resolution) & (centres <= high + resolution)).all(axis=1)
+        self._occupied[inside] = self._tree.getLabels(centres[inside]) == 1
 
 
 def empty_snapshot(resolution_m: float = 0.2) -> MapSnapshot:
@@ -102,8 +146,9 @@ def empty_snapshot(resolution_m: float = 0.2) -> MapSnapshot:
     return MapSnapshot(stamp_s=-math.inf, resolution_m=resolution_m, payload=b"")
 
 
-def _payload(tree: pyoctomap.OcTree) -> bytes:
-    if tree.size() == 0:
-        return b""
-    written: bytes = tree.writeBinary()
-    return written.split(b"\ndata\n", 1)[1]
+def snapshot_of(points_enu_m: FloatArray, resolution_m: float = 0.2) -> MapSnapshot:
+    """A map in which exactly the voxels of the points (n, 3) are occupied."""
+    codes = np.empty(len(points_enu_m), np.int64)
+    count = octree.morton_codes(np.asarray(points_enu_m, np.float64), resolution_m, codes)
+    payload = octree.encode(np.unique(codes[:count]))
+    return MapSnapshot(stamp_s=0.0, resolution_m=resolution_m, payload=payload)
