@@ -1,0 +1,175 @@
+"""Signing, against pymavlink's own implementation in both directions."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import pytest
+
+from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.signing import EPOCH_UNIX_S, UNITS_PER_S, Signing, key_from_passphrase
+
+KEY = key_from_passphrase("open sesame")
+NOW_S = EPOCH_UNIX_S + 3600.0
+NOW = 3600 * UNITS_PER_S
+PING = dialect.MAVLink_ping_message(1, 2, 3, 4)
+
+
+class Clock:
+    def __init__(self, now_s: float = NOW_S) -> None:
+        self.now_s = now_s
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def _codec(key: bytes = KEY, clock: Clock | None = None, **options: Any) -> Codec:
+    return Codec(1, 1, signing=Signing(key, clock or Clock(), **options))
+
+
+def _pymavlink(key: bytes = KEY, timestamp: int = NOW, link_id: int = 0) -> Any:
+    mav = dialect.MAVLink(None, 7, 9)
+    mav.robust_parsing = True
+    mav.signing.secret_key = key
+    mav.signing.sign_outgoing = True
+    mav.signing.timestamp = timestamp
+    mav.signing.link_id = link_id
+    return mav
+
+
+def test_the_key_is_the_digest_of_the_passphrase() -> None:
+    assert hashlib.sha256(b"open sesame").digest() == KEY
+
+
+def test_our_frames_are_byte_for_byte_pymavlinks() -> None:
+    theirs = _pymavlink(link_id=5)
+    theirs.srcSystem = theirs.srcComponent = 1
+    ours = _codec(link_id=5)
+    for sequence in range(3):
+        theirs.seq = sequence
+        assert ours.encode(PING) == PING.pack(theirs)
+
+
+def test_pymavlink_accepts_what_we_sign() -> None:
+    ours, theirs = _codec(link_id=3), _pymavlink()
+    for _ in range(3):
+        (message,) = theirs.parse_buffer(ours.encode(PING))
+        assert message.get_type() == "PING"
+        assert message.get_signed()
+        assert message.get_link_id() == 3
+    assert theirs.signing.goodsig_count == 3
+
+
+def test_we_accept_what_pymavlink_signs() -> None:
+    ours, theirs = _codec(), _pymavlink(link_id=3)
+    for _ in range(3):
+        (message,) = ours.decode(PING.pack(theirs))
+        assert message.get_signed()
+        assert message.get_link_id() == 3
+    assert ours.refused == 0
+
+
+def test_another_key_is_refused() -> None:
+    ours = _codec()
+    assert ours.decode(PING.pack(_pymavlink(key=key_from_passphrase("other")))) == []
+    assert ours.refused == 1
+
+
+def test_a_tampered_signature_is_refused_and_costs_no_other_frame() -> None:
+    ours, theirs = _codec(), _pymavlink()
+    bad, good = bytearray(PING.pack(theirs)), PING.pack(theirs)
+    bad[-1] ^= 1
+    assert len(ours.decode(bytes(bad) + good)) == 1
+    assert (ours.refused, ours.bad_bytes) == (1, 0)
+
+
+def test_a_replayed_frame_is_refused() -> None:
+    ours, theirs = _codec(), _pymavlink()
+    first, second = PING.pack(theirs), PING.pack(theirs)
+    assert len(ours.decode(first + second)) == 2
+    assert ours.decode(first + second) == []
+    assert ours.refused == 2
+
+
+def test_streams_of_other_senders_have_timestamps_of_their_own() -> None:
+    ours, one, other = _codec(), _pymavlink(timestamp=NOW + 50), _pymavlink(timestamp=NOW)
+    other.srcComponent = 10
+    assert len(ours.decode(PING.pack(one) + PING.pack(other))) == 2
+
+
+def test_a_new_stream_may_be_a_minute_behind_and_no_more() -> None:
+    minute = 60 * UNITS_PER_S
+    assert len(_codec().decode(PING.pack(_pymavlink(timestamp=NOW - minute)))) == 1
+    assert _codec().decode(PING.pack(_pymavlink(timestamp=NOW - minute - 1))) == []
+
+
+def test_a_forger_cannot_silence_a_stream() -> None:
+    """A wrong signature with a far timestamp must not move what counts as newest."""
+    ours = _codec()
+    forged = PING.pack(_pymavlink(key=key_from_passphrase("other"), timestamp=2**47))
+    assert ours.decode(forged) == []
+    assert len(ours.decode(PING.pack(_pymavlink()))) == 1
+
+
+def test_unsigned_frames_are_refused_unless_allowed() -> None:
+    plain = Codec(7, 9).encode(PING)
+    ours = _codec()
+    assert ours.decode(plain) == []
+    assert ours.refused == 1
+    (message,) = _codec(accept_unsigned=True).decode(plain)
+    assert not message.get_signed()
+
+
+def test_a_wrong_signature_is_refused_where_none_would_be_fine() -> None:
+    wrong = PING.pack(_pymavlink(key=key_from_passphrase("other")))
+    assert _codec(accept_unsigned=True).decode(wrong) == []
+
+
+def test_a_radio_has_no_key_and_may_report() -> None:
+    report = dialect.MAVLink_radio_status_message(1, 2, 3, 4, 5, 6, 7)
+    assert len(_codec().decode(Codec(51, 68).encode(report))) == 1
+
+
+def test_version_1_frames_carry_no_signature() -> None:
+    frame = PING.pack(dialect.MAVLink(None, 7, 9), force_mavlink1=True)
+    assert _codec().decode(frame) == []
+    assert len(_codec(accept_unsigned=True).decode(frame)) == 1
+
+
+def test_a_link_without_a_key_hears_signed_frames() -> None:
+    (message,) = Codec(1, 1).decode(PING.pack(_pymavlink()))
+    assert message.time_usec == 1
+
+
+def _timestamp(frame: bytes) -> int:
+    return int.from_bytes(frame[-12:-6], "little")
+
+
+def test_timestamps_follow_the_clock_and_never_stand_still() -> None:
+    clock = Clock()
+    ours = _codec(clock=clock)
+    stamps = [_timestamp(ours.encode(PING)) for _ in range(3)]
+    clock.now_s += 1.0
+    stamps.append(_timestamp(ours.encode(PING)))
+    clock.now_s -= 100.0
+    stamps.append(_timestamp(ours.encode(PING)))
+    later = NOW + UNITS_PER_S
+    assert stamps == [NOW, NOW + 1, NOW + 2, later, later + 1]
+
+
+def test_a_clock_behind_the_peers_catches_up() -> None:
+    ours = _codec(clock=Clock(NOW_S - 30.0))
+    ours.decode(PING.pack(_pymavlink()))
+    assert _timestamp(ours.encode(PING)) >= NOW
+
+
+def test_a_clock_before_the_epoch_counts_as_the_epoch() -> None:
+    assert _timestamp(_codec(clock=Clock(0.0)).encode(PING)) == 0
+
+
+def test_nonsense_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match="32 bytes"):
+        Signing(b"short", Clock())
+    with pytest.raises(ValueError, match=r"0\.\.255"):
+        Signing(KEY, Clock(), link_id=256)
