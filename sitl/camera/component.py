@@ -28,6 +28,7 @@ COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
 MAX_RATE_HZ = 50.0  # one frame a control tick
 _HEARTBEAT_S = 1.0
 _HOME = Origin()
+_LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 _LEGACY_REQUESTS: dict[int, int] = {
     dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION: dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION,
@@ -77,6 +78,8 @@ class Camera:
         self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
         self._origin = origin
         self._default_interval_s = 1.0 / rate_hz
+        # Loads the compiled renderer now: in real time the first frame must not stall the flight.
+        render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
         self._pose: CameraPose | None = None
         self._stamp_s = 0.0
         self._heartbeat = Schedule(interval_s=_HEARTBEAT_S)
@@ -131,6 +134,10 @@ class Camera:
         if self._frames is not None and self._frames.due(stamp_s):
             due += self._take_frame(self._pose)
         return due
+
+    def idle(self) -> list[Message]:
+        """A heartbeat for while there is no pose to poll with."""
+        return [messages.heartbeat()]
 
     def _reboot(self) -> None:
         self._heartbeat.restart()

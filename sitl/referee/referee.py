@@ -73,7 +73,10 @@ class Referee:
         self._ground = GroundRule(half_m=(length / 2.0, width / 2.0, height / 2.0), limits=limits)
         self._stamp_s = 0.0
         self._position: Vector | None = None
-        self._quaternion = np.array([1.0, 0.0, 0.0, 0.0])
+        self._quaternion = level = np.array([1.0, 0.0, 0.0, 0.0])
+        # Loads the compiled geometry now: in real time the first tick must not stall.
+        clearance(np.zeros(3), level, self._half, self._boxes)
+        sweep(np.zeros(3), level, np.zeros(3), level, self._half, self._boxes, 0.0)
 
     def observe(
         self,

@@ -33,8 +33,8 @@ class WorldCheck:
     start_clearance_m: float  # in plan, inf where there is no box
     goal_clearance_m: float
     straight_m: float  # from start to goal in plan
-    path_m: float | None  # shortest on the grid, None where there is none
-    path_enu_m: Vector  # (n, 3) at flight height, empty where there is none
+    path_m: float | None  # a shortest way on the grid, straightened; None where there is none
+    path_enu_m: Vector  # (n, 3) its corners at flight height, empty where there is none
 
     @property
     def path_exists(self) -> bool:
@@ -53,8 +53,8 @@ def check_world(
     plan = world.goal_enu_m[:2] - world.start_enu_m[:2]
     path = np.zeros((0, 3))
     if found is not None:
-        centres = origin + (np.array(found[1]) + 0.5) * cell_m
-        path = np.column_stack([centres, np.full(len(centres), height)])
+        corners = origin + (np.array(_straighten(free, found)) + 0.5) * cell_m
+        path = np.column_stack([corners, np.full(len(corners), height)])
     start_gaps = plan_distance_to_boxes(world.boxes_enu_m, world.start_enu_m)
     goal_gaps = distance_to_boxes(world.boxes_enu_m, world.goal_enu_m)
     return WorldCheck(
@@ -62,7 +62,7 @@ def check_world(
         start_clearance_m=float(start_gaps.min(initial=math.inf)),
         goal_clearance_m=float(goal_gaps.min(initial=math.inf)),
         straight_m=float(np.hypot(*plan)),
-        path_m=None if found is None else found[0] * cell_m,
+        path_m=None if found is None else _length_m(path),
         path_enu_m=path,
     )
 
@@ -92,8 +92,8 @@ def _cell(place: Vector, origin: Vector, cell_m: float) -> tuple[int, int]:
 
 def _shortest(
     free: Mask, start: tuple[int, int], goal: tuple[int, int]
-) -> tuple[float, list[tuple[int, int]]] | None:
-    """Dijkstra with the straight line as heuristic (A*): length in cells, and the cells."""
+) -> list[tuple[int, int]] | None:
+    """Dijkstra with the straight line as heuristic (A*): the cells of a shortest way."""
     shape = free.shape
     start = (min(start[0], shape[0] - 1), min(start[1], shape[1] - 1))
     goal = (min(goal[0], shape[0] - 1), min(goal[1], shape[1] - 1))
@@ -106,7 +106,7 @@ def _shortest(
     while queue:
         _, here = heapq.heappop(queue)
         if here == goal:
-            return best[goal], _trace(parent, goal)
+            return _trace(parent, goal)
         if here in closed:
             continue
         closed.add(here)
@@ -129,3 +129,29 @@ def _trace(
     while cells[-1] in parent:
         cells.append(parent[cells[-1]])
     return cells[::-1]
+
+
+def _straighten(free: Mask, cells: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The same way with fewer corners: each is joined to the last one that it sees."""
+    corners = [cells[0]]
+    at = 0
+    while at < len(cells) - 1:
+        seen = at + 1
+        for ahead in range(len(cells) - 1, at + 1, -1):
+            if _sees(free, cells[at], cells[ahead]):
+                seen = ahead
+                break
+        at = seen
+        corners.append(cells[at])
+    return corners
+
+
+def _sees(free: Mask, a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether every cell on the straight way between two cells is free."""
+    count = 4 * max(abs(b[0] - a[0]), abs(b[1] - a[1])) + 1
+    line = np.rint(np.linspace(a, b, count)).astype(int)
+    return bool(free[line[:, 0], line[:, 1]].all())
+
+
+def _length_m(path: Vector) -> float:
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())

@@ -50,7 +50,7 @@ def world_svg(world: World, path_enu_m: Vector | None = None) -> bytes:
                 linestyle=(0, (4, 2)), label="way with clearance", zorder=3,
             )  # fmt: skip
         _draw_places(axes, world)
-        _draw_scale(axes, west, south, east - west)
+        _draw_scale(axes, world)
         axes.set_xlim(west, east)
         axes.set_ylim(south, north)
         axes.set_aspect("equal")
@@ -98,15 +98,36 @@ def _draw_places(axes: Axes, world: World) -> None:
     )  # fmt: skip
 
 
-def _draw_scale(axes: Axes, west: float, south: float, width: float) -> None:
-    """A bar of 1, 2 or 5 times a power of ten, about a sixth of the width, lower left."""
-    ideal = width / 6.0
-    power = 10.0 ** np.floor(np.log10(ideal))
-    length = float(power * max(f for f in (1.0, 2.0, 5.0) if f * power <= ideal))
-    x, y = west + 0.04 * width, south + 0.04 * width
-    backdrop = {"facecolor": _GROUND, "edgecolor": "none", "pad": 0.8, "alpha": 0.85}
+def _draw_scale(axes: Axes, world: World) -> None:
+    """A bar of 1, 2 or 5 times a power of ten, about a sixth of the width, in a free corner."""
+    west, south, _, east, north, _ = (float(v) for v in world.bounds_enu_m)
+    width = east - west
+    power = 10.0 ** np.floor(np.log10(width / 6.0))
+    length = float(power * max(f for f in (1.0, 2.0, 5.0) if f * power <= width / 6.0))
+    margin, room = 0.04 * width, 0.07 * width
+    corners = [
+        (x, y)
+        for y in (south + margin, north - margin - room)
+        for x in (west + margin, east - margin - length)
+    ]
+    free = [corner for corner in corners if _is_empty(world, corner, length, room)]
+    x, y = (free or corners)[0]
     axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.0, solid_capstyle="butt", zorder=6)
     axes.text(
         x + length / 2.0, y + 0.012 * width, f"{length:g} m", ha="center", va="bottom",
-        fontsize=8, color=_INK, zorder=6, bbox=backdrop,
+        fontsize=8, color=_INK, zorder=6,
     )  # fmt: skip
+
+
+def _is_empty(world: World, corner: tuple[float, float], width: float, height: float) -> bool:
+    """Whether no box, start or goal lies in a rectangle of the plan."""
+    boxes = world.boxes_enu_m
+    places = np.array([world.start_enu_m, world.goal_enu_m])
+    footprints = np.vstack([boxes[:, [0, 1, 3, 4]], np.hstack([places[:, :2], places[:, :2]])])
+    apart = (
+        (footprints[:, 0] > corner[0] + width)
+        | (footprints[:, 2] < corner[0])
+        | (footprints[:, 1] > corner[1] + height)
+        | (footprints[:, 3] < corner[1])
+    )
+    return bool(apart.all())

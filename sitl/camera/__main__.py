@@ -1,0 +1,8 @@
+"""`python -m sitl.camera`: the depth camera for a foreign autopilot."""
+
+import sys
+
+from sitl.camera.command import main
+
+if __name__ == "__main__":
+    sys.exit(main())
