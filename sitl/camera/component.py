@@ -202,6 +202,7 @@ class Camera:
             return int(dialect.MAV_RESULT_DENIED)
         if math.isnan(interval_s) or interval_s == 0.0:
             interval_s = self._default_interval_s
+        interval_s = round(interval_s, 6)  # the wire's float32 of 0.1 would drift against ticks
         self._frames = Schedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
         self._frames_left = count
         return int(dialect.MAV_RESULT_ACCEPTED)
