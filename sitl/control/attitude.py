@@ -30,6 +30,7 @@ from sitl.control.layout import (
     S_HEADING_RATE,
     S_LAST_RATES,
     S_RATE_INTEGRAL,
+    S_VELOCITY_INTEGRAL,
     SP_YAW,
     SP_YAW_RATE,
 )
@@ -39,6 +40,8 @@ Vector = NDArray[np.float64]
 
 LEAST_LIFT = 0.25  # of gravity: below it the attitude would lose its meaning
 THRUST_RESERVE = 0.9  # of the largest thrust; the rest is kept for attitude
+HORIZONTAL_MARGIN = 0.2  # of gravity: acceleration that a climb never takes from a turn
+UNWINDING_HZ = 2.0  # how fast an integral gives way to what could not be had
 RATE_INTEGRAL_LIMIT_RADPS2 = 20.0
 
 
@@ -63,20 +66,34 @@ def rotation(measurement: Vector) -> Vector:
 def specific_force(acceleration: Vector, gains: Vector) -> Vector:
     """Thrust per mass (3,), NED m/s^2, for an acceleration; height before tilt.
 
-    The vertical part is kept; the horizontal part gives way to the tilt limit and to the
-    thrust that there is.
+    The vertical part comes first, but for a margin; the horizontal part gives way to the tilt
+    limit and to the thrust that there is.
     """
     gravity = gains[G_GRAVITY]
     largest = THRUST_RESERVE * 4.0 * gains[G_ROTOR_THRUST] / gains[G_MASS]
+    horizontal = math.sqrt(acceleration[0] ** 2 + acceleration[1] ** 2)
+    margin = min(horizontal, HORIZONTAL_MARGIN * gravity)
+    highest = math.sqrt(max(largest * largest - margin * margin, 0.0))
     force = np.empty(3)
-    force[2] = clip(acceleration[2] - gravity, -largest, -LEAST_LIFT * gravity)
+    force[2] = clip(acceleration[2] - gravity, -highest, -LEAST_LIFT * gravity)
     room = math.sqrt(max(largest * largest - force[2] * force[2], 0.0))
     allowed = min(-force[2] * gains[G_TILT_TANGENT], room)
-    horizontal = math.sqrt(acceleration[0] ** 2 + acceleration[1] ** 2)
     scale = allowed / horizontal if horizontal > allowed else 1.0
     force[0] = acceleration[0] * scale
     force[1] = acceleration[1] * scale
     return force
+
+
+@compiled
+def unwind(acceleration: Vector, force: Vector, state: Vector, gains: Vector) -> None:
+    """Let the velocity integrals in `state` that push into a limit give way towards zero."""
+    for axis in range(3):
+        had = force[axis] + (gains[G_GRAVITY] if axis == 2 else 0.0)
+        step = gains[G_DT] * UNWINDING_HZ * abs(had - acceleration[axis])
+        integral = state[S_VELOCITY_INTEGRAL + axis]
+        if integral * (acceleration[axis] - had) > 0.0:
+            left = max(abs(integral) - step, 0.0)
+            state[S_VELOCITY_INTEGRAL + axis] = math.copysign(left, integral)
 
 
 @compiled

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.control.attitude import heading_rate, rotation, specific_force, tilt_rates, torque
+from sitl.control.attitude import heading_rate, rotation, specific_force, tilt_rates, torque, unwind
 from sitl.control.compiled import compiled
 from sitl.control.layout import (
     G_MASS,
@@ -62,6 +62,7 @@ def control_step(
     new[S_FLYING] = 1.0
     acceleration = acceleration_target(target, clean, measurement, new, gains)
     force = specific_force(acceleration, gains)
+    unwind(acceleration, force, new, gains)
     rates = tilt_rates(force, matrix, gains)
     heading = math.atan2(matrix[1, 0], matrix[0, 0])
     turn = heading_rate(clean, heading, new, gains)

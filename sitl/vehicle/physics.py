@@ -58,8 +58,12 @@ class Physics:
         dt_s: float,
     ) -> None:
         jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
-        with tempfile.TemporaryDirectory(prefix="mavfi-vehicle-") as folder:
-            self._fdm = _load(profile, Path(folder), dt_s)
+        try:
+            with tempfile.TemporaryDirectory(prefix="mavfi-vehicle-") as folder:
+                self._fdm = _load(profile, Path(folder), dt_s)
+        except (OSError, jsbsim.BaseError) as error:
+            problem = f"cannot make the model of vehicle {profile.name!r}: {error}"
+            raise VehicleProcessError(problem) from None
         _place(self._fdm, position_ned_m, heading_rad)
         self._readers = [_node(self._fdm, name).get_double_value for name in RAW_PROPERTIES]
         self._writers = [

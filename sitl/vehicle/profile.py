@@ -14,7 +14,7 @@ from mavfi_cli.core.errors import ConfigError, UnknownName
 
 AIR_DENSITY_KGPM3 = 1.225  # ISA sea level, which is where the physics world lies
 GRAVITY_MPS2 = 9.80665
-MIN_THRUST_TO_WEIGHT = 1.15  # below it there is nothing left to steer and climb with
+MIN_THRUST_TO_WEIGHT = 1.2  # below it there is nothing left to steer and climb with
 
 LARGEST_TILT_DEG = 60.0
 

@@ -52,12 +52,12 @@ class Record:
 
 
 class Flight:
-    """A vehicle and what to do with it."""
+    """A vehicle, "profile" or "profile+payload in kg", and what to do with it."""
 
     def __init__(self, name, *, position_enu_m=(0.0, 0.0, 0.0), yaw_enu_rad=0.5):
-        profile = load_profile(name.removesuffix("+payload"))
-        if name.endswith("+payload"):
-            profile = dataclasses.replace(profile, extra_payload_kg=0.3)
+        base, _, payload_kg = name.partition("+")
+        payload_kg = float(payload_kg or 0.0)
+        profile = dataclasses.replace(load_profile(base), extra_payload_kg=payload_kg)
         self.vehicle = Vehicle(profile, position_enu_m=position_enu_m, yaw_enu_rad=yaw_enu_rad)
         self.truth = self.vehicle.truth
 

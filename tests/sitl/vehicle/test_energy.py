@@ -86,7 +86,7 @@ def test_battery_lasts_as_long_as_the_real_one(airborne, setpoint, name, minutes
     assert flight.truth.battery_voltage_v < battery.cells * battery.cell_full_v
 
 
-@pytest.mark.parametrize("name", ["solo", "spark", "solo+payload"])
+@pytest.mark.parametrize("name", ["solo", "spark", "solo+0.3"])
 def test_hover_power_is_that_of_the_propeller_equations(airborne, setpoint, name):
     flight = airborne(name)
     flight.fly(setpoint(velocity=(0.0, 0.0, 0.0)), 20.0)

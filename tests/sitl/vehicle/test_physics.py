@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from mavfi_cli.core.errors import VehicleProcessError
 from sitl.control.gains import gains_for
 from sitl.control.mixer import throttle
 from sitl.vehicle.model import AIRCRAFT, power_share, thrust_share, write_model
@@ -121,3 +122,9 @@ def test_model_files_are_ours_and_whole(tmp_path):
         "engine/propeller.xml",
         "planet.xml",
     ]
+
+
+def test_no_room_for_the_model_files_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+    with pytest.raises(VehicleProcessError, match="cannot make the model of vehicle 'solo'"):
+        bench("solo", 1.0)

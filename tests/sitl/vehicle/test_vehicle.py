@@ -11,7 +11,7 @@ from sitl.vehicle.profile import load_profile
 from sitl.vehicle.truth import T_ON_GROUND
 from sitl.vehicle.vehicle import PHYSICS_DT_S, Vehicle
 
-NAMES = ("solo", "spark", "solo+payload")
+NAMES = ("solo", "spark", "solo+0.3")
 
 
 @pytest.mark.parametrize("name", NAMES)
