@@ -7,7 +7,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import cattrs
 from cattrs import AttributeValidationNote, IterableValidationNote
@@ -95,9 +95,18 @@ def _refuse_unknown(
         full = f"{prefix}{key}"
         if key not in hints:
             raise UnknownKey(full, hints, path=path, line=_line_of(text, full))
-        for item in value if isinstance(value, list) else [value]:
-            for nested in _dataclasses_in(hints[key]):
-                _refuse_unknown(item, nested, path, text, prefix=f"{full}.")
+        for nested in _dataclasses_in(hints[key]):
+            for name, item in _items(value, hints[key]):
+                _refuse_unknown(item, nested, path, text, prefix=f"{full}.{name}")
+
+
+def _items(value: Any, hint: Any) -> list[tuple[str, Any]]:
+    """The tables inside a value, each with what it adds to the key's name."""
+    if isinstance(value, list):
+        return [("", item) for item in value]
+    if get_origin(hint) is dict and isinstance(value, Mapping):
+        return [(f"{name}.", item) for name, item in value.items()]
+    return [("", value)]
 
 
 def _dataclasses_in(hint: Any) -> list[Any]:

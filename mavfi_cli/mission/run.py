@@ -76,6 +76,7 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
             flight_begun = time.perf_counter()
             crash = _fly(flight, folder)
             flight_wall_s = time.perf_counter() - flight_begun
+        transport.close()  # the vehicle sees the end and saves its truth
         if process is not None:
             process.stop()
         host = {
@@ -117,9 +118,11 @@ def _vehicle(
         return
     with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
         process = VehicleProcess(config, Path(folder))
+        transport = open_transport(f"fd:{process.detach()}")
         try:
-            yield open_transport(f"fd:{process.socket.detach()}"), Path(folder), process
+            yield transport, Path(folder), process
         finally:
+            transport.close()
             process.stop()
 
 

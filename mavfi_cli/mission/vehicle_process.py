@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import subprocess
 import sys
@@ -32,12 +31,14 @@ class VehicleProcess:
             except OSError as error:
                 ours.close()
                 raise VehicleProcessError(f"cannot start the vehicle: {error}") from None
-        self.socket = ours
+        self._socket = ours
+
+    def detach(self) -> int:
+        """Our end of the socket pair; the caller closes it."""
+        return self._socket.detach()
 
     def stop(self, timeout_s: float = 20.0) -> None:
-        """Let it save the truth and end; kill it where it does not."""
-        with contextlib.suppress(OSError):
-            self.socket.close()
+        """After our end was closed: let it save the truth and end; kill it where it does not."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:

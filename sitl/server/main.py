@@ -11,6 +11,7 @@ from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.link.signing import Signing, key_from_passphrase
 from mavfi_cli.link.transport import open_listener, open_transport
 from sitl.autopilot.streams import Preset
+from sitl.server.briefing import write_briefing
 from sitl.server.client import Client
 from sitl.server.lockstep import run_lockstep
 from sitl.server.options import Options, parse
@@ -35,6 +36,8 @@ def serve(options: Options) -> None:
     """Run until the peer closes, or SIGINT or SIGTERM; save the truth whatever ends it."""
     stopped = _stop_on_signals()
     simulation = _simulation(options)
+    if options.truth is not None:
+        write_briefing(simulation, options.truth)
     run = _lockstep if options.lockstep_fd is not None else _realtime
     try:
         run(options, simulation, stopped)

@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -19,6 +19,7 @@ class Outer:
     box: list[Inner]
     sub: Inner | None = None
     pair: tuple[float, float] = (0.0, 0.0)
+    named: dict[str, Inner] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.name == "bad":
@@ -32,8 +33,9 @@ def load(tmp_path: Path, text: str) -> Outer:
 
 
 def test_a_good_file(tmp_path):
-    text = 'name = "x"\npair = [1, 2.5]\n[[box]]\na = 1\n[sub]\na = 2.0\nb = 3\n'
-    assert load(tmp_path, text) == Outer("x", [Inner(1.0)], Inner(2.0, 3), (1.0, 2.5))
+    text = 'name = "x"\npair = [1, 2.5]\n[[box]]\na = 1\n[sub]\na = 2.0\nb = 3\n[named.one]\na = 4'
+    expected = Outer("x", [Inner(1.0)], Inner(2.0, 3), (1.0, 2.5), {"one": Inner(4.0)})
+    assert load(tmp_path, text) == expected
 
 
 @pytest.mark.parametrize(
@@ -41,6 +43,7 @@ def test_a_good_file(tmp_path):
     [
         ('name = "x"\nbox = []\nnam = 1', r"file\.toml:3: nam: .*did you mean 'name'"),
         ('name = "x"\n[[box]]\na = 1\n[[box]]\nq = 2', r"file\.toml:5: box\.q: unknown key"),
+        ('name = "x"\nbox = []\n[named.one]\nq = 2', r"file\.toml:4: named\.one\.q: unknown"),
     ],
 )
 def test_an_unknown_key_names_the_nearest(tmp_path, text, message):

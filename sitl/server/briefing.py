@@ -1,0 +1,30 @@
+"""What a companion that was started together with the vehicle is told: its mission."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from mavfi_cli.core.errors import RecordError
+from sitl.server.simulation import Simulation
+
+FILE = "briefing.json"
+
+
+def write_briefing(simulation: Simulation, folder: Path) -> None:
+    """Leave goal, bounds and camera mount in `folder`, before the first message is sent.
+
+    Raises:
+        RecordError: it cannot be written.
+    """
+    world = simulation.referee.world
+    briefing = {
+        "goal_enu_m": world.goal_enu_m.tolist(),
+        "bounds_enu_m": world.bounds_enu_m.tolist(),
+        "camera_offset_flu_m": [float(c) for c in simulation.camera.optics.mount_offset_flu_m],
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / FILE).write_text(json.dumps(briefing))
+    except OSError as error:
+        raise RecordError(f"{folder / FILE}: {error.strerror or error}") from None
