@@ -24,6 +24,7 @@ Vector = NDArray[np.float64]
 
 LEAST_SHARE = 0.01  # of a rotor's thrust; keeps it turning
 IDLE_SHARE = 0.01
+NEGLIGIBLE_SHARE = 1.0e-12  # too little to divide by
 _FORWARD = np.array([1.0, -1.0, 1.0, -1.0])
 _RIGHT = np.array([1.0, -1.0, -1.0, 1.0])
 _SENSE = np.array([1.0, 1.0, -1.0, -1.0])
@@ -47,9 +48,9 @@ def thrust_shares(collective_n: float, torque_nm: Vector, gains: Vector) -> Vect
     yawing = _SENSE * torque_nm[2] / (unit * gains[G_TORQUE_PER_THRUST])
     scale = 1.0
     for rotor in range(4):
-        if yawing[rotor] > 0.0:
+        if yawing[rotor] > NEGLIGIBLE_SHARE:
             scale = min(scale, (1.0 - shares[rotor]) / yawing[rotor])
-        elif yawing[rotor] < 0.0:
+        elif yawing[rotor] < -NEGLIGIBLE_SHARE:
             scale = min(scale, (LEAST_SHARE - shares[rotor]) / yawing[rotor])
     shares += max(scale, 0.0) * yawing
     for rotor in range(4):
