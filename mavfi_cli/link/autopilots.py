@@ -23,6 +23,7 @@ class Autopilot:
     arming_modes: tuple[str, ...]  # modes to arm in; the first is the one to ask for
     takeoff_amsl: bool  # NAV_TAKEOFF takes an altitude above sea level, not above home
     unused: float  # what a command parameter without meaning holds
+    early_setpoints: bool  # wants setpoints before the mode; otherwise they break its take-off
 
     def mode_name(self, custom_mode: int) -> str:
         """The name of a HEARTBEAT.custom_mode, or its number in words."""
@@ -64,6 +65,7 @@ PX4 = Autopilot(
     arming_modes=("AUTO.LOITER", "AUTO.TAKEOFF", "POSCTL"),
     takeoff_amsl=True,
     unused=math.nan,
+    early_setpoints=True,
 )
 
 ARDUCOPTER = Autopilot(
@@ -86,6 +88,7 @@ ARDUCOPTER = Autopilot(
     arming_modes=("GUIDED",),
     takeoff_amsl=False,
     unused=0.0,
+    early_setpoints=False,
 )
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +26,8 @@ MAX_PIXELS = 1 << 20
 DEPTH_UNIT_M = 0.1
 NOTHING = 255  # pixel value where nothing was in range
 
-_OPEN_FRAMES = 3  # frames that may still become whole at the same time
-_SPARE_PACKETS = 16  # packets kept that no announced frame lacks
+_OPEN_FRAMES = 3  # the newest frames, by index, may still become whole
+_RECENT_PACKETS = 16  # packets that a frame announced after them may still claim
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
 _LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
 _REMEMBERED = 64  # indices of frames that are done with
@@ -58,29 +59,33 @@ class _Shape:
 class _Assembly:
     """A frame that was announced and is not whole yet."""
 
-    __slots__ = ("checksum", "index", "places", "stamp_s", "trials_left")
+    __slots__ = ("announced", "checksum", "index", "near", "stamp_s", "trials_left")
 
-    def __init__(self, index: int, stamp_s: float, checksum: int | None) -> None:
+    def __init__(self, index: int, stamp_s: float, checksum: int | None, announced: int) -> None:
         self.index = index
         self.stamp_s = stamp_s
         self.checksum = checksum
-        self.places: dict[int, bytes] = {}
+        self.announced = announced  # count of messages at its announcement
+        self.near: dict[int, tuple[int, bytes]] = {}  # place -> how far off its due time, data
         self.trials_left = _TRIALS
 
-    def image(self, shape: _Shape, changes: dict[int, bytes]) -> bytes | None:
-        """The pixels with some packets exchanged, if the checksum agrees."""
+    def offer(self, place: int, data: bytes, count: int, reach: int) -> bool:
+        """Take the packet if it came nearer to when this frame's was due than any before."""
+        off = abs(count - (self.announced + 2 + place))
+        held = self.near.get(place)
+        if off > reach or (held is not None and held[0] <= off):
+            return False
+        self.near[place] = (off, data)
+        return True
+
+    def image(self, packets: Iterable[bytes], shape: _Shape) -> bytes | None:
+        """The pixels of these packets, if the checksum agrees."""
         if self.trials_left <= 0:
             return None
         self.trials_left -= 1
-        chosen = {**self.places, **changes}
-        packets = (chosen[place][: shape.payload] for place in range(shape.packets))
-        image = b"".join(packets)[: shape.size]
+        image = b"".join(data[: shape.payload] for data in packets)[: shape.size]
         agreed = self.checksum is None or zlib.crc32(image) == self.checksum
         return image if agreed else None
-
-    def is_full(self, shape: _Shape) -> bool:
-        """Whether there is a packet for every place."""
-        return len(self.places) >= shape.packets
 
 
 class ImageReceiver:
@@ -89,8 +94,9 @@ class ImageReceiver:
     A lost packet loses its frame and no other; a frame whose checksum never fits is dropped.
     Memory is bounded by a few frames of MAX_PIXELS, whatever comes in.
 
-    Every announced frame takes the packets it lacks. One that no frame lacks is kept a while: its
-    frame may be announced later, or hold a packet of a neighbour in its place.
+    Two guesses are tried against the checksum: of each place the packet that came nearest to when
+    it was due after the announcement (right when neighbouring frames interleave a little), and
+    the newest packet of each place (right when one frame is shuffled as it likes).
 
     Attributes:
         hfov_rad: the camera's horizontal field of view, None until it told.
@@ -102,7 +108,10 @@ class ImageReceiver:
         self.received = 0
         self._shape: _Shape | None = None
         self._open: list[_Assembly] = []  # oldest first
-        self._spare: deque[tuple[int, bytes]] = deque(maxlen=_SPARE_PACKETS)
+        self._count = 0  # messages of the protocol so far
+        self._recent: deque[tuple[int, int, bytes]] = deque(maxlen=_RECENT_PACKETS)
+        self._latest: dict[int, bytes] = {}  # place -> newest packet
+        self._fresh: set[int] = set()  # places that got a packet since a frame became whole
         self._closed: deque[int] = deque(maxlen=_REMEMBERED)
         self._first: int | None = None  # first and newest index since the camera started
         self._newest = 0
@@ -132,21 +141,24 @@ class ImageReceiver:
         return []
 
     def _captured(self, message: Message) -> list[ImageFrame]:
-        """Open a frame; spare packets may belong to it."""
-        if not self._count(message.image_index):
+        """Open a frame; packets that came just before may belong to it."""
+        self._count += 1
+        if not self._follow(message.image_index):
             return []
         match = _CHECKSUM.fullmatch(message.file_url)
         checksum = int(match[1], 16) if match else None
-        frame = _Assembly(message.image_index, message.time_boot_ms / 1e3, checksum)
-        frame.places.update(p for p in self._spare if self._fits(p[0]))
-        self._spare.clear()
+        stamp_s = message.time_boot_ms / 1e3
+        frame = _Assembly(message.image_index, stamp_s, checksum, self._count)
+        for count, place, data in self._recent:
+            if self._fits(place):
+                frame.offer(place, data, count, self._reach())
         self._open.append(frame)
         self._open.sort(key=lambda each: each.index)
-        if len(self._open) > _OPEN_FRAMES:
+        while self._open and self._open[0].index <= self._newest - _OPEN_FRAMES:
             self._close(self._open[0])
         return self._finish(self._open)
 
-    def _count(self, index: int) -> bool:
+    def _follow(self, index: int) -> bool:
         """Follow the index; False for a frame that is known or too old."""
         if self._first is None or abs(index - self._newest) > _LARGEST_GAP:
             self._open.clear()
@@ -164,46 +176,50 @@ class ImageReceiver:
         return True
 
     def _handshake(self, message: Message) -> list[ImageFrame]:
+        self._count += 1
         shape = _shape_of(message)
-        if shape is None or shape == self._shape:
+        if shape is None:
             return []
-        self._shape = shape
-        for frame in self._open:
-            frame.places = {p: data for p, data in frame.places.items() if p < shape.packets}
+        if shape != self._shape:
+            self._shape = shape
+            self._latest = {p: data for p, data in self._latest.items() if p < shape.packets}
+            self._fresh &= self._latest.keys()
+            for frame in self._open:
+                frame.near = {p: held for p, held in frame.near.items() if p < shape.packets}
         return self._finish(self._open)
 
     def _fits(self, place: int) -> bool:
         """Whether a frame has such a place, as far as is known."""
-        return place < (_SPARE_PACKETS if self._shape is None else self._shape.packets)
+        return place < (_RECENT_PACKETS if self._shape is None else self._shape.packets)
+
+    def _reach(self) -> int:
+        """How far off its due time a packet may come, in messages: about one frame."""
+        return _RECENT_PACKETS if self._shape is None else self._shape.packets + 2
 
     def _packet(self, place: int, data: bytes) -> list[ImageFrame]:
+        self._count += 1
         if not self._fits(place):
             return []
-        lacking = [frame for frame in self._open if place not in frame.places]
-        for frame in lacking:
-            frame.places[place] = data
-        if lacking:
-            done = self._finish(lacking)
-            for frame in self._open[:-1]:  # an older frame lacks this place still
-                if frame in lacking and self._shape and frame.is_full(self._shape):
-                    del frame.places[place]
-            return done
-        if any(frame.places[place] == data for frame in self._open):
-            return []  # a copy of a packet that is in its place already
-        self._spare.append((place, data))
-        return self._finish(self._open)
+        self._recent.append((self._count, place, data))
+        self._latest[place] = data
+        self._fresh.add(place)
+        reach = self._reach()
+        improved = [f for f in self._open if f.offer(place, data, self._count, reach)]
+        every = self._shape is not None and len(self._fresh) >= self._shape.packets
+        return self._finish(self._open if every else improved)
 
     def _finish(self, frames: list[_Assembly]) -> list[ImageFrame]:
         """Close and return those of some open frames that are whole."""
         shape = self._shape
+        if shape is None:
+            return []
         done = []
         for frame in list(frames):
-            if shape is None or not frame.is_full(shape):
-                continue
             image = self._solve(frame, shape)
             if image is None:
                 continue
             self._close(frame)
+            self._fresh.clear()
             self.received += 1
             pixels = np.frombuffer(image, dtype=np.uint8).reshape(shape.rows, shape.columns)
             done.append(
@@ -214,17 +230,14 @@ class ImageReceiver:
         return done
 
     def _solve(self, frame: _Assembly, shape: _Shape) -> bytes | None:
-        """The frame as it is, with all spare packets in place, or with one of them."""
-        spare = [(place, data) for place, data in self._spare if place < shape.packets]
-        options = [{}, *([dict(spare)] if len(spare) > 1 else []), *({p: d} for p, d in spare)]
-        for changes in options:
-            image = frame.image(shape, changes)
-            if image is not None:
-                used = changes.items()
-                kept = [packet for packet in self._spare if packet not in used]
-                self._spare = deque(kept, maxlen=_SPARE_PACKETS)
-                return image
-        return None
+        """The pixels of the nearest, or else of the newest packets, whichever fits."""
+        places = range(shape.packets)
+        image = None
+        if len(frame.near) == shape.packets:
+            image = frame.image((frame.near[place][1] for place in places), shape)
+        if image is None and len(self._fresh) == shape.packets:
+            image = frame.image((self._latest[place] for place in places), shape)
+        return image
 
     def _close(self, frame: _Assembly) -> None:
         self._open.remove(frame)

@@ -230,7 +230,12 @@ class OffboardSession:
     # Messages out -------------------------------------------------------------------------------
 
     def tick(self, stamp_s: float) -> list[Message]:
-        """Go on to a stamp; the messages to send, the setpoint of this stamp being the last."""
+        """Go on to a stamp; the messages to send, the setpoint of this stamp being the last.
+
+        There is a setpoint in every tick, because OFFBOARD wants them before it is entered and a
+        lockstep peer waits for them. Only ArduCopter, which knows no such handshake and breaks
+        off a take-off when a setpoint comes, gets them in the OFFBOARD phase alone.
+        """
         self._now_s = self.telemetry.now_s = stamp_s
         if self._phase_since_s is None:
             self._phase_since_s = stamp_s
@@ -243,8 +248,9 @@ class OffboardSession:
         system = self.telemetry.system
         if system:
             out += self._commands.poll(stamp_s, system)
-        component = dialect.MAV_COMP_ID_AUTOPILOT1 if system else 0
-        out.append(self._target.message(stamp_s, system, component))
+        if self.telemetry.autopilot.early_setpoints or self.phase is Phase.OFFBOARD:
+            component = dialect.MAV_COMP_ID_AUTOPILOT1 if system else 0
+            out.append(self._target.message(stamp_s, system, component))
         return out
 
     # The phases ---------------------------------------------------------------------------------

@@ -246,6 +246,12 @@ class FakeArduCopter(FakeAutopilot):
     mav_autopilot = 3
     streams_unasked = False
 
+    def _take(self, message: Message) -> None:
+        super()._take(message)
+        if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED" and self.mode == "GUIDED":
+            self.climb_to_m = 0.0  # GUIDED leaves its take-off for whatever comes
+            self.landed = _AIR if self.position_enu_m[2] > 0.0 else _GROUND
+
     def _set_mode(self, message: Message) -> None:
         self.mode = ARDUCOPTER.mode_name(int(message.param2))
         self._ack(176, _ACCEPTED)

@@ -76,7 +76,7 @@ def test_a_whole_flight(make: type[FakeAutopilot]) -> None:
     assert fake.armed
     assert fake.mode == fake.autopilot.offboard_mode == session.mode
     assert abs(fake.position_enu_m[2] - HEIGHT_M) <= 0.3
-    flight.until(lambda: fake.climb_to_m == 0.0)  # the last centimetres of the take-off
+    flight.until(lambda: fake.climb_to_m == 0.0)  # PX4 flies the last centimetres in OFFBOARD
     before = list(fake.position_enu_m)
     session.set_target([1.0, 2.0, 0.5], 0.3)
     for _ in range(100):
@@ -94,9 +94,8 @@ def test_a_whole_flight(make: type[FakeAutopilot]) -> None:
     assert not session.failsafe
 
 
-@FAKES
-def test_every_tick_ends_with_the_setpoint_of_its_stamp(make: type[FakeAutopilot]) -> None:
-    flight = Flight(make())
+def test_every_tick_ends_with_the_setpoint_of_its_stamp() -> None:
+    flight = Flight(FakePX4())
     ticks = 0
     while flight.session.phase is not Phase.DONE:
         sent = flight.tick()
@@ -108,6 +107,14 @@ def test_every_tick_ends_with_the_setpoint_of_its_stamp(make: type[FakeAutopilot
         if flight.session.phase is Phase.OFFBOARD:
             flight.session.request_land()
         assert ticks < 3000
+
+
+def test_arducopter_gets_setpoints_in_offboard_only() -> None:
+    flight = Flight(FakeArduCopter())
+    flight.until_phase(Phase.OFFBOARD)
+    assert [m for m in flight.fake.setpoints if m.target_system == 1] == []
+    for _ in range(10):
+        assert flight.tick()[-1].get_type() == "SET_POSITION_TARGET_LOCAL_NED"
 
 
 def test_px4_takes_off_to_an_altitude_above_sea_level() -> None:

@@ -1,0 +1,140 @@
+"""The .tlog, read by pymavlink's own mavlogdump.py."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pymavlink
+import pytest
+
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter
+
+MAVLOGDUMP = Path(pymavlink.__file__).parent / "tools" / "mavlogdump.py"
+
+
+def _frames(count: int) -> list[bytes]:
+    vehicle, companion = Codec(1, 1), Codec(1, 191)
+    frames = []
+    for number in range(count):
+        position = dialect.MAVLink_local_position_ned_message(20 * number, 1, 2, -3, 0, 0, 0)
+        target = dialect.MAVLink_set_position_target_local_ned_message(
+            20 * number, 1, 1, 1, 2503, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0.5, 0
+        )
+        frames += [vehicle.encode(position), companion.encode(target)]
+    return frames
+
+
+def _write(path: Path, frames: list[bytes]) -> None:
+    with TlogWriter(path) as log:
+        for number, frame in enumerate(frames):
+            log.write(number // 2 * 0.02, frame)
+
+
+def _records(data: bytes) -> list[tuple[int, bytes]]:
+    """Time in microseconds and frame of every record; fails on half a record."""
+    records, at = [], 0
+    while at < len(data):
+        length = 12 + data[at + 9]
+        frame = data[at + 8 : at + 8 + length]
+        assert len(frame) == length
+        records.append((int.from_bytes(data[at : at + 8], "big"), frame))
+        at += 8 + length
+    return records
+
+
+def test_mavlogdump_reads_both_directions(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    _write(path, _frames(50))
+    done = subprocess.run(
+        [sys.executable, str(MAVLOGDUMP), "--format", "json", str(path)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    dumped = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    kinds = [entry["meta"]["type"] for entry in dumped]
+    assert kinds == ["LOCAL_POSITION_NED", "SET_POSITION_TARGET_LOCAL_NED"] * 50
+    assert [entry["data"]["time_boot_ms"] for entry in dumped] == [
+        20 * (k // 2) for k in range(100)
+    ]
+    stamps = [entry["meta"]["timestamp"] - EPOCH_UNIX_S for entry in dumped]
+    assert stamps == pytest.approx([0.02 * (k // 2) for k in range(100)], abs=1e-5)
+
+
+def test_the_epoch_is_a_fixed_day() -> None:
+    day = datetime.datetime.fromtimestamp(EPOCH_UNIX_S, datetime.UTC)
+    assert day == datetime.datetime(2020, 1, 1, tzinfo=datetime.UTC)
+
+
+def test_the_same_flight_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        _write(tmp_path / name, _frames(20))
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+def test_every_frame_is_there_as_it_was_on_the_wire(tmp_path: Path) -> None:
+    frames = _frames(20)
+    _write(tmp_path / "log", frames)
+    records = _records((tmp_path / "log").read_bytes())
+    assert [frame for _, frame in records] == frames
+    assert records[2][0] == EPOCH_UNIX_S * 1_000_000 + 20_000
+
+
+def test_a_kill_leaves_whole_records_of_all_but_the_last_second(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    program = (
+        "import os, signal\n"
+        "from pathlib import Path\n"
+        "from mavfi_cli.link.codec import Codec, dialect\n"
+        "from mavfi_cli.link.tlog import TlogWriter\n"
+        f"log = TlogWriter(Path({str(path)!r}))\n"
+        "for k in range(1000):\n"
+        "    m = dialect.MAVLink_local_position_ned_message(20 * k, 1, 2, 3, 4, 5, 6)\n"
+        "    log.write(0.02 * k, Codec(1, 1).encode(m))\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == -9, done.stderr
+    assert 949 <= len(_records(path.read_bytes())) <= 1000
+
+
+def test_a_full_disk_is_one_clear_line() -> None:
+    log = TlogWriter(Path("/dev/full"))
+    log.write(0.0, _frames(1)[0])
+    with pytest.raises(RecordError, match="/dev/full: cannot write: No space left on device"):
+        log.flush()
+    log.close()  # and it does not complain twice
+
+
+def test_a_disk_that_fills_up_keeps_whole_records(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    program = (
+        "import resource, signal, sys\n"
+        "from pathlib import Path\n"
+        "from mavfi_cli.core.errors import RecordError\n"
+        "from mavfi_cli.link.codec import Codec, dialect\n"
+        "from mavfi_cli.link.tlog import TlogWriter\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (10_001, 10_001))\n"
+        f"log = TlogWriter(Path({str(path)!r}))\n"
+        "m = dialect.MAVLink_local_position_ned_message(1, 1, 2, 3, 4, 5, 6)\n"
+        "try:\n"
+        "    for k in range(1000):\n"
+        "        log.write(0.1 * k, Codec(1, 1).encode(m))\n"
+        "except RecordError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "cannot write: File too large" in done.stdout, done.stderr
+    assert len(_records(path.read_bytes())) > 100
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match="No such file or directory"):
+        TlogWriter(tmp_path / "nowhere" / "log")
