@@ -1,0 +1,1 @@
+"""Instruction-level fault injection into native code of a running process (Linux)."""

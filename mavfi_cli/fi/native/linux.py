@@ -1,0 +1,200 @@
+"""ptrace and its neighbours as typed functions; nothing here knows an architecture.
+
+Request and option numbers: `<sys/ptrace.h>` of Linux; see ptrace(2), personality(2).
+A stopped thread is named by its thread id. ptrace obeys one thread only: whoever attached.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from mavfi_cli.core.errors import TracingForbidden
+
+PEEKUSER, POKEUSER = 3, 6
+CONT, SINGLESTEP, DETACH = 7, 9, 17
+GETSIGINFO, GETREGSET, SETREGSET = 0x4202, 0x4204, 0x4205
+SEIZE, INTERRUPT, LISTEN = 0x4206, 0x4207, 0x4208
+GETEVENTMSG = 0x4201
+
+OPTION_EXITKILL = 1 << 20
+TRACE_OPTIONS = (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4)  # fork, vfork, clone, exec
+EVENT_FORK, EVENT_VFORK, EVENT_CLONE, EVENT_EXEC, EVENT_STOP = 1, 2, 3, 4, 128
+WALL = 0x4000_0000
+ADDR_NO_RANDOMIZE = 0x0040000
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_ptrace = _libc.ptrace
+_ptrace.restype = ctypes.c_long
+_ptrace.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]
+_personality = _libc.personality
+_personality.restype = ctypes.c_int
+_personality.argtypes = [ctypes.c_ulong]
+
+REMEDY = (
+    "run as the parent of the target, set kernel.yama.ptrace_scope to 0 or 1, or start the "
+    "container with --cap-add=SYS_PTRACE"
+)
+
+
+class _IoVector(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
+    """One ptrace request; the result of a peek is unsigned.
+
+    Raises:
+        OSError: with the errno of the request.
+    """
+    ctypes.set_errno(0)
+    result = int(_ptrace(number, tid, address, data))
+    if result == -1:
+        code = ctypes.get_errno()
+        if code:
+            raise OSError(code, os.strerror(code))
+    return result & 0xFFFF_FFFF_FFFF_FFFF
+
+
+def seize(tid: int, *, kill_with_tracer: bool) -> None:
+    """Attach without stopping; new threads and children are attached by the kernel.
+
+    Raises:
+        TracingForbidden: the operating system refuses; says how to allow it.
+        ProcessLookupError: no such thread.
+    """
+    options = TRACE_OPTIONS | (OPTION_EXITKILL if kill_with_tracer else 0)
+    try:
+        request(SEIZE, tid, 0, options)
+    except PermissionError as error:
+        raise TracingForbidden("tracing a process", str(error), REMEDY) from None
+
+
+def get_registers(tid: int, note: int, buffer: ctypes.Array[ctypes.c_char]) -> int:
+    """Fill `buffer` with a register set; returns the number of bytes that the kernel has."""
+    vector = _IoVector(ctypes.addressof(buffer), len(buffer))
+    request(GETREGSET, tid, note, ctypes.addressof(vector))
+    return int(vector.length)
+
+
+def set_registers(tid: int, note: int, data: bytes) -> None:
+    """Write a register set.
+
+    Raises:
+        OSError: the kernel refuses a value (EINVAL, EIO).
+    """
+    buffer = ctypes.create_string_buffer(data, len(data))
+    vector = _IoVector(ctypes.addressof(buffer), len(data))
+    request(SETREGSET, tid, note, ctypes.addressof(vector))
+
+
+@dataclass(frozen=True, slots=True)
+class SignalInfo:
+    """What the kernel says about the signal of a stop."""
+
+    number: int
+    code: int
+
+
+def signal_info(tid: int) -> SignalInfo:
+    """The siginfo of a signal-delivery stop."""
+    buffer = (ctypes.c_int * 32)()
+    request(GETSIGINFO, tid, 0, ctypes.addressof(buffer))
+    return SignalInfo(buffer[0], buffer[2])
+
+
+def event_message(tid: int) -> int:
+    """The message of an event stop (for a clone: the new thread id)."""
+    message = ctypes.c_ulong()
+    request(GETEVENTMSG, tid, 0, ctypes.addressof(message))
+    return int(message.value)
+
+
+@contextmanager
+def fixed_addresses() -> Iterator[None]:
+    """Programs started inside get no address-space randomisation, so that addresses repeat."""
+    before = int(_personality(0xFFFF_FFFF))
+    if before == -1 or int(_personality(before | ADDR_NO_RANDOMIZE)) == -1:
+        yield  # a sandbox may refuse; offsets still repeat, addresses then do not
+        return
+    try:
+        yield
+    finally:
+        _personality(before)
+
+
+def threads_of(pid: int) -> list[int]:
+    """The thread ids of a process, ascending; empty when it has ended."""
+    try:
+        return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
+    except FileNotFoundError:
+        return []
+
+
+def cpu_time_s(pid: int) -> float:
+    """CPU time that a process has used, all threads; 0 when it has ended.
+
+    The clock id encoding is that of clock_getcpuclockid(3) on Linux.
+    """
+    try:
+        return time.clock_gettime((~pid << 3) | 2)
+    except OSError:
+        return 0.0
+
+
+def auxiliary(pid: int, key: int) -> int | None:
+    """One entry of the auxiliary vector of a process (AT_ENTRY is 9)."""
+    data = Path(f"/proc/{pid}/auxv").read_bytes()
+    for at in range(0, len(data) - 15, 16):
+        if int.from_bytes(data[at : at + 8], "little") == key:
+            return int.from_bytes(data[at + 8 : at + 16], "little")
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """One report of waitpid about one thread."""
+
+    tid: int
+    raw: int
+
+    @property
+    def stopped(self) -> bool:
+        """The thread waits for us."""
+        return os.WIFSTOPPED(self.raw)
+
+    @property
+    def ended(self) -> bool:
+        """The thread is gone."""
+        return os.WIFEXITED(self.raw) or os.WIFSIGNALED(self.raw)
+
+    @property
+    def signal(self) -> int:
+        """The signal of a stop."""
+        return os.WSTOPSIG(self.raw)
+
+    @property
+    def event(self) -> int:
+        """The ptrace event of a stop, 0 for a signal-delivery stop."""
+        return self.raw >> 16
+
+    @property
+    def trapped(self) -> bool:
+        """Stopped by a SIGTRAP that is no ptrace event."""
+        return self.stopped and self.event == 0 and self.signal == signal.SIGTRAP
+
+
+def wait(tid: int) -> Status:
+    """Wait for the next report of one thread, or of any with -1.
+
+    Raises:
+        ChildProcessError: there is nobody to wait for.
+    """
+    found, raw = os.waitpid(tid, WALL)
+    return Status(found, raw)
