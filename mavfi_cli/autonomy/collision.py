@@ -86,7 +86,10 @@ def step(
 def time_to_collision(
     snapshot: MapSnapshot, trajectory: Trajectory, time_s: float, params: CollisionParams
 ) -> float:
-    """Time from `time_s` along the trajectory to the first contact, s; inf where it is free."""
+    """Time from `time_s` along the trajectory to the first contact, s; inf where it is free.
+
+    Never too late, and early by no more than one or two spacings.
+    """
     points = np.empty((MAX_SAMPLES, 3))
     times_s = np.empty(MAX_SAMPLES)
     count, unflyable_s = sample_ahead(
@@ -101,7 +104,8 @@ def time_to_collision(
     if not snapshot.payload:
         return float(unflyable_s)
     hit = _first_contact(snapshot, points[:count], params)
-    return float(times_s[hit]) if hit is not None else float(unflyable_s)
+    # The sphere before was free: contact comes between the two, so not before its time.
+    return float(times_s[max(hit - 1, 0)]) if hit is not None else float(unflyable_s)
 
 
 class SphereProbe:

@@ -7,8 +7,9 @@ The reference is the trajectory's (see `trajectory`), run at `rate`: slowed down
 changes by dr/dt, it has the velocity r v and the acceleration r^2 a + dr/dt v.
 
 A corrupted reference: a term that is not finite is left out (the position error, the velocity or
-the acceleration of that axis counts as zero, a yaw as the last one), anything finite is obeyed as
-far as the limits let it. So the output is always finite and within its limits.
+the acceleration of that axis counts as zero, a yaw as the last one). As position and velocity
+between waypoints depend on acceleration, a NaN there takes the whole axis out. Anything finite is
+obeyed as far as the limits let it. So the output is always finite and within its limits.
 """
 
 from __future__ import annotations
