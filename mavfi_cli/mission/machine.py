@@ -16,7 +16,12 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.core.errors import MavfiError
+
+if TYPE_CHECKING:
+    from mavfi_cli.fi.native.breakpoints import Mechanism
 
 
 class Verdict(Enum):
@@ -47,6 +52,19 @@ _WHEELS = {
     "matplotlib": "matplotlib", "click": "click", "rich": "rich", "cattrs": "cattrs",
     "pyserial": "serial",
 }  # fmt: skip
+_LOAD_VEHICLE = """
+from sitl.vehicle.profile import load_profile
+from sitl.vehicle.vehicle import Vehicle
+import numpy, sys
+vehicle = Vehicle(load_profile("solo"), position_enu_m=numpy.zeros(3), yaw_enu_rad=0.0)
+target = numpy.full(11, numpy.nan)
+target[3:6] = 0.0, 0.0, -1.0
+for _ in range(500):
+    vehicle.step(target, True)
+height_m = -vehicle.truth.position_ned_m[2]
+print(f"the simulated quadrotor climbs ({height_m:.1f} m in 2 s)")
+sys.exit(0 if height_m > 1.0 else 1)
+"""
 _EXTRAS = {"train": "torch", "cluster": "distributed", "view": "rerun"}
 
 
@@ -136,11 +154,54 @@ def _physics() -> Check:
     """The vehicle's process starts, which loads JSBSim and every compiled kernel it has."""
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
-            [sys.executable, "-m", "sitl", "--version"], capture_output=True, text=True, cwd=folder,
+            [sys.executable, "-c", _LOAD_VEHICLE], capture_output=True, text=True, cwd=folder,
             timeout=120.0, check=False,
         )  # fmt: skip
     if run.returncode == 0:
         return Check(name="Vehicle", verdict=Verdict.OK, found=run.stdout.strip())
-    last = (run.stderr.strip().splitlines() or ["no message"])[-1]
+    last = ((run.stderr or run.stdout).strip().splitlines() or ["no message"])[-1]
     return Check(name="Vehicle", verdict=Verdict.FAILED, found=last,
                  remedy="pip install -e . in the project's folder")  # fmt: skip
+
+
+def _injection() -> Iterator[Check]:
+    """Tracing and counted breakpoints, tried on a real program."""
+    if platform.system() != "Linux" or platform.machine() != "x86_64":
+        yield Check(name="Tracing", verdict=Verdict.LIMITED, found="not Linux on x86-64",
+                    remedy="instruction-level injection is not available here")  # fmt: skip
+        return
+    from mavfi_cli.fi.native.breakpoints import Mechanism, perf_allowed
+
+    refused = perf_allowed()
+    traced = _traced(Mechanism.DEBUG)
+    allow = "allow ptrace: sysctl kernel.yama.ptrace_scope=1, or docker run --cap-add SYS_PTRACE"
+    yield Check(
+        name="Tracing",
+        verdict=Verdict.LIMITED if traced else Verdict.OK,
+        found=f"ptrace fails: {traced}"
+        if traced
+        else "ptrace stops a program where it is asked to",
+        remedy=allow if traced else "",
+    )
+    if refused is None and not traced:
+        refused = _traced(Mechanism.PERF)
+    yield Check(
+        name="Breakpoints",
+        verdict=Verdict.LIMITED if refused else Verdict.OK,
+        found=f"counted by the tracer (perf: {refused})" if refused else "counted by the kernel",
+        remedy="sysctl kernel.perf_event_paranoid=2; Linux 5.13 or newer" if refused else "",
+    )  # fmt: skip
+
+
+def _traced(mechanism: Mechanism) -> str | None:
+    """Stop `true` at its entry point; None where that works, else why not."""
+    from mavfi_cli.fi.native.spawn import Command, run_to_entry, spawn
+
+    nowhere = Path(os.devnull)
+    try:
+        tracee = spawn(Command.of(["true"]), stdout=nowhere, stderr=nowhere, mechanism=mechanism)
+        stopped = run_to_entry(tracee)
+        tracee.kill()
+    except (MavfiError, OSError) as error:
+        return str(error)
+    return None if stopped else "the program ended before its entry point"

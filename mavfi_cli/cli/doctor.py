@@ -1,0 +1,32 @@
+"""`mavfi doctor`: what works on this machine, and what to do about what does not."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+_MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="Print the checks as JSON.")
+def doctor(as_json: bool) -> None:
+    """Test this machine: wheels, cores, physics, loopback, ptrace, breakpoints.
+
+    Exits with 1 where flying would not work; what is only limited does not count.
+    """
+    from mavfi_cli.mission.machine import Verdict, check_machine
+
+    checks = []
+    for check in check_machine():
+        checks.append(check)
+        if not as_json:
+            colour, mark = _MARKS[check.verdict.value]
+            click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<12} {check.found}")
+            if check.remedy:
+                click.echo(f"{'':20} -> {check.remedy}")
+    if as_json:
+        click.echo(json.dumps([check.to_dict() for check in checks], indent=2))
+    if any(check.verdict is Verdict.FAILED for check in checks):
+        raise click.exceptions.Exit(1)
