@@ -16,6 +16,7 @@ from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.camera import CameraClient
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.commands import CommandChannel, Ticket, Verdict
+from mavfi_cli.link.replies import Replies
 from mavfi_cli.link.setpoint import Target
 from mavfi_cli.link.telemetry import LandedState, Telemetry
 from mavfi_cli.link.texts import Text
@@ -27,9 +28,7 @@ _MODE_TRIES = 5
 _MODE_PATIENCE_S = 1.5  # HEARTBEAT comes once a second
 _LOOK_INTERVAL_S = 0.2
 _HOME_INTERVAL_S = 1.0
-_HEARTBEAT_INTERVAL_S = 1.0
 _DISARM_AFTER_S = 5.0  # on the ground, where the autopilot should have done so by itself
-_MAX_REPLIES = 64  # to requests of one tick; more are not answered
 _WARNING = dialect.MAV_SEVERITY_WARNING
 
 
@@ -88,10 +87,9 @@ class OffboardSession:
         self._commands = CommandChannel(self._settings.system, self._settings.component)
         self.camera = CameraClient(self._commands)
         self._target = Target()
-        self._replies: list[Message] = []
+        self._replies = Replies()
         self._now_s = 0.0
         self._phase_since_s: float | None = None
-        self._next_heartbeat_s = -math.inf
         self._next_look_s = -math.inf
         self._ticket: Ticket | None = None  # the one command that the phase hangs on
         self._look: Ticket | None = None
@@ -205,27 +203,7 @@ class OffboardSession:
                 self._commands.acknowledge(message)
             elif message.get_srcComponent() == dialect.MAV_COMP_ID_CAMERA:
                 self.camera.handle(message)
-        if isinstance(message, dialect.MAVLink_timesync_message):
-            self._answer_timesync(message)
-        elif isinstance(message, dialect.MAVLink_ping_message):
-            self._answer_ping(message)
-
-    def _answer_timesync(self, message: Message) -> None:
-        if message.tc1 == 0 and len(self._replies) < _MAX_REPLIES:
-            own_ns = round(self._now_s * 1e9)
-            self._replies.append(dialect.MAVLink_timesync_message(own_ns, message.ts1))
-
-    def _answer_ping(self, message: Message) -> None:
-        asked = message.target_system == 0 and message.target_component == 0
-        if asked and len(self._replies) < _MAX_REPLIES:
-            self._replies.append(
-                dialect.MAVLink_ping_message(
-                    message.time_usec,
-                    message.seq,
-                    message.get_srcSystem(),
-                    message.get_srcComponent(),
-                )
-            )
+        self._replies.handle(message, self._now_s)
 
     # Messages out -------------------------------------------------------------------------------
 
@@ -241,10 +219,7 @@ class OffboardSession:
             self._phase_since_s = stamp_s
         self.telemetry.expire()
         _STEPS[self.phase](self)
-        out, self._replies = self._replies, []
-        if stamp_s >= self._next_heartbeat_s:
-            self._next_heartbeat_s = stamp_s + _HEARTBEAT_INTERVAL_S
-            out.append(_heartbeat())
+        out = self._replies.take(stamp_s)
         system = self.telemetry.system
         if system:
             out += self._commands.poll(stamp_s, system)
@@ -469,10 +444,3 @@ _STEPS = {
     Phase.DONE: OffboardSession._ended,
     Phase.FAILED: OffboardSession._ended,
 }
-
-
-def _heartbeat() -> Message:
-    return dialect.MAVLink_heartbeat_message(
-        dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0,
-        dialect.MAV_STATE_ACTIVE, 3,
-    )  # fmt: skip

@@ -1,0 +1,48 @@
+"""What every MAVLink node owes the others: a HEARTBEAT, and answers to TIMESYNC and PING."""
+
+from __future__ import annotations
+
+import math
+
+from mavfi_cli.link.codec import Message, dialect
+
+HEARTBEAT_INTERVAL_S = 1.0
+_MAX_ANSWERS = 64  # to requests of one tick; more are not answered
+
+
+class Replies:
+    """Collects the answers; `take` hands them out at the next tick."""
+
+    def __init__(self) -> None:
+        self._answers: list[Message] = []
+        self._next_heartbeat_s = -math.inf
+
+    def handle(self, message: Message, now_s: float) -> None:
+        """Take a message; an answer to one of ours is not answered again."""
+        if len(self._answers) >= _MAX_ANSWERS:
+            return
+        if isinstance(message, dialect.MAVLink_timesync_message):
+            if message.tc1 == 0:
+                own_ns = round(now_s * 1e9)
+                self._answers.append(dialect.MAVLink_timesync_message(own_ns, message.ts1))
+        elif isinstance(message, dialect.MAVLink_ping_message):
+            if message.target_system == message.target_component == 0:
+                asker = (message.get_srcSystem(), message.get_srcComponent())
+                self._answers.append(
+                    dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
+                )
+
+    def take(self, stamp_s: float) -> list[Message]:
+        """The answers so far, and our own HEARTBEAT once a second."""
+        out, self._answers = self._answers, []
+        if stamp_s >= self._next_heartbeat_s:
+            self._next_heartbeat_s = stamp_s + HEARTBEAT_INTERVAL_S
+            out.append(_heartbeat())
+        return out
+
+
+def _heartbeat() -> Message:
+    return dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0,
+        dialect.MAV_STATE_ACTIVE, 3,
+    )  # fmt: skip
