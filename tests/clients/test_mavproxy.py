@@ -1,0 +1,138 @@
+"""MAVProxy, unchanged, against `python -m sitl` over TCP, driven through its own prompt."""
+
+import contextlib
+import importlib.util
+import queue
+import re
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+_MODULES = "param,arm,mode,cmdlong,misc"
+
+
+class MavProxy:
+    """The MAVProxy process: commands in, and waiting for what it prints."""
+
+    def __init__(self, port, folder):
+        script = Path(importlib.util.find_spec("MAVProxy").origin).with_name("mavproxy.py")
+        self.process = subprocess.Popen(
+            [
+                sys.executable, str(script), f"--master=tcp:127.0.0.1:{port}",
+                f"--state-basedir={folder}", f"--default-modules={_MODULES}",
+            ],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=folder,
+        )  # fmt: skip
+        self._pieces = queue.Queue()
+        self._text = ""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self):
+        while piece := self.process.stdout.read1(4096):
+            self._pieces.put(piece.decode(errors="replace"))
+        self._pieces.put(None)
+
+    def command(self, line):
+        self.process.stdin.write(line.encode() + b"\n")
+        self.process.stdin.flush()
+
+    def expect_mode(self, mode):
+        """Its prompt shows the mode of the newest HEARTBEAT."""
+        self.expect(rf"{mode}> ")
+
+    def expect(self, pattern, timeout_s=40.0):
+        """Wait for a pattern in what it prints; what came before it is used up."""
+        deadline = time.monotonic() + timeout_s
+        while (match := re.search(pattern, self._text)) is None:
+            try:
+                piece = self._pieces.get(timeout=max(deadline - time.monotonic(), 0.0))
+            except queue.Empty:
+                piece = None
+            assert piece is not None, f"no {pattern!r} in:\n{self._text}"
+            self._text += piece
+        self._text = self._text[match.end() :]
+        return match
+
+    def close(self):
+        with contextlib.suppress(OSError):
+            self.command("exit")
+            self.process.stdin.close()
+        try:
+            self.process.wait(10)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join()
+        self.process.stdout.close()
+
+
+def shown(proxy, name):
+    proxy.command(f"param show {name}")
+    return float(proxy.expect(rf"{name}\s+([\d.]+)").group(1))
+
+
+@pytest.fixture
+def connect(tmp_path):
+    with contextlib.ExitStack() as stack:
+
+        def start(port):
+            proxy = MavProxy(port, tmp_path)
+            stack.callback(proxy.close)
+            return proxy
+
+        yield start
+
+
+@pytest.mark.slow
+def test_mavproxy_sets_parameter_and_mode_arms_takes_off_and_lands(sitl, connect, free_tcp_port):
+    port = free_tcp_port()
+    server = sitl("--world", "farm", "--speed", "5", "--link", f"tcpin:127.0.0.1:{port}")
+    proxy = connect(port)
+
+    proxy.expect(r"Mode LOITER")
+    proxy.expect(r"Received \d+ parameters")
+    assert shown(proxy, "MIS_TAKEOFF_ALT") == 2.5
+    proxy.command("param set MIS_TAKEOFF_ALT 3.5")
+    # MAVProxy shows the old value until the vehicle has confirmed the new one.
+    assert any(shown(proxy, "MIS_TAKEOFF_ALT") == 3.5 for _ in range(50))
+
+    proxy.command("long DO_SET_MODE 1 3 0 0 0 0 0")
+    proxy.expect_mode("POSCTL")
+    proxy.command("long DO_SET_MODE 1 4 3 0 0 0 0")
+    proxy.expect_mode("LOITER")
+    proxy.command("arm throttle")
+    proxy.expect(r"ARMED")
+    proxy.command("long NAV_TAKEOFF 0 0 0 nan nan nan nan")
+    proxy.expect(r"Using default takeoff altitude: 3.5 m")
+    proxy.expect_mode("TAKEOFF")
+    proxy.expect_mode("LOITER")
+    proxy.command("long NAV_LAND")
+    proxy.expect_mode("LAND")
+    proxy.expect(r"Disarmed by landing")
+    proxy.expect(r"DISARMED")
+
+    report, log = server.stop()
+    assert report["collision"] is None
+    assert log["position_enu_m"][:, 2].max() == pytest.approx(3.6, abs=0.3)
+    assert log["on_ground"][-1]
+    assert not log["armed"][-1]
+
+
+@pytest.mark.slow
+def test_mavproxy_hears_why_offboard_cannot_arm(sitl, connect, free_tcp_port):
+    port = free_tcp_port()
+    server = sitl("--world", "farm", "--speed", "5", "--link", f"tcpin:127.0.0.1:{port}")
+    proxy = connect(port)
+    proxy.expect(r"Received \d+ parameters")
+    proxy.command("long DO_SET_MODE 1 6 0 0 0 0 0")
+    proxy.expect_mode("OFFBOARD")
+    proxy.command("arm throttle")
+    proxy.expect(r"COMPONENT_ARM_DISARM: TEMPORARILY_REJECTED")
+    proxy.expect(r"Arming denied: Resolve system health failures first")
+    _, log = server.stop()
+    assert not log["armed"].any()
