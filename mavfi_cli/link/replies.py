@@ -21,16 +21,14 @@ class Replies:
         """Take a message; an answer to one of ours is not answered again."""
         if len(self._answers) >= _MAX_ANSWERS:
             return
-        if isinstance(message, dialect.MAVLink_timesync_message):
-            if message.tc1 == 0:
-                own_ns = round(now_s * 1e9)
-                self._answers.append(dialect.MAVLink_timesync_message(own_ns, message.ts1))
-        elif isinstance(message, dialect.MAVLink_ping_message):
-            if message.target_system == message.target_component == 0:
-                asker = (message.get_srcSystem(), message.get_srcComponent())
-                self._answers.append(
-                    dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
-                )
+        if _asks_time(message):
+            own_ns = round(now_s * 1e9)
+            self._answers.append(dialect.MAVLink_timesync_message(own_ns, message.ts1))
+        elif _pings(message):
+            asker = (message.get_srcSystem(), message.get_srcComponent())
+            self._answers.append(
+                dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
+            )
 
     def take(self, stamp_s: float) -> list[Message]:
         """The answers so far, and our own HEARTBEAT once a second."""
@@ -39,6 +37,15 @@ class Replies:
             self._next_heartbeat_s = stamp_s + HEARTBEAT_INTERVAL_S
             out.append(_heartbeat())
         return out
+
+
+def _asks_time(message: Message) -> bool:
+    return isinstance(message, dialect.MAVLink_timesync_message) and message.tc1 == 0
+
+
+def _pings(message: Message) -> bool:
+    asked = isinstance(message, dialect.MAVLink_ping_message)
+    return asked and message.target_system == message.target_component == 0
 
 
 def _heartbeat() -> Message:
