@@ -109,6 +109,7 @@ def run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
             reached = np.hypot(np.hypot(gap, gap_y), gap_x) < radius_m
             if reached.any():
                 widths[i, j] = offsets[reached].max()
+    widths[reach, reach] = max(0, widths[reach, reach])  # the occupied voxel itself
     return widths
 
 

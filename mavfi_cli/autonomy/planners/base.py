@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -67,7 +68,7 @@ class Planner(Protocol):
 
 def failure(problem: PlanningProblem, reason: str) -> PlanResult:
     """No path, and nothing was searched."""
-    gap_m = float(np.linalg.norm(problem.goal_enu_m - problem.start_enu_m))
+    gap_m = math.dist(problem.goal_enu_m, problem.start_enu_m)
     return PlanResult(found=False, path_enu_m=np.empty((0, 3)), reason=reason, nearest_m=gap_m)
 
 

@@ -8,6 +8,7 @@ are, but none of those is used. The search stops after a count of iterations, ne
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -110,7 +111,7 @@ def _state(space: Any, point: FloatArray) -> Any:
 
 def _result(problem: PlanningProblem, definition: Any, iterations: int) -> PlanResult:
     if not definition.hasExactSolution():
-        gap_m = float(np.linalg.norm(problem.goal_enu_m - problem.start_enu_m))
+        gap_m = math.dist(problem.goal_enu_m, problem.start_enu_m)
         if definition.hasApproximateSolution():
             gap_m = min(gap_m, float(definition.getSolutionDifference()))
         return PlanResult(

@@ -1,0 +1,74 @@
+"""The whole planning stage: from a map to a trajectory that the collision check finds free."""
+
+import math
+
+import numpy as np
+
+from mavfi_cli import autonomy
+from mavfi_cli.autonomy import collision, planning
+from mavfi_cli.autonomy.occupancy import snapshot_of
+from mavfi_cli.autonomy.planners import find
+from mavfi_cli.autonomy.smoothing import Departure, Sequence
+
+BOUNDS = np.array([-5.0, -12.0, 1.0, 25.0, 12.0, 10.0])
+
+
+def blocks():
+    rng = np.random.default_rng(4)
+    cells = np.arange(0.1, 2.0, 0.2)
+    block = np.stack(np.meshgrid(cells, cells, np.arange(0.1, 9, 0.2)), axis=-1).reshape(-1, 3)
+    corners = [(5, -1), (9, 3), (9, -6), (14, -1), (14, 7)]
+    shifts = [np.array([x, y + rng.uniform(-0.5, 0.5), 0.0]) for x, y in corners]
+    return snapshot_of(np.vstack([block + shift for shift in shifts]))
+
+
+def inputs(velocity=(0.0, 0.0, 0.0), goal=(20.0, 0.0, 5.0), seed=1):
+    return planning.StageInputs(
+        snapshot=blocks(),
+        position_enu_m=np.array([0.0, 0.0, 5.0]),
+        departure=Departure(stamp_s=3.0, velocity_enu_mps=np.array(velocity), yaw_rad=0.0),
+        goal_enu_m=np.array(goal),
+        bounds_enu_m=BOUNDS,
+        sequence=Sequence(trajectory_seq=5, future_collision_seq=2),
+        seed=seed,
+    )
+
+
+def test_plans_pass_the_collision_check_at_rest_and_in_motion():
+    rng = np.random.default_rng(0)
+    for seed in range(12):
+        velocity = rng.uniform(-1, 1, 3) * [1.5, 1.5, 0.2] if seed % 2 else np.zeros(3)
+        given = inputs(velocity, seed=seed)
+        found = planning.plan(find("rrtstar"), given, planning.StageParams())
+        assert found.trajectory is not None, found.reason
+        free_s = collision.time_to_collision(
+            given.snapshot, found.trajectory, 0.0, collision.CollisionParams()
+        )
+        assert free_s == math.inf
+        assert found.trajectory.trajectory_seq == 5
+        assert len(found.path_enu_m) >= 3
+
+
+def test_a_blocked_goal_is_refused_with_its_reason():
+    found = planning.plan(find("rrt"), inputs(goal=(6.0, 0.0, 5.0)), planning.StageParams())
+    assert found.trajectory is None
+    assert found.reason == "goal blocked"
+
+
+def test_a_start_that_cannot_stop_in_time_is_refused():
+    given = inputs(velocity=(3.0, 0.0, 0.0))
+    close = planning.StageInputs(
+        **{
+            name: getattr(given, name)
+            for name in given.__dataclass_fields__
+            if name != "position_enu_m"
+        },
+        position_enu_m=np.array([2.9, 0.0, 5.0]),
+    )
+    found = planning.plan(find("rrtstar"), close, planning.StageParams())
+    assert found.trajectory is None
+    assert found.reason == "no free way on"
+
+
+def test_warm_up_runs_every_kernel():
+    autonomy.warm_up()
