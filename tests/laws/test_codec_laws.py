@@ -147,7 +147,7 @@ def test_noise_costs_no_frame(parts: list[tuple[bytes, Message]], cuts: list[int
     codec, found = Codec(1, 1), []
     for chunk in [*_chunks(stream, cuts), FLUSH]:
         found += [bytes(m.get_msgbuf()) for m in codec.decode(chunk)]
-    assume(codec.unknown == 0)  # one in 256 false headers of an unknown message looks whole
+    assume(codec.unknown == 0)  # once in 30,000 times noise looks like a whole unknown message
     remaining = iter(found)
     assert all(frame in remaining for frame in frames)
 
@@ -194,5 +194,7 @@ def test_a_datagram_with_a_broken_tail_holds_nothing_back(message: Message, tail
     codec = Codec(1, 1)
     frame = Codec(7, 9).encode(message)
     cut = b"\xfd\xff\x00" + tail
-    assert len(codec.decode(cut + frame, datagram=True)) >= 1
+    found = codec.decode(cut + frame, datagram=True)
+    assume(codec.unknown == 0)  # once in 30,000 times noise looks like a whole unknown message
+    assert len(found) >= 1
     assert len(codec.decode(frame, datagram=True)) == 1
