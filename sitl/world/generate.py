@@ -23,7 +23,7 @@ Vector = NDArray[np.float64]
 
 CELL_M = 10.0
 MARGIN_M = 20.0
-CLEAR_RADIUS_M = 4.0
+CLEAR_RADIUS_M = 3.0
 """No obstacle stands nearer than this, in plan, to start or goal."""
 
 UNLIMITED_HEIGHT_M = 1000.0

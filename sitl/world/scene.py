@@ -9,7 +9,7 @@
     min_enu_m = [10, 10, 0]
     max_enu_m = [12, 20, 8]
 
-Where start or goal is not given, the seed chooses it: a place with nothing within 4 m in plan,
+Where start or goal is not given, the seed chooses it: a place with nothing within 3 m in plan,
 the goal at `flight_height_m` and within `goal_distance_m` of the start. So each seed of a fixed
 scene is a mission of its own.
 """

@@ -32,8 +32,11 @@ def test_each_box_is_a_square_tower_in_the_middle_of_its_cell() -> None:
 
 def test_density_one_fills_all_cells_but_those_near_start_and_goal() -> None:
     world = generate("w", Pair(density=1.0, size_m=5.0), 1, START, GOAL)
-    # 7 x 8 cells; start and goal each lie where four cells meet, 3.54 m from their towers.
-    assert len(world.boxes_enu_m) == 56 - 8
+    # 7 x 8 cells; start and goal each lie where four cells meet: 3.54 m from towers of 5 m,
+    # 2.83 m from towers of 6 m.
+    assert len(world.boxes_enu_m) == 56
+    wide = generate("w", Pair(density=1.0, size_m=6.0), 1, START, GOAL)
+    assert len(wide.boxes_enu_m) == 56 - 8
 
 
 def test_evaluation_and_training_worlds_differ() -> None:

@@ -8,6 +8,7 @@ import pytest
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName, WorldError
 from sitl.world import load_world, world_names
 from sitl.world.check import check_world
+from sitl.world.generate import CLEAR_RADIUS_M
 from sitl.world.scene import scene_toml
 from sitl.world.world import plan_distance_to_boxes
 
@@ -57,7 +58,7 @@ def test_a_hundred_seeds_of_a_scene_are_a_hundred_flyable_missions(name: str) ->
         assert 45.0 <= found.straight_m <= 55.0
         assert found.path_exists
         for place in (world.start_enu_m, world.goal_enu_m):
-            assert plan_distance_to_boxes(world.boxes_enu_m, place).min() >= 4.0
+            assert plan_distance_to_boxes(world.boxes_enu_m, place).min() >= CLEAR_RADIUS_M
 
 
 def test_nothing_in_the_farm_reaches_flight_height() -> None:
