@@ -59,8 +59,10 @@ def run(problem: PlanningProblem, seed: int, search: Search) -> PlanResult:
     space, information = _space(problem.grid)
     definition = ob.ProblemDefinition(information)
     definition.setStartAndGoalStates(_state(space, start), _state(space, goal), 1e-6)
-    if search.optimise:
-        definition.setOptimizationObjective(ob.PathLengthOptimizationObjective(information))
+    objective = ob.PathLengthOptimizationObjective(information)
+    if not search.optimise:
+        objective.setCostThreshold(ob.Cost(math.inf))
+    definition.setOptimizationObjective(objective)
     planner = search.make(information)
     planner.setProblemDefinition(definition)
     planner.setup()
