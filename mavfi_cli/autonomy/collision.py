@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import fcl
 import numpy as np
 
-from mavfi_cli.autonomy.compiled import compiled
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.trajectory import locate
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory
 
 MAX_SAMPLES = 4096

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.autonomy.compiled import compiled
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.octree import occupied_leaves
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray
 
 Blocked = NDArray[np.uint8]

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.autonomy.compiled import compiled
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray
 
 TREE_DEPTH = 16

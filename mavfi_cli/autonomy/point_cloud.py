@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mavfi_cli.autonomy.compiled import compiled
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import rotation_matrix
 from mavfi_cli.core.types import DepthFrame, FloatArray, PointCloud
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mavfi_cli.autonomy.compiled import compiled
 from mavfi_cli.autonomy.trajectory import angle_between, reference
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import Command, FloatArray, Trajectory
 
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mavfi_cli.autonomy.compiled import compiled
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 TWO_PI = 2.0 * math.pi

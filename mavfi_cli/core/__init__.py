@@ -1,1 +1,1 @@
-"""Types, frames, states table, seeds, errors and configuration; needs numpy only."""
+"""Types, frames, states table, seeds, errors, configuration; imports numpy only (numba on use)."""

@@ -192,11 +192,8 @@ class Flight:
 
     def _tick(self, stamp_s: float) -> None:
         """One control tick: publish what is due, decide, answer, and only then compute."""
-        if not self._on_clock:  # the vehicle's clock takes over from ours
-            self._on_clock = True
-            system = self._session
-            self._session = self._new_session()
-            self._session.telemetry = system.telemetry
+        if not self._on_clock:
+            self._take_clock(stamp_s)
         if stamp_s <= self.stamp_s and len(self.trace):
             return
         self.stamp_s = stamp_s
@@ -212,6 +209,14 @@ class Flight:
         if companion is not None:
             companion.executor.compute()
         self._tell(state)
+
+    def _take_clock(self, stamp_s: float) -> None:
+        """From the first state on, the foreign vehicle's clock is ours: begin the talk anew."""
+        self._on_clock = True
+        telemetry = self._session.telemetry
+        telemetry.heartbeat_s = telemetry.now_s = stamp_s
+        self._session = self._new_session()
+        self._session.telemetry = telemetry
 
     def _airborne(self) -> bool:
         return self._session.phase in (Phase.TAKING_OFF, Phase.OFFBOARD, Phase.LANDING)

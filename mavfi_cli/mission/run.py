@@ -60,12 +60,11 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
         with _interruptible() as interrupt:
             flight = Flight(config, transport, platform, planner, watcher, interrupt)
             try:
+                if truth_folder is None:  # before connecting: from then on the vehicle's clock runs
+                    flight.brief(briefing.of_config(config))
                 flight.connect()
-                flight.brief(
-                    briefing.of_config(config)
-                    if truth_folder is None
-                    else briefing.of_simulation(truth_folder)
-                )
+                if truth_folder is not None:
+                    flight.brief(briefing.of_simulation(truth_folder))
             except MavfiError:
                 transport.close()
                 if process is not None and (failure := _failure(process)):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.mission.files import write_json
+from mavfi_cli.core.files import write_json
 from mavfi_cli.mission.trace import read_trace
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.states import BY_NAME, STATES, DType, Message, State
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory, VehicleState
-from mavfi_cli.mission.files import write_atomically
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -33,6 +33,8 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
     config, qof = result["config"], result["quality_of_flight"]
     counters, host = result["pilot"], result["host"]
     flown = f"{config['vehicle']} in {config['world']}, seed {config['seed']}"
+    if config["link"] is not None:
+        flown = f"foreign autopilot at {config['link']}, seed {config['seed']}"
     lines = [
         outcome_line(result),
         "",

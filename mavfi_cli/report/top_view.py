@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.mission.files import write_atomically
+from mavfi_cli.core.files import write_atomically
 from mavfi_cli.mission.run_folder import Run
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ def _caption(axes: Axes, result: dict[str, Any]) -> None:
     time_s, distance_m = qof["flight_time_s"], qof["distance_m"]
     figures = "" if time_s is None else f", {time_s:.1f} s, {distance_m:.1f} m"
     axes.set_title(
-        f"{Path(config['world']).stem}, seed {config['seed']}: "
+        f"{config['link'] or Path(config['world']).stem}, seed {config['seed']}: "
         f"{result['outcome'].replace('_', ' ')}{figures}",
         fontsize=10, loc="left",
     )  # fmt: skip

@@ -89,11 +89,11 @@ def global_setpoint(message: Any, origin: Origin, home_down_m: float) -> Setpoin
 
 
 def _check_mask(name: str, mask: int) -> None:
-    if mask & _FORCE:
-        raise SetpointRefused(f"{name} force not supported")
     position = mask & _IGNORE_POSITION != _IGNORE_POSITION
     velocity = mask & _IGNORE_VELOCITY != _IGNORE_VELOCITY
     acceleration = mask & _IGNORE_ACCELERATION != _IGNORE_ACCELERATION
+    if acceleration and mask & _FORCE:  # the bit says what the acceleration fields mean
+        raise SetpointRefused(f"{name} force not supported")
     if acceleration and not position and not velocity:
         raise SetpointRefused(f"{name} acceleration without velocity not supported")
     if not position and not velocity:

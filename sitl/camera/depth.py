@@ -22,8 +22,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import rotation_matrix
-from sitl.control.compiled import compiled
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.compiled import compiled
 from sitl.control.attitude import heading_rate, rotation, specific_force, tilt_rates, torque, unwind
-from sitl.control.compiled import compiled
 from sitl.control.layout import (
     G_MASS,
     M_ON_GROUND,

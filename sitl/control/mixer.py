@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.control.compiled import compiled
+from mavfi_cli.core.compiled import compiled
 from sitl.control.layout import (
     G_ROTOR_OFFSET,
     G_ROTOR_THRUST,

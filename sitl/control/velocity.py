@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.control.compiled import compiled
+from mavfi_cli.core.compiled import compiled
 from sitl.control.layout import (
     G_ACCELERATION_LIMIT,
     G_CLIMB_LIMIT,

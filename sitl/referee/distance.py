@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.control.compiled import compiled
+from mavfi_cli.core.compiled import compiled
 
 Vector = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.control.compiled import compiled
+from mavfi_cli.core.compiled import compiled
 from sitl.referee.distance import body_distance, point_distance
 
 Vector = NDArray[np.float64]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import write_atomically, write_json
 
 COLUMNS: dict[str, slice] = {
     "stamp_s": slice(0, 1),
@@ -66,27 +64,10 @@ def save_truth(folder: Path, log: TruthLog, report: Mapping[str, Any]) -> None:
     Raises:
         RecordError: the folder cannot be made or written (no space, no permission).
     """
-    buffer = io.BytesIO()
     arrays: dict[str, Any] = dict(log.arrays())
-    np.savez_compressed(buffer, **arrays)
-    text = json.dumps(report, indent=1, allow_nan=False) + "\n"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_whole(folder / "truth.npz", buffer.getvalue())
-        _write_whole(folder / "truth.json", text.encode())
     except OSError as error:
         raise RecordError(f"{folder}: cannot write the truth log: {error.strerror}") from None
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """A kill at any moment leaves the old file or the new one."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
+    write_atomically(folder / "truth.npz", lambda file: np.savez(file, **arrays))
+    write_json(folder / "truth.json", report)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from mavfi_cli.core.errors import RecordError
 from sitl.server.simulation import Simulation
 
 FILE = "briefing.json"
@@ -25,6 +23,6 @@ def write_briefing(simulation: Simulation, folder: Path) -> None:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / FILE).write_text(json.dumps(briefing))
     except OSError as error:
-        raise RecordError(f"{folder / FILE}: {error.strerror or error}") from None
+        raise RecordError(f"{folder}: {error.strerror or error}") from None
+    write_json(folder / FILE, briefing)

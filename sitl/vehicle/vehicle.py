@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import ned_from_enu, ned_yaw_from_enu
 from sitl.control.cascade import control_step
-from sitl.control.compiled import compiled
 from sitl.control.gains import gains_for
 from sitl.control.layout import (
     M_ON_GROUND,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import Any, TypeVar
 
 import click
 
-from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import write_atomically, write_text
 from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
 from sitl.world.generate import Pair
 from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, world_names
@@ -107,7 +107,7 @@ def make(
     made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
     text = scene_toml(made)
     if output is not None:
-        write_whole(output, text.encode())
+        write_text(output, text)
     if as_json:
         click.echo(json.dumps({**_world_json(made), "file": _name(output)}, indent=1))
     elif output is None:
@@ -169,29 +169,12 @@ def draw(
     made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
     file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
     path = check_world(made).path_enu_m if with_path else None
-    write_whole(file, world_svg(made, path))
+    picture = world_svg(made, path)
+    write_atomically(file, lambda opened: opened.write(picture))
     if as_json:
         click.echo(json.dumps({**_world_json(made), "file": _name(file)}, indent=1))
     else:
         click.echo(f"{file}: {_boxes(made)}")
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that a kill at any moment leaves the old one or the new one.
-
-    Raises:
-        RecordError: it cannot be written.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise RecordError(f"{path}: {error.strerror}") from None
 
 
 def _name(path: Path | None) -> str | None:

@@ -47,7 +47,8 @@ def test_quaternion_change_of_frames_equals_rotating_in_ned(roll, pitch, yaw, bo
     body_frd = body_flu * [1.0, -1.0, -1.0]
     expected = frames.enu_from_ned(frames.rotation_matrix(q_ned) @ body_frd)
     scale = 1.0 + np.abs(body_flu).max()
-    np.testing.assert_allclose(frames.rotation_matrix(q_enu) @ body_flu, expected, atol=1e-9 * scale)
+    turned = frames.rotation_matrix(q_enu) @ body_flu
+    np.testing.assert_allclose(turned, expected, atol=1e-9 * scale)
     back = frames.flu_enu_from_frd_ned(q_enu)
     assert abs(float(back @ q_ned)) == pytest.approx(1.0)
 

@@ -3,9 +3,11 @@
 import subprocess
 import sys
 
-CALLEE = "from sitl.control.compiled import compiled\n@compiled\ndef inner(x):\n    return x + {}\n"
+CALLEE = (
+    "from mavfi_cli.core.compiled import compiled\n@compiled\ndef inner(x):\n    return x + {}\n"
+)
 CALLER = (
-    "from sitl.control.compiled import compiled\n"
+    "from mavfi_cli.core.compiled import compiled\n"
     "from callee_module import inner\n"
     "@compiled\n"
     "def outer(x):\n"
