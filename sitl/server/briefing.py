@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import write_json
 from sitl.server.simulation import Simulation
 
 FILE = "briefing.json"
