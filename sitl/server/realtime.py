@@ -65,10 +65,11 @@ class Realtime:
 
     def _wait(self, timeout_s: float) -> None:
         poller = select.poll()
-        for descriptor in {door.listener.fileno() for door in self._doors}:
-            poller.register(descriptor, select.POLLIN)
-        for client, _ in self._clients:
-            poller.register(client.transport.fileno(), select.POLLIN)
+        descriptors = {door.listener.fileno() for door in self._doors}
+        descriptors |= {client.transport.fileno() for client, _ in self._clients}
+        for descriptor in descriptors:
+            if descriptor >= 0:  # a door with one peer closes with it
+                poller.register(descriptor, select.POLLIN)
         poller.poll(timeout_s * 1e3)
 
     def _welcome(self) -> None:

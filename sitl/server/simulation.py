@@ -6,16 +6,21 @@ import math
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.frames import enu_from_ned, flu_enu_from_frd_ned
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.streams import TICK_US
+from sitl.autopilot.truth import Truth, Vector
 from sitl.camera.component import Camera
 from sitl.referee import Referee
+from sitl.server.wreck import Wreck, has_come_down, wreck_of
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Vehicle
 from sitl.world import World
 
 STEPS_A_TICK = 5
+_FARTHEST_M = 1e6
+_FASTEST_RADPS = 1e4
 _STEP_S = TICK_US * 1e-6 / STEPS_A_TICK
 
 
@@ -63,6 +68,7 @@ class Simulation:
         )
         self.referee = Referee(world, profile.body_box_m, vehicle=profile.name)
         self.stamp_us = 0
+        self._wreck: Wreck | None = None
         self.camera_due: list[Any] = []
         self._look()
 
@@ -71,8 +77,9 @@ class Simulation:
         autopilot, vehicle = self.autopilot, self.vehicle
         autopilot.fly()
         setpoint, motors_on = autopilot.setpoint, autopilot.motors_on
-        for _ in range(STEPS_A_TICK):
-            vehicle.step(setpoint, motors_on)
+        if self._wreck is None:
+            for _ in range(STEPS_A_TICK):
+                vehicle.step(setpoint, motors_on)
         self.stamp_us += TICK_US
         self._look()
 
@@ -86,22 +93,37 @@ class Simulation:
         self.referee.save(folder, energies)
 
     def _look(self) -> None:
-        truth, autopilot = self.vehicle.truth, self.autopilot
+        autopilot = self.autopilot
+        truth: Truth = self._wreck or self.vehicle.truth
         position = enu_from_ned(truth.position_ned_m)
         quaternion = flu_enu_from_frd_ned(truth.quaternion_frd_ned)
-        stamp_s = self.stamp_us * 1e-6
+        self._judge(truth, position, quaternion)
+        autopilot.observe(self.stamp_us, truth)
+        self.camera_due = self.camera.poll(self.stamp_us * 1e-6, position, quaternion)
+
+    def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
+        """Let the referee see this tick; a collision ends the flight where it falls to."""
+        commander, powers = self.autopilot.commander, self.vehicle.truth
+        moves = self._wreck is None
         collision = self.referee.observe(
-            stamp_s,
-            position,
-            quaternion,
+            self.stamp_us * 1e-6,
+            position_enu_m,
+            quaternion_flu_enu,
             enu_from_ned(truth.velocity_ned_mps),
-            armed=autopilot.commander.armed,
+            armed=commander.armed,
             on_ground=truth.on_ground,
-            may_land=autopilot.may_touch_ground,
-            power_regression_w=truth.power_regression_w,
-            power_propeller_w=truth.power_propeller_w,
+            may_land=self.autopilot.may_touch_ground,
+            power_regression_w=powers.power_regression_w if moves else 0.0,
+            power_propeller_w=powers.power_propeller_w if moves else 0.0,
         )
         if collision is not None:
-            autopilot.commander.terminate(collision.text)
-        autopilot.observe(self.stamp_us, truth)
-        self.camera_due = self.camera.poll(stamp_s, position, quaternion)
+            commander.terminate(collision.text)
+        if moves and commander.terminated and has_come_down(truth):
+            self._wreck = wreck_of(truth)
+        if not _is_believable(truth):
+            raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")
+
+
+def _is_believable(truth: Truth) -> bool:
+    place, rates = truth.position_ned_m, truth.rates_frd_radps
+    return float(place @ place) < _FARTHEST_M**2 and float(rates @ rates) < _FASTEST_RADPS**2

@@ -1,0 +1,42 @@
+"""What is left of a vehicle that crashed and came down: it lies where it fell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sitl.autopilot.truth import Truth, Vector
+
+_GROUND_M = 0.3  # the centre of what has fallen lies no higher than this
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wreck:
+    """A vehicle's state, at rest for good; see `sitl.autopilot.truth.Truth`."""
+
+    position_ned_m: Vector  # (3,)
+    quaternion_frd_ned: Vector  # (4,)
+    battery_voltage_v: float
+    battery_remaining: float
+    battery_current_a: float = 0.0
+    on_ground: bool = True
+    velocity_ned_mps: Vector = field(default_factory=lambda: np.zeros(3))
+    acceleration_ned_mps2: Vector = field(default_factory=lambda: np.zeros(3))
+    rates_frd_radps: Vector = field(default_factory=lambda: np.zeros(3))
+    motor_commands: Vector = field(default_factory=lambda: np.zeros(4))
+
+
+def has_come_down(truth: Truth) -> bool:
+    """Whether a vehicle without motors has reached the ground."""
+    return truth.on_ground or bool(truth.position_ned_m[2] > -_GROUND_M)
+
+
+def wreck_of(truth: Truth) -> Wreck:
+    """The state of a vehicle that stays where it is from now on."""
+    return Wreck(
+        position_ned_m=np.array(truth.position_ned_m),
+        quaternion_frd_ned=np.array(truth.quaternion_frd_ned),
+        battery_voltage_v=truth.battery_voltage_v,
+        battery_remaining=truth.battery_remaining,
+    )

@@ -1,0 +1,85 @@
+"""Bad beginnings: known errors are one line and 1, misuse is 2."""
+
+import socket
+import subprocess
+import sys
+
+import pytest
+
+
+def run(*arguments):
+    done = subprocess.run(
+        [sys.executable, "-m", "sitl", *arguments],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--world", "dence"], "did you mean 'dense'"),
+        (["--world", "farm", "--vehicle", "sollo"], "did you mean 'solo'"),
+        (["--world", "farm", "--goal", "900,0,5"], "goal (900, 0, 5) is outside"),
+        (["--world", "farm", "--start", "6.4,10,0"], "start (6.4, 10, 0) is blocked"),
+        (["--world", "/nowhere/at/all.toml"], "/nowhere/at/all.toml"),
+        (["--world", "farm", "--link", "carrier:pigeon"], "carrier"),
+        (["--world", "farm", "--link", "udpin:0.0.0.0:14777"], "sign"),
+        (["--world", "farm", "--camera-rate", "1000"], "camera rate"),
+        (["--world", "farm", "--fd", "1", "--lockstep"], "fd:1"),
+        (["--world", "farm", "--key-file", "/nowhere/key"], "/nowhere/key"),
+    ],
+)
+def test_known_error_is_one_line_and_exit_1(arguments, words):
+    code, out, errors = run(*arguments)
+    assert (code, out) == (1, "")
+    assert errors.startswith("error: ")
+    assert errors.count("\n") == 1
+    assert words in errors
+
+
+def test_port_in_use_is_named():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        code, _, errors = run("--world", "farm", "--link", f"tcpin:127.0.0.1:{port}")
+    assert code == 1
+    assert errors == f"error: tcpin:127.0.0.1:{port}: port {port} is in use\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--lockstep"],
+        ["--start", "1,2"],
+        ["--goal", "a,b,c"],
+        ["--camera-size", "64"],
+        ["--speed", "0"],
+        ["--speed", "nan"],
+        ["--sysid", "256"],
+        ["--realtime", "--speed", "2"],
+        ["--link", "best=udpin:127.0.0.1:1"],
+        ["--lockstep", "--fd", "3", "--link", "udpin:127.0.0.1:1"],
+        ["--no-such-option"],
+    ],
+)
+def test_misuse_exits_2(arguments, capsys):
+    from sitl.server.options import parse
+
+    with pytest.raises(SystemExit) as stop:
+        parse(arguments)
+    assert stop.value.code == 2
+    assert "error:" in capsys.readouterr().err
+
+
+def test_defaults_are_those_of_a_px4_sitl():
+    from sitl.server.options import parse
+
+    options = parse([])
+    assert [(preset.value, url) for preset, url in options.links] == [
+        ("onboard", "udpout:127.0.0.1:14540"),
+        ("gcs", "udpout:127.0.0.1:14550"),
+        ("gcs", "tcpin:127.0.0.1:5760"),
+    ]
+    assert options.speed == 1.0
+    assert parse(["--lockstep", "--fd", "5"]).speed is None
+    assert parse(["--lockstep", "--fd", "5"]).links == ()
