@@ -123,13 +123,23 @@ def _signing_maker(key: bytes | None) -> Callable[[], Signing | None]:
 
 def _announce(options: Options, simulation: Simulation) -> None:
     world = simulation.referee.world
-    links = "\n".join(f"  {preset.value:9} {url}" for preset, url in options.links)
-    print(  # noqa: T201 - what a person who starts it by hand needs
+    links = [f"  {preset.value:9} {url:32} {_how(url)}" for preset, url in options.links]
+    lines = [
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
-        f"system {options.system_id}, {options.speed:g} x real time\n{links}\n"
-        "connect:  MAVSDK udpin://0.0.0.0:14540 · QGroundControl by itself on UDP 14550 · "
-        "mavproxy.py --master=tcp:127.0.0.1:5760\n"
+        f"system {options.system_id}, {options.speed:g} x real time",
+        *(line.rstrip() for line in links),
         "Ctrl-C ends it.",
-        file=sys.stderr,
-        flush=True,
-    )
+    ]
+    print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201 - for who starts it by hand
+
+
+def _how(url: str) -> str:
+    """How a client gets to an endpoint."""
+    scheme, _, place = url.partition(":")
+    port = place.rpartition(":")[2]
+    return {
+        "udpout": f"MAVSDK udpin://{place}, MAVProxy --master=udpin:{place}"
+        + (", QGroundControl by itself" if port == "14550" else ""),
+        "udpin": f"MAVSDK udpout://{place}, MAVProxy --master=udpout:{place}",
+        "tcpin": f"MAVSDK tcpout://{place}, MAVProxy --master=tcp:{place}",
+    }.get(scheme, "")
