@@ -17,7 +17,11 @@ from mavfi_cli.fi.native.tracee import ENTRY_ADDRESS, Tracee, best_mechanism
 
 # The shell says that it runs (so that its own exec is over) and waits for one line (so that the
 # tracer is attached before the program starts).
-_LAUNCHER = 'echo >&3 && read -r go <&3 && cd -- "$1" && shift && exec "$@" 3<&-'
+# No core files, and no endless output of a corrupted program (in blocks of 512 bytes).
+_LAUNCHER = (
+    "ulimit -c 0; ulimit -f 2097152; echo >&3 && read -r go <&3 && "
+    'cd -- "$1" && shift && exec "$@" 3<&-'
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
+from mavfi_cli.fi.native.alarm import Alarm
 from mavfi_cli.fi.native.arch import TRAITS, Registers
 from mavfi_cli.fi.native.breakpoints import (
     SI_KERNEL,
@@ -61,6 +62,7 @@ class Tracee:
     registers: Registers = field(init=False)
     _pending_signal: int = 0
     _interrupting: bool = False
+    _expecting_alarm: bool = False
     _memory: int = -1  # file descriptor of the process's memory
 
     def __post_init__(self) -> None:
@@ -110,6 +112,15 @@ class Tracee:
     def resume(self) -> Trap | Ended:
         """Run until a trap of ours stops the target thread, or to the end."""
         return self._go(linux.CONT)
+
+    def resume_until_alarm(self, alarm: Alarm) -> Trap | Ended:
+        """Run until `alarm` sends its SIGTRAP; that signal is not delivered to the program."""
+        self._expecting_alarm = True
+        try:
+            with alarm:
+                return self.resume()
+        finally:
+            self._expecting_alarm = False
 
     def release(self) -> None:
         """Let the stopped target thread run without waiting for it."""
@@ -186,8 +197,16 @@ class Tracee:
 
     def _await(self, how: int = linux.CONT) -> Trap | Ended:
         """Handle reports until the target thread stops for us or the process ends."""
+        return self.handle(self._wait(), how)
+
+    def handle(self, status: linux.Status, how: int) -> Trap | Ended:
+        """Act on a report, and on all that follow, until the target stops for us or it ends.
+
+        Args:
+            status: the first report.
+            how: the request that the target goes on with after a passing stop.
+        """
         while True:
-            status = self._wait()
             if status.ended:
                 if self._note_end(status):
                     assert self.ended is not None
@@ -199,6 +218,7 @@ class Tracee:
                 self._continue(status, how)
             else:
                 self._continue(status, linux.CONT)
+            status = self._wait()
 
     def _wait(self) -> linux.Status:
         found, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS)
@@ -232,6 +252,8 @@ class Tracee:
             return Trap(code=TRAP_BRKPT) if self._interrupting else None
         if status.trapped:
             code = linux.signal_info(self.tid).code
+            if self._expecting_alarm and code <= 0:  # sent by a process
+                return Trap(code=code)
             return Trap(code=code) if code in _TRACER_TRAPS else None
         if self._interrupting and status.event == 0:
             # A signal came first. It is delivered when the thread goes on; the interrupt is

@@ -42,6 +42,7 @@ class Traits:
     longest_instruction: int
     breakpoint: bytes  # software breakpoint instruction
     breakpoint_advance: int  # how far the instruction pointer is past it when it traps
+    user_offsets: tuple[int, int]  # of instruction and stack pointer in `struct user`
     debug_registers: int  # offset of debug register 0 in `struct user`
     step_after_breakpoint: bool  # a single step works right after a perf breakpoint stop
 
@@ -54,6 +55,7 @@ TRAITS = Traits(
     longest_instruction=15,
     breakpoint=b"\xcc",
     breakpoint_advance=1,
+    user_offsets=(128, 152),
     debug_registers=848,
     step_after_breakpoint=True,
 )

@@ -1,0 +1,147 @@
+"""`mavfi kernels`: one fault a run in an isolated program, and what it did to the output."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mavfi_cli.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from mavfi_cli.fi.isolated.campaign import Campaign, Plan
+
+
+@click.command()
+@click.option("--program", required=True, help="The native program to attack.")
+@click.option("--args", default="", help="Its arguments, quoted as in a shell.")
+@click.option("--compare", default="stdout", show_default=True, help="stdout or file:PATH.")
+@click.option("--tolerance", default=0.0, help="Relative difference of numbers that is no SDC.")
+@click.option("--runs", default=1000, show_default=True, type=click.IntRange(min=1))
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1))
+@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
+@click.option("--scope", multiple=True, help="Shared object in scope; default the program.")
+@click.option("--function", help="Attack only inside invocations of this function.")
+@click.option("--windows", default=16, show_default=True, help="Invocations that are sampled.")
+@click.option(
+    "--sampling",
+    default="instruction-uniform",
+    show_default=True,
+    help="instruction-uniform, cpu-time or wall-clock.",
+)
+@click.option("--site", multiple=True, help="general, flags, vector, x87, memory, opcode ...")
+@click.option("--role", multiple=True, help="source or destination; default both.")
+@click.option("--field", default="any", help="sign, exponent, mantissa or any.")
+@click.option("--bits", default=1, type=click.IntRange(min=1), help="Bits flipped at once.")
+@click.option("--compat", help="Repeat another injector's habits: rosfi-2021.")
+@click.option("--null", is_flag=True, help="Do everything but the flip.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for records, JSON and CSV.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def kernels(**options: Any) -> None:
+    """Flip bits in a native program, one fault a run, and compare its output.
+
+    Outcomes: benign, crash, hang, SDC (silent data corruption), not injected.
+    """
+    from mavfi_cli.fi.isolated.campaign import run_campaign
+
+    as_json, out = options["as_json"], options["out"]
+    plan = _plan(options)
+    progress_bar: Any = click.progressbar
+    name = Path(options["program"]).name
+    with progress_bar(length=plan.runs, label=name, file=sys.stderr) as bar:
+        campaign = run_campaign(
+            plan, jobs=options["jobs"], folder=out, progress=lambda _done: bar.update(1)
+        )
+    if out is not None:
+        _save(campaign, out)
+    click.echo(json.dumps(campaign.summary(), indent=2) if as_json else _table(campaign))
+
+
+def _plan(options: dict[str, Any]) -> Plan:
+    from mavfi_cli.fi.isolated.campaign import Plan
+    from mavfi_cli.fi.isolated.compare import Comparison
+    from mavfi_cli.fi.isolated.program import ProgramTarget, absolute_arguments
+    from mavfi_cli.fi.native.spawn import Command
+
+    comparison = Comparison.of(options["compare"], options["tolerance"])
+    try:
+        arguments: tuple[str, ...] = tuple(shlex.split(options["args"]))
+    except ValueError as error:
+        raise ConfigError(str(error), key="args") from None
+    if comparison.file is not None:
+        arguments = absolute_arguments(arguments, Path.cwd())
+    return Plan(
+        target=ProgramTarget(
+            command=Command.of([options["program"], *arguments]),
+            comparison=comparison,
+            objects=tuple(options["scope"]),
+            function=options["function"],
+        ),
+        runs=options["runs"],
+        seed=options["seed"],
+        rule=options["sampling"],
+        compat=options["compat"],
+        model=_model(options),
+        windows=options["windows"],
+        null=options["null"],
+    )
+
+
+def _model(options: dict[str, Any]) -> Any:
+    from mavfi_cli.core.errors import UnknownName
+    from mavfi_cli.fi.bits import Field
+    from mavfi_cli.fi.native.fault import FaultModel, Role, Site
+
+    def named(kind: Any, name: str, what: str) -> Any:
+        try:
+            return kind(name)
+        except ValueError:
+            raise UnknownName(what, name, [known.value for known in kind]) from None
+
+    default = FaultModel()
+    sites = frozenset(named(Site, name, "site") for name in options["site"])
+    roles = frozenset(named(Role, name, "role") for name in options["role"])
+    return FaultModel(
+        sites=sites or default.sites,
+        roles=roles or default.roles,
+        field=named(Field, options["field"], "field"),
+        count=options["bits"],
+    )
+
+
+def _table(campaign: Campaign) -> str:
+    summary = campaign.summary()
+    lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
+    for name, row in summary["outcomes"].items():
+        share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
+        low, high = (100 * edge for edge in row["wilson95"])
+        lines.append(f"{name:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %")
+    lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
+    if summary["executed_in_scope"] is not None:
+        lines.append(
+            f"{summary['executed_in_scope']} executed instructions in scope, windows stepped: "
+            f"{summary['windows']}"
+        )
+    for title in ("crashes", "not_injected", "activation"):
+        if summary[title]:
+            parts = ", ".join(f"{name}: {count}" for name, count in summary[title].items())
+            lines.append(f"{title.replace('_', ' ')}: {parts}")
+    return "\n".join(lines)
+
+
+def _save(campaign: Campaign, folder: Path) -> None:
+    from mavfi_cli.fi.isolated.campaign import csv_rows, to_json
+
+    partial = folder / "kernels.json.partial"
+    partial.write_text(json.dumps(to_json(campaign), indent=1) + "\n", encoding="utf-8")
+    os.replace(partial, folder / "kernels.json")
+    partial = folder / "kernels.csv.partial"
+    with partial.open("w", encoding="utf-8", newline="") as stream:
+        csv.writer(stream).writerows(csv_rows(campaign))
+    os.replace(partial, folder / "kernels.csv")
