@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from typing import NoReturn
 
@@ -56,6 +57,8 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Entry point: a known error is one line and exit code 1, a usage error exit code 2."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up
     try:
         cli.main(prog_name="mavfi", standalone_mode=False)
     except click.ClickException as error:

@@ -72,6 +72,9 @@ class _Size(click.ParamType[Any]):
               help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
 @click.option("--land/--no-land", default=None,
               help="Land and disarm at the goal  [only with --link].")  # fmt: skip
+@click.option("--isolate", multiple=True, metavar="NODE",
+              help="Let a node work in its own process: point_cloud, octomap, collision_check, "
+                   "planner. May be repeated; the record stays the same.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
               show_default=True, help="Where the run folder goes.")  # fmt: skip
 @click.option("--picture/--no-picture", default=True, help="Draw flight.svg.", show_default=True)

@@ -13,7 +13,7 @@ from mavfi_cli.mission.events import Event
 from mavfi_cli.mission.progress import Progress, Watcher
 
 if TYPE_CHECKING:
-    from rich.status import Status
+    from rich.live import Live
 
     from mavfi_cli.mission.config import MissionConfig
 
@@ -40,15 +40,15 @@ class _Plain(Watcher):
 class _Live(Watcher):
     """One line that is rewritten, with the events scrolling above it."""
 
-    def __init__(self, status: Status) -> None:
-        self._status = status
+    def __init__(self, live: Live) -> None:
+        self._live = live
 
     def on_progress(self, progress: Progress) -> None:
-        self._status.update(_line(progress))
+        self._live.update(_line(progress), refresh=True)
 
     def on_event(self, event: Event) -> None:
         if event.kind in _TOLD:
-            self._status.console.print(
+            self._live.console.print(
                 f"[dim]{event.stamp_s:7.2f} s[/dim]  {event.text}", highlight=False
             )
 
@@ -74,8 +74,10 @@ def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
         yield _Plain()
         return
     from rich.console import Console
+    from rich.live import Live
 
     console = Console(stderr=True)
     console.print(f"[bold]{title}[/bold]", highlight=False)
-    with console.status("starting") as status:
-        yield _Live(status)
+    # No thread that refreshes: a mission may fork, and a fork must find one thread only.
+    with Live("starting", console=console, auto_refresh=False, transient=True) as live:
+        yield _Live(live)

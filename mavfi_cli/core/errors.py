@@ -119,6 +119,13 @@ class VehicleProcessError(MavfiError):
     """The simulated vehicle could not start, or ended early."""
 
 
+class NodeCrashed(MavfiError):
+    """A node of the companion died: how, and what it said."""
+
+    def __init__(self, node: str, how: str) -> None:
+        super().__init__(f"node {node} crashed: {how}")
+
+
 class RecordError(MavfiError):
     """A run folder that cannot be written or read."""
 

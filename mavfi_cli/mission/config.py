@@ -6,8 +6,9 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, UnknownName
 
+ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner")
 Vector3 = tuple[float, float, float]
 
 
@@ -22,6 +23,7 @@ class MissionConfig:
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
         realtime: pace the simulated vehicle by the wall clock.
         land: land and disarm after the goal was reached.
+        isolate: nodes that work in processes of their own; changes nothing in the record.
     """
 
     world: str = "dense"
@@ -44,6 +46,7 @@ class MissionConfig:
     realtime: bool = False
     link: str | None = None
     land: bool = False
+    isolate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         positive = {
@@ -59,6 +62,9 @@ class MissionConfig:
         for name, (value, low, high) in positive.items():
             if not (math.isfinite(value) and low <= value <= high):
                 raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
+        for node in self.isolate:
+            if node not in ISOLATABLE:
+                raise UnknownName("node", node, ISOLATABLE)
         if not 0 <= self.seed < 2**31:
             raise ConfigError(f"must be within 0 and 2^31 - 1, got {self.seed}", key="seed")
         for name, size in (
@@ -69,5 +75,7 @@ class MissionConfig:
                 raise ConfigError(f"must be within 4 and 1024 pixels, got {size}", key=name)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the record of the run."""
-        return asdict(self)
+        """Plain values, for the record of the run; how it was computed is not part of it."""
+        values = asdict(self)
+        del values["isolate"]
+        return values

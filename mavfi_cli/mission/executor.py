@@ -9,10 +9,11 @@ in between, so the vehicle's simulation need not wait for it.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from mavfi_cli.mission.node_process import NodeProcess
 from mavfi_cli.mission.wall import WallClock
 
 Run = Callable[[Any, float], Any]  # (input, start stamp) -> output
@@ -31,6 +32,7 @@ class Node:
     invocations: int = 0
     dropped: int = 0  # inputs that a newer one replaced before they were looked at
     busy_s: float = 0.0
+    process: NodeProcess | None = None  # where the real work is done; None: here
 
 
 @dataclass(slots=True, eq=False)
@@ -40,14 +42,31 @@ class _Job:
     node: Node
     start_s: float
     input: Any
+    order: int | None = None  # number of the order in the node's process
     done: bool = False
     output: Any = None
 
-    def compute(self, wall: WallClock) -> Any:
-        if not self.done:
+    def begin(self, wall: WallClock) -> None:
+        """Do the real work, or have the node's process do it."""
+        if self.done or self.order is not None:
+            return
+        process = self.node.process
+        if process is None:
             with wall.measure(self.node.name):
                 self.output = self.node.run(self.input, self.start_s)
-            self.input = None
+            self.done = True
+        else:
+            self.order = process.order(self.node.name, self.input, self.start_s)
+        self.input = None
+
+    def result(self, wall: WallClock) -> Any:
+        """The output, waiting for it where it is not there yet."""
+        self.begin(wall)
+        if not self.done:
+            assert self.node.process is not None
+            assert self.order is not None
+            self.output, host_s = self.node.process.take(self.node.name, self.order)
+            wall.add(self.node.name, host_s)
             self.done = True
         return self.output
 
@@ -88,6 +107,16 @@ class Executor:
         self._nodes[name] = node
         return node
 
+    def fork(self, names: Sequence[str]) -> NodeProcess:
+        """Let these nodes do their real work in one process of their own, from now on.
+
+        Their state moves there; the caller closes the process.
+        """
+        process = NodeProcess({name: self._nodes[name].run for name in names})
+        for name in names:
+            self._nodes[name].process = process
+        return process
+
     @property
     def nodes(self) -> dict[str, Node]:
         """All nodes by name, in the order in which they were added."""
@@ -119,9 +148,9 @@ class Executor:
         self.now_s = max(self.now_s, stamp_s)
 
     def compute(self) -> None:
-        """Do the real work of every invocation that has started; safe to call at any time."""
+        """Begin the real work of every invocation that has started; safe to call at any time."""
         while self._uncomputed:
-            self._uncomputed.pop(0).compute(self.wall)
+            self._uncomputed.pop(0).begin(self.wall)
 
     def _start_if_free(self, node: Node) -> None:
         if node.busy or node.pending is None:
@@ -144,7 +173,7 @@ class Executor:
         self._count += 1
 
     def _finish(self, job: _Job, end_s: float) -> None:
-        output = job.compute(self.wall)
+        output = job.result(self.wall)
         job.node.busy = False
         self._working -= 1
         job.node.publish(output, end_s)

@@ -7,7 +7,8 @@ run while the vehicle already simulates the next tick.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ from mavfi_cli.mission.wall import WallClock
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
 IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing
 LOST_S = 5.0  # a foreign autopilot that says nothing for so long is lost
+_POSITION = dialect.MAVLink_local_position_ned_message
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
 
@@ -108,6 +110,15 @@ class Flight:
         self._briefing = briefing
         self.companion = Companion(self._config, self._platform, self._planner, briefing, self.wall)
 
+    @contextlib.contextmanager
+    def isolated_nodes(self) -> Iterator[None]:
+        """Each node that the mission isolates works in a process of its own meanwhile."""
+        assert self.companion is not None
+        with contextlib.ExitStack() as stack:
+            for name in self._config.isolate:
+                stack.callback(self.companion.executor.fork([name]).close)
+            yield
+
     def fly(self, tlog: Path) -> None:
         """Fly until the mission has an outcome.
 
@@ -162,16 +173,23 @@ class Flight:
             self._silence()
             return
         self._idle_s = 0.0
+        stamp_ms = None
         with self.wall.measure("link"):
-            messages = self._codec.decode(data, datagram=self._transport.datagram)
-        for message in messages:
-            self._handle(message)
-            if (
-                isinstance(message, dialect.MAVLink_local_position_ned_message)
-                and message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1
-                and message.get_srcSystem() == (self._session.telemetry.system or SYSTEM_ID)
-            ):
-                self._tick(message.time_boot_ms / 1e3)
+            for message in self._codec.decode(data, datagram=self._transport.datagram):
+                self._session.handle(message)
+                self._frames += self._images.feed(message)
+                self._record(message.get_msgbuf())
+                if type(message) is _POSITION and self._is_autopilot(message):
+                    stamp_ms = message.time_boot_ms
+        if stamp_ms is not None:
+            self._tick(stamp_ms / 1e3)
+
+    def _is_autopilot(self, message: Message) -> bool:
+        system = self._session.telemetry.system or message.get_srcSystem()
+        return bool(
+            message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1
+            and message.get_srcSystem() == system
+        )
 
     def _silence(self) -> None:
         if self._config.link is None:
@@ -183,12 +201,6 @@ class Flight:
         self._send(self._session.tick(self.stamp_s))
         if isinstance(self._session.failure, NoAutopilot):
             raise self._session.failure
-
-    def _handle(self, message: Message) -> None:
-        with self.wall.measure("link"):
-            self._session.handle(message)
-            self._frames += self._images.feed(message)
-            self._record(self.stamp_s, message.get_msgbuf())
 
     def _tick(self, stamp_s: float) -> None:
         """One control tick: publish what is due, decide, answer, and only then compute."""
@@ -257,18 +269,18 @@ class Flight:
     def _send(self, messages: Sequence[Message]) -> None:
         frames = [self._codec.encode(message) for message in messages]
         for frame in frames:
-            self._record(self.stamp_s, frame)
+            self._record(frame)
         if self._transport.datagram:
             for frame in frames:
                 self._transport.send(frame)
         elif frames:
             self._transport.send(b"".join(frames))
 
-    def _record(self, stamp_s: float, frame: bytes) -> None:
+    def _record(self, frame: bytes) -> None:
         if self._tlog is None:
-            self._early.append((stamp_s, frame))
+            self._early.append((self.stamp_s, frame))
         else:
-            self._tlog.write(stamp_s, frame)
+            self._tlog.write(self.stamp_s, frame)
 
     # What became of it ----------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from mavfi_cli import __version__
 from mavfi_cli.autonomy import planners, warm_up
-from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.errors import MavfiError, NodeCrashed
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.mission import briefing, quality
@@ -73,7 +73,8 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
             name = Path(config.world).stem if config.link is None else "link"
             folder = new_run_folder(out, f"{name}-{config.seed}")
             flight_begun = time.perf_counter()
-            crash = _fly(flight, folder)
+            with flight.isolated_nodes():
+                crash = _fly(flight, folder)
             flight_wall_s = time.perf_counter() - flight_begun
         transport.close()  # the vehicle sees the end and saves its truth
         if process is not None:
@@ -84,6 +85,7 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
             "flight_wall_s": round(flight_wall_s, 3),
             "machine": host_platform.machine(),
             "cores": os.cpu_count(),
+            "isolated": list(config.isolate),
             "stage_wall_s": {k: round(v, 4) for k, v in flight.wall.totals.items()},
         }
         truth, referee = _read_truth(truth_folder)
@@ -95,6 +97,9 @@ def _fly(flight: Flight, folder: RunFolder) -> str | None:
     """Fly to the end. A crash of the companion's software is an outcome: returns its traceback."""
     try:
         flight.fly(folder.tlog)
+    except NodeCrashed as error:
+        flight.end(Outcome.CRASH, str(error).partition("\n")[0])
+        return str(error)
     except MavfiError:
         raise
     except Exception as error:  # the mission-process boundary: a crash is a result

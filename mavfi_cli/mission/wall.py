@@ -20,4 +20,8 @@ class WallClock:
         try:
             yield
         finally:
-            self.totals[name] = self.totals.get(name, 0.0) + perf_counter() - begun
+            self.add(name, perf_counter() - begun)
+
+    def add(self, name: str, seconds: float) -> None:
+        """Add host seconds that were measured elsewhere."""
+        self.totals[name] = self.totals.get(name, 0.0) + seconds
