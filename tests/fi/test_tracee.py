@@ -54,6 +54,17 @@ def test_two_stages_count_from_the_first(start):
     assert tracee.registers.read("rdi") == 12
 
 
+@pytest.mark.parametrize("mechanism", list(Mechanism))
+def test_the_execution_in_front_of_us_counts(start, mechanism):
+    tracee = start("counting", "100", mechanism=mechanism)
+    body = entry(tracee, "counting", "body")
+    assert tracee.run_to(body, 10)
+    assert tracee.run_to(body, 1)
+    assert tracee.registers.read("rdi") == 9
+    assert tracee.run_to(body, 2)
+    assert tracee.registers.read("rdi") == 10
+
+
 def test_a_stop_inside_a_blocking_system_call_resumes_correctly(start, tmp_path):
     tracee = start("sleeper")
     begin = time.monotonic()
@@ -91,6 +102,8 @@ def test_no_trap_flag_is_left_after_pushf_and_popf(start):
     assert instruction_at(tracee, tracee.registers.ip).mnemonic == "popfq"
     clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
     assert image.locate(tracee.registers.ip).object == "destinations"
+    assert instruction_at(tracee, tracee.registers.ip).mnemonic == "ret"
+    clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
     assert tracee.resume() == Ended(exit_code=0, signal=None)
     assert tracee.signals == []
 

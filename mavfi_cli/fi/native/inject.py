@@ -71,7 +71,7 @@ def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
 
 def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
     """Execute one whole instruction and leave no trace of the trap flag in the target."""
-    if instruction is not None and instruction.repeats:
+    if instruction is not None and (instruction.repeats or instruction.restores_flags):
         if tracee.run_to(instruction.next_address):
             return Trap(code=0)
         assert tracee.ended is not None

@@ -38,11 +38,11 @@ def _is_repeated(word: int) -> bool:
 
 
 def _needs_care(word: int) -> bool:
-    """A push of the flags or a system call."""
+    """A push or a pop of the flags, or a system call."""
     first = word & 0xFF
     second = (word >> 8) & 0xFF
-    pushes = first == 0x9C or (second == 0x9C and (first == 0x66 or 0x40 <= first <= 0x4F))
-    return pushes or (first == 0x0F and second == 0x05)
+    code = second if first == 0x66 or 0x40 <= first <= 0x4F else first
+    return code == 0x9C or code == 0x9D or (first == 0x0F and second == 0x05)
 
 
 is_repeated: Any = njit(cache=True)(_is_repeated)

@@ -135,6 +135,7 @@ class Tracee:
         Returns:
             False if the process ended before.
         """
+        self.registers.rearm()
         if self.mechanism is Mechanism.PERF:
             return self._run_to_counted(address, count)
         return self._run_to_stepwise(address, count)

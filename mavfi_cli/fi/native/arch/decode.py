@@ -77,6 +77,15 @@ class Instruction:
         return self.mnemonic.startswith("rep")
 
     @property
+    def restores_flags(self) -> bool:
+        """It pops the flags.
+
+        Linux takes the trap flag for the program's own once such an instruction was stepped
+        (`enable_single_step` in arch/x86/kernel/step.c), and would leave it set.
+        """
+        return self.mnemonic in ("popfq", "popf")
+
+    @property
     def saves_flags(self) -> bool:
         """It pushes the flags, the trap flag of a single step included."""
         return self.mnemonic in ("pushfq", "pushf")

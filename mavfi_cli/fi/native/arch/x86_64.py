@@ -27,6 +27,7 @@ _SLOT = {name: index for index, name in enumerate(_GENERAL_ORDER)}
 GENERAL = tuple(_GENERAL_NAMES.split())
 FLAG_BITS = {"cf": 0, "pf": 2, "af": 4, "zf": 6, "sf": 7, "df": 10, "of": 11}
 TRAP_FLAG = 1 << 8
+RESUME_FLAG = 1 << 16
 _VECTOR = re.compile(r"(xmm|ymm|zmm)(\d+)$")
 _X87 = re.compile(r"(st|mm|k)(\d)$")
 
@@ -181,6 +182,16 @@ class Registers:
             top = self.extended()[3] >> 3 & 7
             return [_Span(X87, 32 + 16 * ((index - top) & 7), 8)]
         return [_Span(OPMASK, xsave_components()[OPMASK].offset + 8 * index, 8)]
+
+    def rearm(self) -> None:
+        """Let a breakpoint on the very next instruction hit.
+
+        A stop at an instruction breakpoint leaves the resume flag set, which hides the next
+        execution (Intel SDM volume 3, section 18.3.1.1).
+        """
+        flags = self.read("rflags")
+        if flags & RESUME_FLAG:
+            self.write("rflags", flags & ~RESUME_FLAG)
 
     @property
     def ip(self) -> int:

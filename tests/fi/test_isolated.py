@@ -1,0 +1,340 @@
+"""Outcomes that are known, faults that repeat, records that refuse another build."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
+from mavfi_cli.fi import record
+from mavfi_cli.fi.isolated.campaign import Plan, csv_rows, run_campaign
+from mavfi_cli.fi.isolated.compare import Comparison, magnitude
+from mavfi_cli.fi.isolated.outcome import Outcome, shares, wilson
+from mavfi_cli.fi.isolated.program import (
+    Limits,
+    ProgramTarget,
+    Workplace,
+    golden_run,
+    profile_program,
+    run_fault,
+)
+from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.fault import (
+    InstructionFault,
+    Role,
+    Stage,
+    explicit_corruption,
+)
+from mavfi_cli.fi.native.image import Image
+from mavfi_cli.fi.native.inject import Activation
+from mavfi_cli.fi.native.spawn import Command
+
+QUICK = Limits(cpu_grace_s=0.1, wall_grace_s=3.0)
+
+
+@pytest.fixture
+def target(native_program):
+    def make(name, *arguments, **options):
+        command = Command.of([str(native_program(name)), *arguments])
+        options.setdefault("comparison", Comparison())
+        return ProgramTarget(command=command, limits=QUICK, **options)
+
+    return make
+
+
+@pytest.fixture
+def workplace():
+    places = []
+
+    def make(target):
+        places.append(Workplace(target))
+        return places[-1]
+
+    yield make
+    for place in places:
+        place.close()
+
+
+def victim_fault(place, target, bit):
+    """Bit of r10 right after the victim's `mov ..., %r10`."""
+    tracee = place.start()
+    image = Image(tracee.pid)
+    here = image.function("victim", [target.name])
+    address = image.address(here)
+    while True:
+        instruction = decode(tracee.read_memory(address, 16), address)
+        if any(use.register == "r10" for use in instruction.writes):
+            break
+        address = instruction.next_address
+    tracee.kill()
+    return InstructionFault(
+        trigger=(Stage(image.locate(address), 1),),
+        execution=1,
+        instruction=instruction.text,
+        instruction_bytes=instruction.raw,
+        corruption=explicit_corruption("r10", bit, Role.DESTINATION),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "bit", "outcome"),
+    [
+        ("benign", 5, Outcome.BENIGN),
+        ("crash", 62, Outcome.CRASH),
+        ("hang", 3, Outcome.HANG),
+        ("sdc", 4, Outcome.SDC),
+    ],
+)
+def test_programs_of_known_outcome(target, workplace, name, bit, outcome):
+    program = target(name)
+    place = workplace(program)
+    golden = golden_run(program, place)
+    fault = victim_fault(place, program, bit)
+    for _ in range(2 if outcome is Outcome.HANG else 5):
+        result = run_fault(program, place, golden, fault)
+        assert result.outcome is outcome
+        assert result.injection.applied
+        assert result.injection.before ^ result.injection.after == 1 << bit
+    if outcome is Outcome.CRASH:
+        assert result.signal == 11
+    if outcome is Outcome.SDC:
+        assert result.magnitude == pytest.approx((23 - 7) / 7)
+
+
+def test_a_tolerance_makes_small_differences_benign(target, workplace):
+    program = target("sdc", comparison=Comparison(tolerance=3.0))
+    place = workplace(program)
+    result = run_fault(program, place, golden_run(program, place), victim_fault(place, program, 4))
+    assert (result.outcome, result.within_tolerance) == (Outcome.BENIGN, True)
+
+
+def test_the_same_fault_gives_the_same_output_20_times(target, workplace):
+    program = target("counting", "60")
+    place = workplace(program)
+    golden = golden_run(program, place)
+    campaign = run_campaign(Plan(target=program, runs=12, seed=8))
+    run = next(r for r in campaign.runs if r.result.outcome is Outcome.SDC)
+    results = [run_fault(program, place, golden, run.result.fault) for _ in range(20)]
+    assert {r.output_sha256 for r in results} == {run.result.output_sha256}
+    assert {(r.injection.before, r.injection.after) for r in results} == {
+        (run.result.injection.before, run.result.injection.after)
+    }
+
+
+def test_a_null_injection_changes_nothing(target):
+    campaign = run_campaign(Plan(target=target("counting", "60"), runs=10, seed=2, null=True))
+    assert {run.result.outcome for run in campaign.runs} == {Outcome.BENIGN}
+    assert {run.result.output_sha256 for run in campaign.runs} == {
+        campaign.runs[0].result.output_sha256
+    }
+
+
+def test_workers_draw_disjoint_streams_and_do_not_change_the_result(target):
+    plan = Plan(target=target("counting", "30"), runs=24, seed=4)
+    alone, together = run_campaign(plan), run_campaign(plan, jobs=2)
+
+    def essence(campaign):
+        return [
+            (r.index, r.result.fault, r.result.outcome, r.result.output_sha256)
+            for r in campaign.runs
+        ]
+
+    assert essence(alone) == essence(together)
+    assert len({r.result.fault for r in alone.runs}) > 20
+
+
+def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplace):
+    program = target("counting", "5")
+    place = workplace(program)
+    golden = golden_run(program, place)
+    fault = run_campaign(Plan(target=target("counting", "60"), runs=1, seed=1)).runs[0].result.fault
+    late = InstructionFault(
+        trigger=(Stage(fault.target, 100_000),),
+        execution=100_000,
+        instruction=fault.instruction,
+        instruction_bytes=fault.instruction_bytes,
+        corruption=fault.corruption,
+    )
+    result = run_fault(program, place, golden, late)
+    assert result.outcome is Outcome.NOT_INJECTED
+    assert "ended before execution 100000 of counting+0x" in result.reason
+    assert result.followed.activation is Activation.NOT_INJECTED
+
+
+def test_another_instruction_at_the_place_is_refused(target, workplace):
+    program = target("sdc")
+    place = workplace(program)
+    golden = golden_run(program, place)
+    fault = victim_fault(place, program, 1)
+    other = InstructionFault(
+        trigger=fault.trigger,
+        execution=1,
+        instruction="nop",
+        instruction_bytes=b"\x90",
+        corruption=fault.corruption,
+    )
+    with pytest.raises(FaultError, match="expected 'nop'"):
+        run_fault(program, place, golden, other)
+
+
+def test_sampled_invocations_say_that_they_are_a_sample(target, workplace):
+    program = target("counting", "50", function="body")
+    profiled = profile_program(program, workplace(program), np.random.default_rng(3), windows=4)
+    profile = profiled.profile
+    assert (len(profile.segments), profile.windows_in_run, profile.complete) == (4, 50, False)
+    campaign = run_campaign(Plan(target=program, runs=6, seed=5, windows=4))
+    assert campaign.summary()["windows"] == "4 of 50"
+    assert {run.record["symbol"].split("+")[0] for run in campaign.runs} == {"body"}
+
+
+@pytest.mark.parametrize("options", [{"rule": "cpu-time"}, {"compat": "rosfi-2021"}])
+def test_time_rules_name_themselves_and_count_what_they_miss(target, options):
+    campaign = run_campaign(Plan(target=target("counting", "400000"), runs=8, seed=6, **options))
+    summary = campaign.summary()
+    assert summary["sampling"].startswith(next(iter(options.values())))
+    assert sum(row["count"] for row in summary["outcomes"].values()) == 8
+    for run in campaign.runs:
+        injected = run.result.outcome is not Outcome.NOT_INJECTED
+        assert injected == (not run.result.reason)
+        if injected and "compat" in options:
+            assert set(run.record["corruption"]["bits"]) <= set(range(8))
+            assert run.record["corruption"]["operand"] not in ("rax", "eax", "rsp", "rip")
+
+
+def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_program):
+    native_program("counting")
+    script = tmp_path / "random"
+    script.write_text("#!/bin/sh\nod -An -N8 -tx8 /dev/urandom\n")
+    script.chmod(0o755)
+    program = ProgramTarget(command=Command.of([str(script)]), comparison=Comparison())
+    place = Workplace(program)
+    with pytest.raises(TargetError, match="two fault-free runs differ"):
+        golden_run(program, place)
+    place.close()
+
+
+# -- records
+
+
+def test_a_record_survives_and_gives_the_fault_back(target, tmp_path):
+    campaign = run_campaign(Plan(target=target("counting", "30"), runs=5, seed=9), folder=tmp_path)
+    planned = [json.loads(line) for line in (tmp_path / "faults.jsonl").read_text().splitlines()]
+    for before, run in zip(planned, campaign.runs, strict=True):
+        assert before["state"] == "planned"
+        path = tmp_path / "fault.json"
+        record.write(path, run.record)
+        again = record.read(path)
+        assert record.fault_of(again) == record.fault_of(before) == run.result.fault
+        assert again["object"] == "counting"
+        assert again["symbol"]
+        assert int(again["injection"]["before"], 16) == run.result.injection.before
+
+
+def test_a_record_of_another_build_is_refused(target, start):
+    campaign = run_campaign(Plan(target=target("counting", "30"), runs=1, seed=9))
+    written = campaign.runs[0].record
+    image = Image(start("counting").pid)
+    record.require_same_build(written, image)
+    changed = {**written, "build_ids": {"counting": "0123", "libgone.so": "45"}}
+    with pytest.raises(BuildMismatch) as caught:
+        record.require_same_build(changed, image)
+    assert "counting has build id" in str(caught.value)
+    assert "libgone.so is not loaded" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"a": 1}'])
+def test_a_file_that_is_no_record_is_a_clear_error(tmp_path, text):
+    path = tmp_path / "fault.json"
+    path.write_text(text)
+    with pytest.raises(RecordError, match=r"fault\.json"):
+        record.read(path)
+
+
+def test_a_damaged_record_is_a_clear_error():
+    with pytest.raises(RecordError, match="damaged"):
+        record.fault_of({"version": 1, "trigger": [{}], "corruption": None})
+    with pytest.raises(RecordError, match="version 1"):
+        record.fault_of({"version": 99})
+
+
+# -- numbers
+
+
+@pytest.mark.parametrize(("count", "total"), [(0, 10), (3, 10), (10, 10), (84, 1000)])
+def test_wilson_against_scipy(count, total):
+    from scipy.stats import binomtest
+
+    ours = wilson(count, total)
+    theirs = binomtest(count, total).proportion_ci(method="wilson")
+    assert ours.low == pytest.approx(theirs.low, abs=1e-12)
+    assert ours.high == pytest.approx(theirs.high, abs=1e-12)
+
+
+def test_not_injected_runs_are_no_part_of_the_other_shares():
+    result = shares([Outcome.SDC, Outcome.BENIGN, Outcome.NOT_INJECTED, Outcome.NOT_INJECTED])
+    assert (result[Outcome.SDC].share, result[Outcome.SDC].total) == (0.5, 2)
+    assert (result[Outcome.NOT_INJECTED].share, result[Outcome.NOT_INJECTED].total) == (0.5, 4)
+    assert math.isnan(wilson(0, 0).share)
+
+
+@pytest.mark.parametrize(
+    ("golden", "output", "size"),
+    [
+        (b"1 2 3", b"1 2 3", 0.0),
+        (b"x=2.0", b"x=3.0", 0.5),
+        (b"0", b"0.25", 0.25),
+        (b"1", b"nan", math.inf),
+        (b"1 2", b"1", None),
+        (b"a", b"b", None),
+    ],
+)
+def test_magnitude(golden, output, size):
+    assert magnitude(golden, output) == size
+
+
+def test_what_can_be_compared():
+    assert Comparison.of("file:out.txt").file == "out.txt"
+    with pytest.raises(ConfigError, match="known: stdout, file:PATH"):
+        Comparison.of("stderr")
+
+
+# -- command
+
+
+def test_the_command_writes_a_table_json_and_csv(native_program, tmp_path):
+    from mavfi_cli.cli.kernels import kernels
+
+    arguments = ["--program", str(native_program("counting")), "--args", "30", "--runs", "8"]
+    result = CliRunner().invoke(kernels, [*arguments, "--out", str(tmp_path), "--json"])
+    assert result.exit_code == 0, result.output
+    saved = json.loads((tmp_path / "kernels.json").read_text())
+    assert len(saved["runs"]) == 8
+    assert saved["summary"]["sampling"] == "instruction-uniform"
+    rows = list(csv.reader((tmp_path / "kernels.csv").read_text().splitlines()))
+    assert len(rows) == 9
+    assert rows[0][:2] == ["run", "outcome"]
+    assert [row[1] for row in rows[1:]] == [run["outcome"] for run in saved["runs"]]
+
+
+def test_a_file_as_output(native_program, tmp_path, target):
+    script = tmp_path / "writer"
+    script.write_text("#!/bin/sh\necho 42 > result.txt\n")
+    script.chmod(0o755)
+    program = ProgramTarget(
+        command=Command.of([str(script)]),
+        comparison=Comparison.of("file:result.txt"),
+        objects=("dash",),
+    )
+    place = Workplace(program)
+    assert golden_run(program, place).output == b"42\n"
+    place.close()
+
+
+def test_csv_has_a_value_for_every_column(target):
+    campaign = run_campaign(Plan(target=target("counting", "30"), runs=3, seed=1))
+    header, *rows = csv_rows(campaign)
+    assert all(len(row) == len(header) for row in rows)
+    assert all(row[header.index("instruction")] for row in rows)
