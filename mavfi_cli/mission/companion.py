@@ -27,11 +27,11 @@ from mavfi_cli.core.types import (
     Trajectory,
     VehicleState,
 )
+from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor
 from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
-from mavfi_cli.mission.wall import WallClock
 
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
 # a shorter delay is below what the simulation resolves.

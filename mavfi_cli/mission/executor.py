@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.node_process import NodeProcess
-from mavfi_cli.mission.wall import WallClock
 
 Run = Callable[[Any, float], Any]  # (input, start stamp) -> output
 Publish = Callable[[Any, float], None]  # (output, stamp at which it takes effect)

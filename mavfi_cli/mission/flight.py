@@ -19,6 +19,7 @@ from mavfi_cli.autonomy.pilot import Mode
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.errors import LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
+from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
@@ -32,7 +33,6 @@ from mavfi_cli.mission.events import EventLog
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Progress, Watcher
 from mavfi_cli.mission.trace import Trace
-from mavfi_cli.mission.wall import WallClock
 
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
 IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing

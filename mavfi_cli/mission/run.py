@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import os
 import platform as host_platform
+import resource
 import signal
 import sys
 import tempfile
@@ -86,7 +87,9 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
             "machine": host_platform.machine(),
             "cores": os.cpu_count(),
             "isolated": list(config.isolate),
+            "memory_mb": _memory_mb(),
             "stage_wall_s": {k: round(v, 4) for k, v in flight.wall.totals.items()},
+            "vehicle_stage_wall_s": _vehicle_stages(truth_folder),
         }
         truth, referee = _read_truth(truth_folder)
     _write(flight, folder, config, host, truth, referee, crash)
@@ -160,6 +163,21 @@ def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, An
     with np.load(folder / "truth.npz") as data:
         truth = {name: data[name] for name in data.files}
     return truth, json.loads((folder / "truth.json").read_text())
+
+
+def _memory_mb() -> dict[str, float]:
+    """Peak resident memory, MB, of this process and of the largest of its children so far."""
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    return {"companion": round(own / 1024, 1), "vehicle": round(children / 1024, 1)}
+
+
+def _vehicle_stages(folder: Path | None) -> dict[str, float]:
+    """Where the host time of the vehicle's process went, s."""
+    if folder is None or not (folder / "host.json").is_file():
+        return {}
+    stages = json.loads((folder / "host.json").read_text())["stage_wall_s"]
+    return {name: round(value, 4) for name, value in stages.items()}
 
 
 def _write(

@@ -55,7 +55,8 @@ class Client:
         Raises:
             LinkLost: the peer is gone.
         """
-        data = self.transport.receive(timeout_s)
+        with self._simulation.wall.measure("wait"):
+            data = self.transport.receive(timeout_s)
         return self._take(data) if data else []
 
     def receive_some(self) -> bool:
@@ -69,15 +70,20 @@ class Client:
         return bool(data)
 
     def _take(self, data: bytes) -> list[Any]:
-        messages = self._codec.decode(data, datagram=self.transport.datagram)
-        for message in messages:
-            if message.get_msgId() in _COMMANDS:
-                self._offer_camera(message)
-            self._simulation.autopilot.handle(message, self._link)
+        with self._simulation.wall.measure("link"):
+            messages = self._codec.decode(data, datagram=self.transport.datagram)
+            for message in messages:
+                if message.get_msgId() in _COMMANDS:
+                    self._offer_camera(message)
+                self._simulation.autopilot.handle(message, self._link)
         return messages
 
     def send_tick(self) -> None:
         """Send everything due at this tick at once, the autopilot's streams last."""
+        with self._simulation.wall.measure("link"):
+            self._send_tick()
+
+    def _send_tick(self) -> None:
         encode = self._camera_codec.encode
         camera = [
             encode(message)

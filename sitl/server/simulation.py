@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import VehicleProcessError
+from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import enu_from_ned, flu_enu_from_frd_ned
+from mavfi_cli.core.wall import WallClock
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.streams import TICK_US
 from sitl.autopilot.truth import Truth, Vector
@@ -19,6 +21,9 @@ from sitl.vehicle.vehicle import Vehicle
 from sitl.world import World
 
 STEPS_A_TICK = 5
+HOST_FILE = "host.json"
+"""Where this machine's time went; beside the truth, and no part of it."""
+
 _FARTHEST_M = 1e6
 _FASTEST_RADPS = 1e4
 _STEP_S = TICK_US * 1e-6 / STEPS_A_TICK
@@ -38,6 +43,7 @@ class Simulation:
     Attributes:
         stamp_us: boot clock at the newest tick.
         camera_due: messages of the camera at the newest tick.
+        wall: where this machine's time goes.
     """
 
     def __init__(
@@ -67,6 +73,7 @@ class Simulation:
             system=system_id,
         )
         self.referee = Referee(world, profile.body_box_m, vehicle=profile.name)
+        self.wall = WallClock()
         self.stamp_us = 0
         self._wreck: Wreck | None = None
         self.camera_due: list[Any] = []
@@ -78,8 +85,9 @@ class Simulation:
         autopilot.fly()
         setpoint, motors_on = autopilot.setpoint, autopilot.motors_on
         if self._wreck is None:
-            for _ in range(STEPS_A_TICK):
-                vehicle.step(setpoint, motors_on)
+            with self.wall.measure("physics"):
+                for _ in range(STEPS_A_TICK):
+                    vehicle.step(setpoint, motors_on)
         self.stamp_us += TICK_US
         self._look()
 
@@ -91,15 +99,18 @@ class Simulation:
             "propeller": truth.energy_propeller_j,
         }
         self.referee.save(folder, energies)
+        write_json(folder / HOST_FILE, {"stage_wall_s": self.wall.totals})
 
     def _look(self) -> None:
         autopilot = self.autopilot
         truth: Truth = self._wreck or self.vehicle.truth
         position = enu_from_ned(truth.position_ned_m)
         quaternion = flu_enu_from_frd_ned(truth.quaternion_frd_ned)
-        self._judge(truth, position, quaternion)
+        with self.wall.measure("referee"):
+            self._judge(truth, position, quaternion)
         autopilot.observe(self.stamp_us, truth)
-        self.camera_due = self.camera.poll(self.stamp_us * 1e-6, position, quaternion)
+        with self.wall.measure("camera"):
+            self.camera_due = self.camera.poll(self.stamp_us * 1e-6, position, quaternion)
 
     def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
         """Let the referee see this tick; a collision ends the flight where it falls to."""
