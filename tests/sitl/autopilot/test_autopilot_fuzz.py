@@ -30,7 +30,7 @@ def scalar(kind):
 def field(name, kind, length):
     if name in ("target_system", "target_component", "target"):
         return st.sampled_from([0, 1, 2, 100])
-    if name == "command":
+    if name == "command" and not length:
         return st.sampled_from(COMMANDS) | st.integers(0, 65535)
     if name == "param_id":
         return st.sampled_from([b"MPC_XY_VEL_MAX", b"COM_OF_LOSS_T", b"_HASH_CHECK", b"\xff\0"])
