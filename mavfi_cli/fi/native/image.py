@@ -219,6 +219,20 @@ class Scope:
         return any(address in span for span in self.spans)
 
 
+def executable_mapping(pid: int, address: int) -> range:
+    """The executable mapping that holds an address: the region of a just-in-time compiled kernel.
+
+    Raises:
+        FaultError: nothing executable is mapped there.
+    """
+    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+        edges, access = line.split(maxsplit=2)[:2]
+        low, high = (int(edge, 16) for edge in edges.split("-"))
+        if low <= address < high and "x" in access:
+            return range(low, high)
+    raise FaultError(f"no executable code at {address:#x} in process {pid}")
+
+
 def scope_of(image: Image, objects: Iterable[str]) -> Scope:
     """The text of the named objects.
 

@@ -1,0 +1,168 @@
+"""Profile and attack one kernel inside a long-running process (a node of a mission).
+
+Both functions block while the node works, so the mission runs them in a thread of their own and
+goes on sending the node its requests. They end with the node detached and running natively.
+
+The node must be a child of the calling process or allow tracing (`PR_SET_PTRACER`). If it dies
+while it is attached, the tracer hears of it first: take its end from the result, not from
+`Popen.wait`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.fi import record
+from mavfi_cli.fi.native.fault import InstructionFault, Stage
+from mavfi_cli.fi.native.image import Image, Location, scope_of
+from mavfi_cli.fi.native.inject import (
+    NOTHING,
+    Followed,
+    Injection,
+    apply,
+    follow,
+    instruction_at,
+    reach,
+)
+from mavfi_cli.fi.native.profile import Segment, record_window
+from mavfi_cli.fi.native.tracee import Ended, Tracee
+
+Notice = Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InvocationProfile:
+    """What one invocation of a kernel executed, with what is needed to draw from it."""
+
+    segment: Segment
+    image: Image
+    code: tuple[tuple[int, bytes], ...]
+
+    def code_at(self, address: int) -> bytes:
+        """16 bytes of code in scope."""
+        for start, data in self.code:
+            if start <= address < start + len(data):
+                return data[address - start : address - start + 16]
+        return b""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attack:
+    """What came of a fault in a node."""
+
+    injection: Injection | None  # None: the trigger was not reached, or null injection
+    followed: Followed
+    reason: str
+    ended: Ended | None  # None: the node lives on, detached
+    record: dict[str, Any]
+
+
+def profile_invocation(
+    pid: int,
+    entry: Location,
+    invocation: int,
+    *,
+    objects: tuple[str, ...],
+    regions: Mapping[str, range] | None = None,
+    limit: int = 2_000_000,
+    armed: Notice | None = None,
+) -> InvocationProfile:
+    """Step one invocation of a kernel in a fault-free node.
+
+    Args:
+        pid: the node, single-threaded as far as code in scope goes.
+        entry: the kernel's entry.
+        invocation: which one from now on, from 1.
+        objects: in scope.
+        regions: addresses of compiled code without a file, by name; may be in `objects`.
+        limit: refuse longer invocations.
+        armed: called once the node runs towards the invocation.
+
+    Raises:
+        TracingForbidden: the operating system refuses.
+        TargetError: the node ends before; WindowTooLong where the limit is reached.
+    """
+    tracee = Tracee.attach(pid)
+    try:
+        image = Image(pid, regions)
+        scope = scope_of(image, objects)
+        code = tuple((s.start, tracee.read_memory(s.start, len(s) + 16)) for s in scope.spans)
+        start = Stage(entry, invocation)
+        if armed is not None:
+            armed()
+        if not tracee.run_to(image.address(entry), invocation):
+            raise TargetError(f"node {pid}", f"ended before invocation {invocation} of {entry}")
+        trace = record_window(tracee, scope, limit=limit, program=f"node {pid}", until_return=True)
+    finally:
+        if tracee.ended is None:
+            tracee.detach()
+    return InvocationProfile(segment=Segment(start=(start,), trace=trace), image=image, code=code)
+
+
+def attack(
+    pid: int,
+    fault: InstructionFault,
+    *,
+    path: Path,
+    regions: Mapping[str, range] | None = None,
+    window: int = 64,
+    armed: Notice | None = None,
+    stopped: Callable[[Tracee], None] | None = None,
+    **context: Any,
+) -> Attack:
+    """Apply one fault in a node; its record is on the disk before the node runs to the trigger.
+
+    Args:
+        pid: the node.
+        fault: its trigger counts from now on.
+        path: of the record.
+        regions: as in `profile_invocation`.
+        window: how many instructions a destination fault is followed.
+        armed: called once the node runs towards the trigger.
+        stopped: called at the stop, before the flip (to wait for a debugger, say).
+        context: what else belongs in the record: kernel, stage, sampling rule, seed, scope.
+
+    Raises:
+        TracingForbidden: the operating system refuses.
+        FaultError: another instruction is at the place.
+    """
+    tracee = Tracee.attach(pid)
+    try:
+        image = Image(pid, regions)
+        planned = record.planned(fault, image, **context)
+        record.write(path, planned)
+        if armed is not None:
+            armed()
+        reason = reach(tracee, image, fault)
+        injection, followed = None, NOTHING
+        if not reason:
+            if stopped is not None:
+                stopped(tracee)
+            injection, followed = _corrupt(tracee, fault, window)
+            reason = "" if injection is None else injection.reason
+    finally:
+        if tracee.ended is None:
+            tracee.detach()
+    done = record.completed(planned, injection, followed, not_injected_reason=reason)
+    record.write(path, done)
+    return Attack(
+        injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
+    )
+
+
+def _corrupt(
+    tracee: Tracee, fault: InstructionFault, window: int
+) -> tuple[Injection | None, Followed]:
+    instruction = instruction_at(tracee, tracee.registers.ip)
+    if instruction is None or instruction.raw != fault.instruction_bytes:
+        found = "nothing" if instruction is None else instruction.text
+        raise FaultError(f"{fault.target} holds {found!r}, expected {fault.instruction!r}")
+    if fault.corruption is None:
+        return None, NOTHING
+    injection = apply(tracee, instruction, fault.corruption)
+    steps = window if tracee.ended is None else 0
+    return injection, follow(tracee, instruction, fault.corruption, injection, window=steps)
