@@ -56,6 +56,37 @@ int main(void) {
     printf("%ld\\n", total[0] + total[1] + total[2] + sink);
     return 0;
 }""",
+    # Handles its own signals, the tracer's favourite one included.
+    "signals": """
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+static volatile sig_atomic_t seen;
+static void handle(int number) {
+    seen += number;
+    if (number == SIGSEGV) { puts("caught"); exit(0); }
+}
+__attribute__((noinline)) void body(long i) { raise(i % 2 ? SIGUSR1 : SIGTRAP); }
+int main(void) {
+    signal(SIGUSR1, handle); signal(SIGTRAP, handle); signal(SIGSEGV, handle);
+    for (long i = 0; i < 6; i++) body(i);
+    printf("%d\\n", (int)seen);
+    *(volatile int *)0 = 1;
+    return 1;
+}""",
+    # Starts a child that outlives it.
+    "parent": """
+#include <stdio.h>
+#include <unistd.h>
+#include <sys/wait.h>
+int main(void) {
+    if (fork() == 0) return 3;
+    int status; wait(&status);
+    pid_t left = fork();
+    if (left == 0) { pause(); return 0; }
+    printf("%d %d\\n", WEXITSTATUS(status), left);
+    return 0;
+}""",
     # Known outcomes: `victim` is the attacked function.
     "benign": """
 #include <stdio.h>

@@ -139,6 +139,35 @@ def test_stepping_through_thread_creation_does_not_deadlock(start, tmp_path):
     assert (tmp_path / "stdout").read_text() == "3019\n"
 
 
+def test_signals_of_the_program_are_its_own(start, tmp_path):
+    tracee = start("signals")
+    assert tracee.run_to(entry(tracee, "signals", "body"), 4)
+    assert tracee.registers.read("rdi") == 3
+    for _ in range(40):
+        clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
+    assert tracee.resume() == Ended(exit_code=0, signal=None)
+    expected = 3 * (signal.SIGUSR1 + signal.SIGTRAP)
+    assert (tmp_path / "stdout").read_text() == f"{expected}\ncaught\n"
+
+
+def alive(pid):
+    """Running or sleeping; one whose end nobody has asked for yet is not alive."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+def test_what_the_program_started_goes_with_it(start, tmp_path):
+    tracee = start("parent")
+    assert tracee.resume() == Ended(exit_code=0, signal=None)
+    code, child = (tmp_path / "stdout").read_text().split()
+    assert code == "3"
+    assert alive(int(child))
+    tracee.kill()
+    assert not alive(int(child))
+
+
 def test_counting_without_stopping(start):
     tracee = start("counting", "77")
     if tracee.mechanism is not Mechanism.PERF:

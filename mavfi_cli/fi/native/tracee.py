@@ -175,13 +175,24 @@ class Tracee:
         linux.request(linux.DETACH, self.tid, 0, self._take_signal())
 
     def kill(self) -> Ended:
-        """End the process now and wait until it is gone."""
+        """End the process now, with what it started itself, and wait until all is gone."""
         if self.ended is None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
             self._await_end()
+        if self.group < _ANY_CHILD:
+            self._kill_descendants()
         assert self.ended is not None
         return self.ended
+
+    def _kill_descendants(self) -> None:
+        """A program that was started by us has a process group of its own."""
+        try:
+            os.killpg(-self.group, signal.SIGKILL)
+            while True:
+                os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS)
+        except (ProcessLookupError, ChildProcessError):
+            return
 
     # -- waiting
 
