@@ -17,6 +17,8 @@ _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
     "sitl": ("mavfi_cli.cli.sitl", "The simulated vehicle alone, for any MAVLink client."),
     "world": ("mavfi_cli.cli.world", "List, make, check and draw worlds."),
+    "replay": ("mavfi_cli.cli.replay", "Repeat a run and compare the records."),
+    "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),
     "show": ("mavfi_cli.cli.show", "Read a run and say what happened."),
     "doctor": ("mavfi_cli.cli.doctor", "Test this machine: what works here, and why not."),
 }

@@ -11,6 +11,10 @@ import click
 if TYPE_CHECKING:
     from mavfi_cli.mission.config import MissionConfig
 
+_FAULT_OPTIONS = (
+    "at", "bits", "field", "exact_bits", "effect", "persistence", "duration_s", "period_s",
+    "together",
+)  # fmt: skip
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
@@ -72,6 +76,29 @@ class _Size(click.ParamType[Any]):
               help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
 @click.option("--land/--no-land", default=None,
               help="Land and disarm at the goal  [only with --link].")  # fmt: skip
+@click.option("--inject", metavar="STAGE|STATE|GROUP",
+              help="Corrupt a state: perception, planning or control draws one of that stage; "
+                   "or name a state or group, as `mavfi states` lists them.")  # fmt: skip
+@click.option("--at", default="random", show_default=True,
+              metavar="random|time=S|tick=N|phase=NAME|invocation=N",
+              help="When the fault strikes, counted from the companion's taking over.")  # fmt: skip
+@click.option("--bits", default=1, show_default=True, help="How many bits are flipped.")
+@click.option("--field", default="any", show_default=True,
+              help="Of which field: sign, exponent, mantissa, any.")  # fmt: skip
+@click.option("--bit", "exact_bits", multiple=True, type=int,
+              help="This bit instead of drawn ones. May be repeated.")  # fmt: skip
+@click.option("--effect", default="flip", show_default=True, help="flip, zero, random.")
+@click.option("--persistence", default="transient", show_default=True,
+              help="transient, stuck-at, intermittent.")  # fmt: skip
+@click.option("--duration", "duration_s", type=float,
+              help="How long a stuck-at or intermittent fault lasts, s  [to the end].")  # fmt: skip
+@click.option("--period", "period_s", default=1.0, show_default=True,
+              help="Time between the strikes of an intermittent fault, s.")  # fmt: skip
+@click.option("--all-components", "together", is_flag=True,
+              help="Strike all states of the group at once, each with bits of its own.")  # fmt: skip
+@click.option(
+    "--fault-seed", default=1, show_default=True, help="Seed of all that is drawn for the fault."
+)
 @click.option("--isolate", multiple=True, metavar="NODE",
               help="Let a node work in its own process: point_cloud, octomap, collision_check, "
                    "planner. May be repeated; the record stays the same.")  # fmt: skip
@@ -117,12 +144,21 @@ def fly(
 
 def _config(options: dict[str, Any]) -> MissionConfig:
     from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.mission.fault_config import FaultConfig
 
+    asked = {name: options.pop(name) for name in _FAULT_OPTIONS}
+    target, seed = options.pop("inject"), options.pop("fault_seed")
+    fault = None
+    if target is not None:
+        exact = asked.pop("exact_bits") or None
+        fault = FaultConfig(target=target, seed=seed, exact_bits=exact, **asked)
+        fault.draw()  # says now what is wrong with it
     columns, rows = options.pop("camera")
     land = options.pop("land")
     return MissionConfig(
         camera_columns=columns,
         camera_rows=rows,
+        fault=fault,
         land=options["link"] is not None if land is None else land,
         **options,
     )

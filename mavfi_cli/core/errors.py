@@ -11,8 +11,10 @@ MavfiError                      one known error, one line, exit code 1
 │   ├── CommandRefused          the autopilot said no, in its own words
 │   └── LinkLost                the peer fell silent or closed the connection
 ├── VehicleProcessError         the simulated vehicle could not start or ended early
+├── NodeCrashed                 a node of the companion died; the mission's outcome is `crash`
 ├── RecordError                 a run folder that cannot be written or read
 ├── FaultError                  a fault that cannot be described, placed or repeated
+│   ├── FaultSpecError          a fault description that makes no sense
 │   ├── BitOutsideWidth         a bit that the type or register does not have
 │   ├── FieldUnavailable        a field (sign, exponent, mantissa) that the type has not
 │   ├── TracingForbidden        ptrace refused; says how to allow it
@@ -132,6 +134,10 @@ class RecordError(MavfiError):
 
 class FaultError(MavfiError):
     """A fault that cannot be described, placed or repeated."""
+
+
+class FaultSpecError(FaultError):
+    """A fault description that makes no sense."""
 
 
 class BitOutsideWidth(FaultError):

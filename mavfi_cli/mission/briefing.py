@@ -26,6 +26,7 @@ MARGIN_M = 30.0  # round home and goal, where no world says how far it reaches
 class Briefing:
     """Goal, where one may fly, and camera."""
 
+    start_enu_m: FloatArray  # (3,) on the ground
     goal_enu_m: FloatArray  # (3,)
     bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax that plans keep to
     camera_offset_flu_m: FloatArray  # (3,) of the optical centre from the vehicle's centre
@@ -41,6 +42,7 @@ def of_simulation(folder: Path) -> Briefing:
     try:
         data = json.loads((folder / FILE).read_text())
         return Briefing(
+            start_enu_m=np.array(data["start_enu_m"], dtype=np.float64),
             goal_enu_m=np.array(data["goal_enu_m"], dtype=np.float64),
             bounds_enu_m=_flight_bounds(data["bounds_enu_m"]),
             camera_offset_flu_m=np.array(data["camera_offset_flu_m"], dtype=np.float64),
@@ -60,6 +62,7 @@ def of_config(config: MissionConfig) -> Briefing:
     goal = np.array(config.goal)
     low, high = np.minimum(goal, 0.0) - MARGIN_M, np.maximum(goal, 0.0) + MARGIN_M
     return Briefing(
+        start_enu_m=np.zeros(3),
         goal_enu_m=goal,
         bounds_enu_m=_flight_bounds([*low, *high]),
         camera_offset_flu_m=np.zeros(3),

@@ -28,9 +28,11 @@ from mavfi_cli.core.types import (
     VehicleState,
 )
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.fi.source.injector import Moment
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor
+from mavfi_cli.mission.injection import Injection, NoInjection
 from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
 
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
@@ -63,9 +65,11 @@ class Companion:
         planner: Planner,
         briefing: Briefing,
         wall: WallClock,
+        injection: Injection | NoInjection,
     ) -> None:
         self._config = config
         self._planner = planner
+        self._injection = injection
         v_max, a_max = config.v_max_mps, config.a_max_mps2
         self.pilot = Pilot(
             PilotParams(
@@ -105,6 +109,8 @@ class Companion:
         self.plans: list[Trajectory] = []
         self.reactions: list[Reaction] = []
         self._fresh_frame_s: float | None = None
+        self._takeover_s: float | None = None
+        self._ticks = 0
 
     # Kernels as nodes run them: (input, start stamp) -> output
 
@@ -170,12 +176,14 @@ class Companion:
         self._snapshot = snapshot
         self._check()
 
-    def _take_report(self, checked: tuple[CollisionReport, float], _stamp_s: float) -> None:
-        self.report, self._fresh_frame_s = checked
+    def _take_report(self, checked: tuple[CollisionReport, float], stamp_s: float) -> None:
+        report, self._fresh_frame_s = checked
+        self.report = self._injection.pass_on(report, self._moment(stamp_s))
         self.pilot.on_report(self.report)
 
-    def _take_plan(self, result: Trajectory | PlanFailure, _stamp_s: float) -> None:
+    def _take_plan(self, result: Trajectory | PlanFailure, stamp_s: float) -> None:
         if isinstance(result, Trajectory):
+            result = self._injection.pass_on(result, self._moment(stamp_s))
             self.plans.append(result)
         self.pilot.on_plan(result)
 
@@ -202,8 +210,15 @@ class Companion:
 
         `executor.advance(stamp_s)` comes before it and `executor.compute()` after it.
         """
+        if self._takeover_s is None:
+            self._takeover_s = stamp_s
         if not self.sees:
             return None
+        self._ticks += 1
+        if self.pilot.trajectory is not None:
+            self.pilot.trajectory = self._injection.strike_latched(
+                self.pilot.trajectory, self._moment(stamp_s), self._waypoint()
+            )
         directive = self.directive = self.pilot.update(stamp_s, state)
         if directive.plan is not None:
             assert self._snapshot is not None
@@ -240,12 +255,26 @@ class Companion:
         return latency_s if latency_s >= SAME_TICK_S else 0.0
 
     def _take_command(self, stamp_s: float, command: Command) -> None:
-        self.command = command
+        self.command = self._injection.pass_on(command, self._moment(stamp_s))
         if self._fresh_frame_s is not None:
             self.reactions.append(
                 Reaction(frame_stamp_s=self._fresh_frame_s, setpoint_stamp_s=stamp_s)
             )
             self._fresh_frame_s = None
+
+    def _moment(self, stamp_s: float) -> Moment:
+        takeover_s = stamp_s if self._takeover_s is None else self._takeover_s
+        return Moment(
+            stamp_s=stamp_s,
+            flight_s=stamp_s - takeover_s,
+            tick=self._ticks,
+            phase=self.pilot.mode.value,
+        )
+
+    def _waypoint(self) -> int:
+        """Index of the waypoint that is followed at present."""
+        assert self.pilot.trajectory is not None
+        return max(0, waypoint_index(self.pilot.trajectory, self.pilot.time_s))
 
     @property
     def tracked(self) -> tuple[Trajectory, int] | None:
@@ -253,7 +282,7 @@ class Companion:
         trajectory = self.pilot.trajectory
         if trajectory is None or not len(trajectory.waypoints):
             return None
-        return trajectory, max(0, waypoint_index(trajectory, self.pilot.time_s))
+        return trajectory, self._waypoint()
 
     @property
     def mode(self) -> Mode:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.mission.fault_config import FaultConfig
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner")
 Vector3 = tuple[float, float, float]
@@ -23,6 +24,7 @@ class MissionConfig:
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
         realtime: pace the simulated vehicle by the wall clock.
         land: land and disarm after the goal was reached.
+        fault: what to inject; None for a golden flight.
         isolate: nodes that work in processes of their own; changes nothing in the record.
     """
 
@@ -46,6 +48,7 @@ class MissionConfig:
     realtime: bool = False
     link: str | None = None
     land: bool = False
+    fault: FaultConfig | None = None
     isolate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -30,6 +30,7 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.events import EventLog
+from mavfi_cli.mission.injection import Injection, NoInjection
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Progress, Watcher
 from mavfi_cli.mission.trace import Trace
@@ -75,6 +76,7 @@ class Flight:
         self._on_clock = config.link is None
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
+        self.injection: Injection | NoInjection = NoInjection()
         self.log = EventLog(watcher)
         self.trace = Trace()
         self.wall = WallClock()
@@ -108,7 +110,18 @@ class Flight:
     def brief(self, briefing: Briefing) -> None:
         """Tell where the goal is and how the camera is mounted; makes the companion ready."""
         self._briefing = briefing
-        self.companion = Companion(self._config, self._platform, self._planner, briefing, self.wall)
+        fault = self._config.fault
+        if fault is not None:
+            self.injection = Injection(fault, self._shortest_flight_s(briefing))
+        self.companion = Companion(
+            self._config, self._platform, self._planner, briefing, self.wall, self.injection
+        )
+
+    def _shortest_flight_s(self, briefing: Briefing) -> float:
+        """No flight takes less: straight to the edge of the goal's tolerance at full speed."""
+        start = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
+        distance_m = float(np.linalg.norm(briefing.goal_enu_m - start))
+        return max(0.0, distance_m - self._config.goal_tolerance_m) / self._config.v_max_mps
 
     @contextlib.contextmanager
     def isolated_nodes(self) -> Iterator[None]:
@@ -318,6 +331,8 @@ class Flight:
         if session.phase is Phase.TAKING_OFF and not self._camera_asked:
             self._camera_asked = True
             session.camera.start(1.0 / self._config.camera_rate_hz)
+        for text in self.injection.news():
+            self._note("fault", text)
         companion = self.companion
         if companion is not None and companion.mode is not self._mode:
             self._tell_mode(companion)

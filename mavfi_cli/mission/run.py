@@ -73,6 +73,7 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
                 raise
             name = Path(config.world).stem if config.link is None else "link"
             folder = new_run_folder(out, f"{name}-{config.seed}")
+            flight.injection.begin(folder.fault)
             flight_begun = time.perf_counter()
             with flight.isolated_nodes():
                 crash = _fly(flight, folder)
@@ -201,13 +202,14 @@ def _write(
         "outcome": flight.outcome.value,
         "reason": flight.reason,
         "config": config.to_dict(),
-        "seeds": {"root": config.seed},
+        "seeds": {"root": config.seed, "fault": config.fault.seed if config.fault else None},
         "simulated_s": flight.end_s,
         "quality_of_flight": qof.to_dict(),
         **flight.statistics(),
         "response_time_s": response_times(companion.reactions if companion else []),
         "events": flight.log.to_list(),
         "plans": flight.plan_lines(),
+        "fault": flight.injection.finish(),
         "goal_enu_m": None if goal is None else goal.tolist(),
         "world": None if referee is None else referee["world"],
         "referee": None if referee is None else {k: v for k, v in referee.items() if k != "world"},

@@ -18,6 +18,7 @@ RESULT = "result.json"
 TRACE = "trace.parquet"
 TLOG = "flight.tlog"
 PICTURE = "flight.svg"
+FAULT = "fault.json"
 CRASH = "crash.txt"
 
 
@@ -46,6 +47,11 @@ class RunFolder:
     def picture(self) -> Path:
         """Top view of the flight."""
         return self.path / PICTURE
+
+    @property
+    def fault(self) -> Path:
+        """The fault record, on disk before the fault strikes."""
+        return self.path / FAULT
 
     def write_result(self, result: dict[str, Any]) -> None:
         """Write result.json atomically."""

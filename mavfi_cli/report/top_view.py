@@ -26,7 +26,8 @@ _MARKS: dict[str, dict[str, Any]] = {
     "slow": {"marker": "v", "s": 30, "facecolors": "#f2b134", "edgecolors": "#222831"},
     "stop": {"marker": "s", "s": 26, "facecolors": "#e4572e", "edgecolors": "#222831"},
 }
-_LABELS = {"replan": "new plan", "slow": "slows down", "stop": "stops"}
+_MARKS["fault"] = {"marker": "*", "s": 130, "facecolors": "#c22f2f", "edgecolors": "white"}
+_LABELS = {"fault": "fault", "replan": "new plan", "slow": "slows down", "stop": "stops"}
 
 
 def write_top_view(run: Run, path: Path) -> None:

@@ -19,6 +19,7 @@ def write_briefing(simulation: Simulation, folder: Path) -> None:
     """
     world = simulation.referee.world
     briefing = {
+        "start_enu_m": world.start_enu_m.tolist(),
         "goal_enu_m": world.goal_enu_m.tolist(),
         "bounds_enu_m": world.bounds_enu_m.tolist(),
         "camera_offset_flu_m": [float(c) for c in simulation.camera.optics.mount_offset_flu_m],

@@ -1,0 +1,1 @@
+"""Source-level faults: bit flips in the states that one kernel hands to the next."""

@@ -1,0 +1,100 @@
+"""What a user asks to be injected, as plain values that a record can hold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from mavfi_cli.core.errors import FaultSpecError, UnknownName
+from mavfi_cli.fi.bits import Field
+from mavfi_cli.fi.source.draw import draw_fault
+from mavfi_cli.fi.source.fault import (
+    Corruption,
+    Effect,
+    Persistence,
+    SourceFault,
+    Trigger,
+    When,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultConfig:
+    """One source-level fault of a mission.
+
+    Attributes:
+        target: a stage, a state, or a group of states.
+        seed: root of the fault's own random streams.
+        at: "random", "time=SECONDS", "tick=N", "phase=NAME" or "invocation=N".
+        together: strike all components of the group at once.
+        exact_bits: these bits instead of drawn ones.
+    """
+
+    target: str
+    seed: int = 1
+    at: str = "random"
+    together: bool = False
+    effect: str = "flip"
+    bits: int = 1
+    field: str = "any"
+    exact_bits: tuple[int, ...] | None = None
+    persistence: str = "transient"
+    duration_s: float | None = None  # None: to the end
+    period_s: float = 1.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for the record of the run."""
+        return asdict(self)
+
+    def draw(self) -> SourceFault:
+        """The fault, its site drawn.
+
+        Raises:
+            UnknownName: a name that does not exist.
+            FaultError: values that do not fit.
+        """
+        duration_s = math.inf if self.duration_s is None else self.duration_s
+        return draw_fault(
+            self.target,
+            seed=self.seed,
+            trigger=parse_trigger(self.at),
+            corruption=Corruption(
+                effect=_member(Effect, "effect", self.effect),
+                bits=self.bits,
+                field=_member(Field, "field", self.field),
+                persistence=_member(Persistence, "persistence", self.persistence),
+                duration_s=duration_s,
+                period_s=self.period_s,
+            ),
+            together=self.together,
+            bits=self.exact_bits,
+        )
+
+
+def parse_trigger(text: str) -> Trigger:
+    """The trigger that a text like `time=12.5` stands for.
+
+    Raises:
+        UnknownName: no such kind of trigger, or no such phase.
+        FaultSpecError: a number that is none.
+    """
+    from mavfi_cli.autonomy.pilot import Mode
+
+    kind, _, value = text.partition("=")
+    when: When = _member(When, "trigger", kind)
+    if when is When.RANDOM:
+        return Trigger()
+    if when is When.PHASE:
+        return Trigger(when=when, phase=_member(Mode, "phase", value).value)
+    try:
+        return Trigger(when=when, number=float(value))
+    except ValueError:
+        raise FaultSpecError(f"{text!r}: {kind} needs a number, as in {kind}=12") from None
+
+
+def _member(kind: Any, what: str, name: str) -> Any:
+    try:
+        return kind(name)
+    except ValueError:
+        raise UnknownName(what, name, [member.value for member in kind]) from None

@@ -1,0 +1,127 @@
+"""A fault's way through a mission: the injector, and the record that outlives the flight."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mavfi_cli.core.files import write_json
+from mavfi_cli.core.types import CollisionReport, Command, Trajectory
+from mavfi_cli.fi.source.fault import SourceFault
+from mavfi_cli.fi.source.injector import Moment, SourceInjector, Strike
+from mavfi_cli.mission.fault_config import FaultConfig
+
+M = TypeVar("M", CollisionReport, Trajectory, Command)
+
+SCHEMA = 1
+
+
+class NoInjection:
+    """The null object: every message goes on as it is."""
+
+    def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
+        """The message itself."""
+        return message
+
+    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
+        """The trajectory itself."""
+        return trajectory
+
+    def begin(self, path: Path) -> None:
+        """Nothing to record."""
+
+    def news(self) -> list[str]:
+        """Nothing to tell."""
+        return []
+
+    def finish(self) -> dict[str, Any] | None:
+        """No record."""
+        return None
+
+
+class Injection:
+    """One source-level fault in one mission.
+
+    Args:
+        config: as asked for.
+        shortest_flight_s: the time over which a random trigger is drawn.
+    """
+
+    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
+        self._config = config
+        self._fault: SourceFault = config.draw()
+        self._injector = SourceInjector(
+            self._fault,
+            seed=config.seed,
+            shortest_flight_s=shortest_flight_s,
+            listener=self._on_strike,
+        )
+        self._path: Path | None = None
+        self._state = "planned"
+        self._news: list[str] = []
+        self.pass_on = self._injector.pass_on
+        self.strike_latched = self._injector.strike_latched
+
+    def begin(self, path: Path) -> None:
+        """Write down what is going to happen, before the flight."""
+        self._path = path
+        write_json(path, self.record())
+
+    def news(self) -> list[str]:
+        """What was done since the last call, a line each."""
+        told, self._news = self._news, []
+        return told
+
+    def _on_strike(self, strike: Strike) -> None:
+        """The first strike reaches the disk before its message goes on."""
+        if self._state == "planned":
+            self._news.append(strike_text(strike))
+            self._state = "applied"
+            if self._path is not None:
+                write_json(self._path, self.record())
+
+    def finish(self) -> dict[str, Any] | None:
+        """The record at the end of the mission, written down as well."""
+        if self._state == "planned":
+            self._state = "not_injected"
+        if self._path is not None:
+            write_json(self._path, self.record())
+        return self.record()
+
+    def record(self) -> dict[str, Any]:
+        """What was asked for, what was drawn, what was hit."""
+        fault = self._fault
+        reason = "the mission ended before the trigger" if self._state == "not_injected" else ""
+        return {
+            "schema": SCHEMA,
+            "level": "source",
+            "state": self._state,
+            "reason": reason,
+            "request": self._config.to_dict(),
+            "stage": fault.states[0].stage.value,
+            "states": [state.name for state in fault.states],
+            "units": [state.unit for state in fault.states],
+            "trigger": {
+                "when": fault.trigger.when.value,
+                "number": fault.trigger.number,
+                "phase": fault.trigger.phase,
+                "drawn_time_s": self._injector.drawn_time_s,
+            },
+            "strikes": [asdict(strike) for strike in self._injector.strikes],
+            "strike_count": self._injector.count,
+        }
+
+
+def strike_text(strike: Strike) -> str:
+    """What a strike changed, in one line."""
+    changes = [
+        f"{c.state}: {_value(c.before)} -> {_value(c.after)} "
+        f"(bit{'s' if len(c.bits) != 1 else ''} {', '.join(map(str, c.bits)) or 'none'})"
+        for c in strike.changes
+    ]
+    return "fault in " + "; ".join(changes)
+
+
+def _value(value: float | int | bool) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,122 @@
+"""Repeat a run from its record, and say where two runs part."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.run_folder import Run
+
+HOST_SECTION = "host"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parting:
+    """The first value in which two runs differ."""
+
+    stamp_s: float
+    column: str
+    this: Any
+    other: Any
+
+
+def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
+    """The mission that a run flew, ready to be flown again.
+
+    Raises:
+        RecordError: it flew a foreign autopilot, which nothing here can repeat.
+    """
+    values = dict(run.result["config"])
+    if values.get("link") is not None:
+        raise RecordError(f"{run.folder.path}: a flight of a foreign autopilot does not repeat")
+    if not with_fault:
+        values["fault"] = None
+    return structure(values, MissionConfig, path=run.folder.result)
+
+
+def version_differences(run: Run, versions: dict[str, str]) -> list[str]:
+    """Which libraries differ between a record and this installation, a phrase each."""
+    recorded = run.result["versions"]
+    return [
+        f"{name} was {recorded.get(name, 'absent')}, is {versions.get(name, 'absent')}"
+        for name in sorted({*recorded, *versions})
+        if recorded.get(name) != versions.get(name)
+    ]
+
+
+def differing_results(this: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """The sections of two results that differ; the host's does not count."""
+    keys = sorted({*this, *other} - {HOST_SECTION})
+    return [key for key in keys if this.get(key) != other.get(key)]
+
+
+def first_difference(this: Run, other: Run, *, truth: bool = False) -> Parting | None:
+    """Where the traces of two runs first differ; None where they never do.
+
+    Within one tick the columns are compared in the order of the pipeline: perception, planning,
+    control, then the vehicle. The referee's truth is left out unless asked for.
+
+    Raises:
+        RecordError: one of them has no trace.
+    """
+    if this.trace is None or other.trace is None:
+        raise RecordError(f"{(this if this.trace is None else other).folder.path}: no trace")
+    from mavfi_cli.core.states import BY_NAME
+
+    columns = [name for name in BY_NAME if name in this.trace.column_names]
+    columns += [c for c in this.trace.column_names if c not in BY_NAME and c != "stamp_s"]
+    if not truth:
+        columns = [c for c in columns if not c.startswith(("truth_", "power_"))]
+    rows = min(this.trace.num_rows, other.trace.num_rows)
+    first: tuple[int, str] | None = None
+    for column in columns:
+        a = this.trace[column].slice(0, rows).to_pylist()
+        b = other.trace[column].slice(0, rows).to_pylist()
+        limit = rows if first is None else first[0]
+        for row in range(limit):
+            if not _same(a[row], b[row]):
+                first = (row, column)
+                break
+    if first is None:
+        return None
+    row, column = first
+    return Parting(
+        stamp_s=this.trace["stamp_s"][row].as_py(),
+        column=column,
+        this=this.trace[column][row].as_py(),
+        other=other.trace[column][row].as_py(),
+    )
+
+
+def _same(a: Any, b: Any) -> bool:
+    return bool(a == b) or (isinstance(a, float) and isinstance(b, float) and a != a and b != b)
+
+
+def same_file(this: Path, other: Path) -> bool:
+    """Whether two files have the same bytes."""
+    return this.read_bytes() == other.read_bytes()
+
+
+def without_fault(config: MissionConfig) -> MissionConfig:
+    """The paired golden mission: same world, seed and noise."""
+    return dataclasses.replace(config, fault=None)
+
+
+def largest_deviation_m(this: Run, other: Run) -> float:
+    """How far the two vehicles were apart at most, at equal stamps, m."""
+    if this.trace is None or other.trace is None:
+        return float("nan")
+    rows = min(this.trace.num_rows, other.trace.num_rows)
+    places = [
+        np.column_stack([run.trace[c].slice(0, rows).to_numpy() for c in ("x_m", "y_m", "z_m")])
+        for run in (this, other)
+        if run.trace is not None
+    ]
+    return float(np.linalg.norm(places[0] - places[1], axis=1).max(initial=0.0))
