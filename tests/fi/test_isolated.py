@@ -22,6 +22,7 @@ from mavfi_cli.fi.isolated.program import (
     run_fault,
 )
 from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.fault import (
     InstructionFault,
     Role,
@@ -188,6 +189,17 @@ def test_sampled_invocations_say_that_they_are_a_sample(target, workplace):
     campaign = run_campaign(Plan(target=program, runs=6, seed=5, windows=4))
     assert campaign.summary()["windows"] == "4 of 50"
     assert {run.record["symbol"].split("+")[0] for run in campaign.runs} == {"body"}
+
+
+def test_debug_registers_give_the_same_faults_and_outcomes(target):
+    """Where counted breakpoints are forbidden nothing but the time changes."""
+
+    def essence(mechanism):
+        program = target("counting", "12", function="body", mechanism=mechanism)
+        campaign = run_campaign(Plan(target=program, runs=10, seed=5, windows=3))
+        return [(r.result.fault, r.result.outcome, r.result.output_sha256) for r in campaign.runs]
+
+    assert essence(Mechanism.PERF) == essence(Mechanism.DEBUG)
 
 
 @pytest.mark.parametrize("options", [{"rule": "cpu-time"}, {"compat": "rosfi-2021"}])

@@ -14,13 +14,14 @@ from mavfi_cli.fi.native.arch.decode import decode
 from mavfi_cli.fi.native.fault import InstructionFault, Role, Stage, explicit_corruption
 from mavfi_cli.fi.native.image import Image, Location, executable_mapping
 from mavfi_cli.fi.native.inject import Activation
-from mavfi_cli.fi.native.node import attack, profile_invocation
+from mavfi_cli.fi.native.node import attack, count_executions, profile_invocation
 from mavfi_cli.fi.native.profile import Profile
 from mavfi_cli.fi.sampling import draw_fault, strategy
 
 KERNEL = """
+__attribute__((noinline)) double inner(double x) { return x * x; }
 double kernel(const double *x, int n) {
-    double s = 0; for (int i = 0; i < n; i++) s += x[i] * x[i]; return s;
+    double s = 0; for (int i = 0; i < n; i++) s += inner(x[i]); return s;
 }
 """
 NODE = """
@@ -118,9 +119,24 @@ def test_an_invocation_is_profiled_and_the_node_goes_on(node):
     found = profiled(node, 3)
     assert found.segment.start == (Stage(entry_of(node), 3),)
     texts = {found.image.symbol(found.image.locate(int(a))) for a in found.segment.trace}
-    assert all(text.startswith("kernel+") for text in texts)
+    assert {text.split("+")[0] for text in texts} >= {"kernel", "inner"}
     assert len(found.segment.trace) > 3 * 4
     assert ask(node, 3, 4) == 25.0
+
+
+def test_a_large_kernel_is_profiled_by_sample(node):
+    entry = entry_of(node)
+    inner = Image(node.pid).function("inner", ["libkernel.so"])
+    tracer = Tracer(count_executions, node.pid, entry, 2, inner)
+    assert [ask(node, 1, 2, 3), ask(node, 1, 2, 3, 4)] == [14.0, 30.0]
+    assert tracer.result() == 4
+    stages = (Stage(inner, 3),)
+    tracer = Tracer(profile_invocation, node.pid, entry, 1, objects=("libkernel.so",), inner=stages)
+    assert ask(node, 1, 2, 3) == 14.0
+    found = tracer.result()
+    assert found.segment.start == (Stage(entry, 1), *stages)
+    assert len(found.segment.trace) == 2  # mulsd, ret
+    assert ask(node, 1, 2) == 5.0
 
 
 def test_a_fault_hits_exactly_its_invocation(node, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import FaultError, UnknownName
-from mavfi_cli.fi.native.breakpoints import ExecutionCounter
+from mavfi_cli.fi.native.breakpoints import ExecutionCounter, Mechanism
 from mavfi_cli.fi.native.fault import FaultModel, Site
 from mavfi_cli.fi.native.image import Image, scope_of
 from mavfi_cli.fi.native.inject import clean_step, instruction_at
@@ -73,8 +73,9 @@ def test_a_function_window_ends_with_its_return(start):
     assert tracee.registers.read("rdi") == 7
 
 
-def test_a_function_called_from_foreign_code_ends_there_too(start):
-    tracee = start("sorting")
+@pytest.mark.parametrize("mechanism", list(Mechanism))
+def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism):
+    tracee = start("sorting", mechanism=mechanism)
     image = Image(tracee.pid)
     compare = image.address(image.function("compare", ["sorting"]))
     assert tracee.run_to(compare, 2)

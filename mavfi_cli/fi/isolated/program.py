@@ -17,7 +17,7 @@ from mavfi_cli.fi.isolated.compare import Comparison, digest, magnitude
 from mavfi_cli.fi.isolated.outcome import Outcome
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.alarm import Alarm
-from mavfi_cli.fi.native.breakpoints import ExecutionCounter, Mechanism
+from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.fault import InstructionFault, Stage
 from mavfi_cli.fi.native.image import Image, Location, Scope, scope_of
 from mavfi_cli.fi.native.inject import (
@@ -240,12 +240,7 @@ def _invocations(target: ProgramTarget, place: Workplace) -> tuple[Location, int
         image = Image(tracee.pid)
         assert target.function is not None
         entry = image.function(target.function, target.scope_objects)
-        counter = ExecutionCounter(tracee.tid, image.address(entry))
-        try:
-            tracee.resume()
-            count = counter.read()
-        finally:
-            counter.close()
+        count = tracee.count_to_end(image.address(entry))
     finally:
         tracee.kill()
     if not count:

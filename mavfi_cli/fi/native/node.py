@@ -17,6 +17,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.fi import record
+from mavfi_cli.fi.native.breakpoints import ExecutionCounter
 from mavfi_cli.fi.native.fault import InstructionFault, Stage
 from mavfi_cli.fi.native.image import Image, Location, scope_of
 from mavfi_cli.fi.native.inject import (
@@ -29,7 +30,7 @@ from mavfi_cli.fi.native.inject import (
     reach,
 )
 from mavfi_cli.fi.native.profile import Segment, record_window
-from mavfi_cli.fi.native.tracee import Ended, Tracee
+from mavfi_cli.fi.native.tracee import Ended, Tracee, stack_word
 
 Notice = Callable[[], None]
 
@@ -68,10 +69,14 @@ def profile_invocation(
     *,
     objects: tuple[str, ...],
     regions: Mapping[str, range] | None = None,
+    inner: tuple[Stage, ...] = (),
     limit: int = 2_000_000,
     armed: Notice | None = None,
 ) -> InvocationProfile:
-    """Step one invocation of a kernel in a fault-free node.
+    """Step one invocation of a kernel in a fault-free node, or of a function inside it.
+
+    A kernel of many million instructions is profiled by sample: count the calls of a function
+    inside it (`count_executions`), draw some uniformly, and profile each with `inner`.
 
     Args:
         pid: the node, single-threaded as far as code in scope goes.
@@ -79,6 +84,8 @@ def profile_invocation(
         invocation: which one from now on, from 1.
         objects: in scope.
         regions: addresses of compiled code without a file, by name; may be in `objects`.
+        inner: further stages after the kernel's entry; the last is a function's entry, and the
+            window is that function's invocation.
         limit: refuse longer invocations.
         armed: called once the node runs towards the invocation.
 
@@ -91,16 +98,58 @@ def profile_invocation(
         image = Image(pid, regions)
         scope = scope_of(image, objects)
         code = tuple((s.start, tracee.read_memory(s.start, len(s) + 16)) for s in scope.spans)
-        start = Stage(entry, invocation)
+        start = (Stage(entry, invocation), *inner)
         if armed is not None:
             armed()
-        if not tracee.run_to(image.address(entry), invocation):
-            raise TargetError(f"node {pid}", f"ended before invocation {invocation} of {entry}")
+        _run_through(tracee, image, start)
         trace = record_window(tracee, scope, limit=limit, program=f"node {pid}", until_return=True)
     finally:
         if tracee.ended is None:
             tracee.detach()
-    return InvocationProfile(segment=Segment(start=(start,), trace=trace), image=image, code=code)
+    return InvocationProfile(segment=Segment(start=start, trace=trace), image=image, code=code)
+
+
+def count_executions(
+    pid: int,
+    entry: Location,
+    invocation: int,
+    what: Location,
+    *,
+    regions: Mapping[str, range] | None = None,
+    armed: Notice | None = None,
+) -> int:
+    """How often an instruction executes during one invocation of a kernel.
+
+    Raises:
+        TargetError: the node ends before.
+        OSError: the system does not count executions for us.
+    """
+    tracee = Tracee.attach(pid)
+    try:
+        image = Image(pid, regions)
+        if armed is not None:
+            armed()
+        _run_through(tracee, image, (Stage(entry, invocation),))
+        tracee.registers.rearm()
+        back, top = stack_word(tracee), tracee.registers.sp
+        counter = ExecutionCounter(tracee.tid, image.address(what))
+        try:
+            while tracee.run_to(back) and tracee.registers.sp <= top:
+                tracee.step()  # a deeper return to the same place
+            return counter.read()
+        finally:
+            counter.close()
+    finally:
+        if tracee.ended is None:
+            tracee.detach()
+
+
+def _run_through(tracee: Tracee, image: Image, stages: tuple[Stage, ...]) -> None:
+    for stage in stages:
+        if not tracee.run_to(image.address(stage.location), stage.count):
+            raise TargetError(
+                f"node {tracee.pid}", f"ended before execution {stage.count} of {stage.location}"
+            )
 
 
 def attack(

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.arch import TRAITS
-from mavfi_cli.fi.native.breakpoints import PerfBreakpoint
 from mavfi_cli.fi.native.fault import Stage
 from mavfi_cli.fi.native.image import Location, Scope
 from mavfi_cli.fi.native.inject import clean_step, instruction_at
@@ -147,7 +146,7 @@ class _Blanket:
     def run_native(self, stop: NDArray[np.int64]) -> bool:
         """Run foreign code; False where the program ended or the window's function returned."""
         tracee = self._tracee
-        guard = PerfBreakpoint(tracee.tid, int(stop[0]), 1) if self._guarded(stop) else None
+        guard = tracee.breakpoint_at(int(stop[0])) if self._guarded(stop) else None
         try:
             self._write(covered=True)
             while True:

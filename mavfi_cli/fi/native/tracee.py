@@ -24,6 +24,7 @@ from mavfi_cli.fi.native.breakpoints import (
     TRAP_PERF,
     TRAP_TRACE,
     DebugBreakpoint,
+    ExecutionCounter,
     Mechanism,
     PerfBreakpoint,
     perf_allowed,
@@ -139,6 +140,32 @@ class Tracee:
         if self.mechanism is Mechanism.PERF:
             return self._run_to_counted(address, count)
         return self._run_to_stepwise(address, count)
+
+    def count_to_end(self, address: int) -> int:
+        """Run to the end of the program and count the executions of `address` on the way."""
+        self.registers.rearm()
+        if self.mechanism is Mechanism.PERF:
+            counter = ExecutionCounter(self.tid, address)
+            try:
+                while not isinstance(self.resume(), Ended):
+                    pass
+                return counter.read()
+            finally:
+                counter.close()
+        count = 0
+        breakpoint_ = self.breakpoint_at(address)
+        try:
+            while not isinstance(self.resume(), Ended):
+                count += self.registers.ip == address
+            return count
+        finally:
+            breakpoint_.close()
+
+    def breakpoint_at(self, address: int) -> PerfBreakpoint | DebugBreakpoint:
+        """A breakpoint that stops at the next execution of `address`, until it is closed."""
+        if self.mechanism is Mechanism.PERF:
+            return PerfBreakpoint(self.tid, address, 1)
+        return DebugBreakpoint(self.tid, address)
 
     def read_memory(self, address: int, size: int) -> bytes:
         """Bytes of the process's memory, whatever their protection.
