@@ -95,7 +95,7 @@ class _Size(click.ParamType[Any]):
 @click.option("--period", "period_s", default=1.0, show_default=True,
               help="Time between the strikes of an intermittent fault, s.")  # fmt: skip
 @click.option("--all-components", "together", is_flag=True,
-              help="Strike all states of the group at once, each with bits of its own.")  # fmt: skip
+              help="Strike all states of the group, each with its own bits.")  # fmt: skip
 @click.option(
     "--fault-seed", default=1, show_default=True, help="Seed of all that is drawn for the fault."
 )

@@ -11,17 +11,22 @@ import click
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print result.json as it is.")
+@click.option("--golden/--no-golden", default=True, show_default=True,
+              help="Fly the paired golden mission once, to say what the fault changed.")  # fmt: skip
 @click.option("--events", is_flag=True, help="Also list every event of the flight.")
-def show(run: Path, as_json: bool, events: bool) -> None:
+def show(run: Path, as_json: bool, golden: bool, events: bool) -> None:
     """Say what happened in RUN, a run folder."""
+    from mavfi_cli.mission.golden import paired_golden
     from mavfi_cli.mission.run_folder import load_run
-    from mavfi_cli.report.summary import event_lines, summary_lines
+    from mavfi_cli.report.summary import difference_lines, event_lines, summary_lines
 
     record = load_run(run)
     if as_json:
         click.echo(json.dumps(record.result, indent=2, sort_keys=True))
         return
     lines = summary_lines(record.result)
+    if golden and record.result.get("fault"):
+        lines += difference_lines(record, paired_golden(record))
     if events:
         lines += ["", "Events", *event_lines(record.result)]
     click.echo("\n".join(lines))

@@ -331,8 +331,8 @@ class Flight:
         if session.phase is Phase.TAKING_OFF and not self._camera_asked:
             self._camera_asked = True
             session.camera.start(1.0 / self._config.camera_rate_hz)
-        for text in self.injection.news():
-            self._note("fault", text)
+        for struck in self.injection.news():
+            self._note("fault", struck)
         companion = self.companion
         if companion is not None and companion.mode is not self._mode:
             self._tell_mode(companion)

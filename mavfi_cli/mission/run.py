@@ -213,7 +213,7 @@ def _write(
         "goal_enu_m": None if goal is None else goal.tolist(),
         "world": None if referee is None else referee["world"],
         "referee": None if referee is None else {k: v for k, v in referee.items() if k != "world"},
-        "versions": _versions(),
+        "versions": installed_versions(),
         "host": host,
     }
     write_trace(folder.trace, flight.trace.table(truth))
@@ -222,7 +222,8 @@ def _write(
     folder.write_result(result)
 
 
-def _versions() -> dict[str, str]:
+def installed_versions() -> dict[str, str]:
+    """Versions that a record depends on."""
     versions = {"mavfi": __version__, "python": sys.version.split()[0]}
     for name in _VERSIONS:
         versions[name] = importlib.metadata.version(name)

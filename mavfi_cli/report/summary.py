@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from mavfi_cli.mission.replay import first_difference, largest_deviation_m
+from mavfi_cli.mission.run_folder import Run
+
 _OUTCOMES = {
     "success": "SUCCESS: reached the goal",
     "collision": "COLLISION",
@@ -49,6 +52,7 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
         f"{counters['plans_failed']} failed; {counters['collisions_foreseen']} collisions "
         f"foreseen, {counters['slowdowns']} slow-downs, {counters['stops']} stops",
     ]
+    lines += fault_lines(result)
     response = result.get("response_time_s") or {}
     if response.get("median") is not None:
         lines.append(
@@ -71,3 +75,65 @@ def _kilo(value: float | None) -> float | None:
 def event_lines(result: dict[str, Any]) -> list[str]:
     """One line an event, with its simulated time."""
     return [f"{e['stamp_s']:9.2f} s  {e['kind']:<10} {e['text']}" for e in result["events"]]
+
+
+def fault_lines(result: dict[str, Any]) -> list[str]:
+    """What was to be hit, and what was."""
+    fault = result.get("fault")
+    if not fault:
+        return []
+    trigger = fault["trigger"]
+    when = {
+        "random": f"at a random moment ({trigger['drawn_time_s']:.2f} s into the flight)",
+        "time": f"{trigger['number']:g} s into the flight",
+        "tick": f"at control tick {trigger['number']:g}",
+        "phase": f"in the phase {trigger['phase']}",
+        "invocation": f"at invocation {trigger['number']:g} of the kernel",
+    }[trigger["when"]]
+    request = fault["request"]
+    lines = [
+        f"Fault       {fault['stage']} stage, {', '.join(fault['states'])}: "
+        f"{request['persistence']} {request['effect']}, {when}"
+    ]
+    if fault["state"] == "not_injected":
+        lines.append(f"            not injected: {fault['reason']}")
+    for strike in fault["strikes"][:3]:
+        lines += [_change_line(strike["stamp_s"], change) for change in strike["changes"]]
+    if fault["strike_count"] > 3:
+        lines.append(f"            and {fault['strike_count'] - 3} more strikes")
+    return lines
+
+
+def _change_line(stamp_s: float, change: dict[str, Any]) -> str:
+    place = f"[{change['index']}]" if change["state"].startswith("waypoint") else ""
+    bits = ", ".join(map(str, change["bits"])) or "none: the value was that already"
+    return (
+        f"            at {stamp_s:.2f} s: {change['state']}{place} "
+        f"{_value(change['before'])} -> {_value(change['after'])} (bit {bits})"
+    )
+
+
+def difference_lines(run: Run, golden: Run) -> list[str]:
+    """What a run did otherwise than its golden pair: first difference, and what became of it."""
+    parting = first_difference(run, golden)
+    if parting is None:
+        return ["Effect      none: no state differs from the golden flight (masked)"]
+    lines = [
+        f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
+        f"{_value(parting.this)} instead of {_value(parting.other)}",
+        f"            at most {largest_deviation_m(run, golden):.2f} m off the golden path",
+    ]
+    ours, theirs = run.result["quality_of_flight"], golden.result["quality_of_flight"]
+    if ours["flight_time_s"] and theirs["flight_time_s"]:
+        change = 100.0 * (ours["flight_time_s"] / theirs["flight_time_s"] - 1.0)
+        lines.append(
+            f"            {ours['flight_time_s']:.1f} s and {run.result['outcome']} instead of "
+            f"{theirs['flight_time_s']:.1f} s and {golden.result['outcome']} ({change:+.1f} %)"
+        )
+    return lines
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return "inf or nan"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,67 @@
+"""`mavfi replay`: fly a recorded mission again and hold the records against each other."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--without-fault", is_flag=True, help="Fly the paired golden mission instead.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
+              show_default=True, help="Where the new run folder goes.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
+def replay(run: Path, without_fault: bool, out: Path, as_json: bool) -> None:
+    """Repeat RUN, a run folder, and say whether the record is the same to the byte.
+
+    Exits with 1 where a repetition differs. With --without-fault a difference is the point: it is
+    what the fault did.
+    """
+    from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.replay import (
+        config_of,
+        differing_results,
+        first_difference,
+        same_file,
+        version_differences,
+    )
+    from mavfi_cli.mission.run import fly_mission, installed_versions
+    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.report.summary import difference_lines, outcome_line
+
+    recorded = load_run(run)
+    for text in version_differences(recorded, installed_versions()):
+        click.echo(f"warning: another build: {text}", err=True)
+    config = config_of(recorded, with_fault=not without_fault)
+    again = load_run(fly_mission(config, out, Watcher()).path)
+    identical = same_file(recorded.folder.trace, again.folder.trace) and not differing_results(
+        recorded.result, again.result
+    )
+    parting = first_difference(recorded, again, truth=True)
+    if as_json:
+        comparison = {
+            "run": str(recorded.folder.path),
+            "again": str(again.folder.path),
+            "identical": identical,
+            "outcomes": [recorded.result["outcome"], again.result["outcome"]],
+            "differing_sections": differing_results(recorded.result, again.result),
+            "first_difference": None
+            if parting is None
+            else {"stamp_s": parting.stamp_s, "column": parting.column},
+        }
+        click.echo(json.dumps(comparison, indent=2))
+    elif without_fault:
+        click.echo(f"with the fault     {outcome_line(recorded.result)}")
+        click.echo(f"without            {outcome_line(again.result)}")
+        click.echo("\n".join(difference_lines(recorded, again)))
+        click.echo(f"\nRun folder  {again.folder.path}")
+    else:
+        click.echo("identical" if identical else "DIFFERENT")
+        if not identical:
+            click.echo("\n".join(difference_lines(recorded, again)))
+        click.echo(f"Run folder  {again.folder.path}")
+    if not identical and not without_fault:
+        raise click.exceptions.Exit(1)

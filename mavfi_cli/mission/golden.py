@@ -1,0 +1,33 @@
+"""The golden flight that a faulty one is held against: the same mission without the fault."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import Run, load_run
+
+FOLDER = "golden"
+
+
+def paired_golden(run: Run) -> Run:
+    """The golden pair of a run: flown once, then kept in the run's folder.
+
+    Raises:
+        RecordError: the run does not repeat, or its folder cannot be written.
+    """
+    kept = run.folder.path / FOLDER
+    if not kept.is_dir():
+        config = config_of(run, with_fault=False)
+        with tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent:
+            flown = fly_mission(config, Path(parent), Watcher())
+            try:
+                shutil.move(flown.path, kept)
+            except OSError as error:
+                raise RecordError(f"{kept}: {error.strerror or error}") from None
+    return load_run(kept)
