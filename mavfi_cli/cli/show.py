@@ -12,7 +12,7 @@ import click
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print result.json as it is.")
 @click.option("--golden/--no-golden", default=True, show_default=True,
-              help="Fly the paired golden mission once, to say what the fault changed.")  # fmt: skip
+              help="Fly the golden pair once, to say what the fault changed.")  # fmt: skip
 @click.option("--events", is_flag=True, help="Also list every event of the flight.")
 def show(run: Path, as_json: bool, golden: bool, events: bool) -> None:
     """Say what happened in RUN, a run folder."""
