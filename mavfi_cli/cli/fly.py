@@ -51,7 +51,7 @@ class _Size(click.ParamType[Any]):
 @click.command()
 @click.option("--world", default="dense", show_default=True, metavar="NAME|FILE",
               help="A world, or a TOML file of boxes; `mavfi world list` shows them.")  # fmt: skip
-@click.option("--seed", default=1, show_default=True, help="Root seed of everything random.")
+@click.option("--seed", default=3, show_default=True, help="Root seed of everything random.")
 @click.option("--planner", default="rrtstar", show_default=True,
               help="rrtstar, rrt, rrtconnect, or a plug-in's name.")  # fmt: skip
 @click.option("--platform", default="x86", show_default=True, metavar="NAME|FILE",

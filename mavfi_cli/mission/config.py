@@ -29,7 +29,7 @@ class MissionConfig:
     """
 
     world: str = "dense"
-    seed: int = 1
+    seed: int = 3
     planner: str = "rrtstar"
     platform: str = "x86"
     vehicle: str = "solo"
@@ -65,6 +65,9 @@ class MissionConfig:
         for name, (value, low, high) in positive.items():
             if not (math.isfinite(value) and low <= value <= high):
                 raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
+        for name, place in (("start", self.start), ("goal", self.goal)):
+            if place is not None and not all(map(math.isfinite, place)):
+                raise ConfigError("must be three finite numbers", key=name)
         for node in self.isolate:
             if node not in ISOLATABLE:
                 raise UnknownName("node", node, ISOLATABLE)

@@ -45,7 +45,7 @@ def _size(_ctx: click.Context, _param: click.Parameter, value: str) -> tuple[int
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--world", "name", default="dense", show_default=True, metavar="NAME|FILE")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True)
 @click.option("--start", callback=_triple, metavar="X,Y,Z", help="As for the world, ENU m.")
 @click.option("--goal", callback=_triple, metavar="X,Y,Z", help="As for the world, ENU m.")
 @click.option(

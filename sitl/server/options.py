@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--world", default="dense", help="name, gen:density,size or TOML file (default: dense)")
-    add("--seed", type=int, default=1, help="of the world (default: 1)")
+    add("--seed", type=int, default=3, help="of the world (default: 3)")
     add("--vehicle", default="solo", help="profile name or TOML file (default: solo)")
     add("--start", type=_triple, metavar="X,Y,Z", help="start, east,north,up in m")
     add("--goal", type=_triple, metavar="X,Y,Z", help="goal, east,north,up in m")

@@ -44,7 +44,7 @@ class _Place(click.ParamType[tuple[float, ...]]):
 def _world_options(command: F) -> F:
     decorators = [
         click.argument("name", metavar="WORLD"),
-        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
+        click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True),
         click.option("--start", type=_Place(), help="Where flights start, ENU m."),
         click.option("--goal", type=_Place(), help="Where they go, ENU m."),
         click.option("--json", "as_json", is_flag=True, help="The result as JSON."),
