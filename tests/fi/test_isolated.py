@@ -24,8 +24,11 @@ from mavfi_cli.fi.isolated.program import (
 from mavfi_cli.fi.native.arch.decode import decode
 from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.fault import (
+    DATA_REGISTERS,
+    FaultModel,
     InstructionFault,
     Role,
+    Site,
     Stage,
     explicit_corruption,
 )
@@ -123,6 +126,22 @@ def test_the_same_fault_gives_the_same_output_20_times(target, workplace):
     assert {(r.injection.before, r.injection.after) for r in results} == {
         (run.result.injection.before, run.result.injection.after)
     }
+
+
+@pytest.mark.parametrize("sites", [DATA_REGISTERS, frozenset((Site.MEMORY,))])
+def test_what_was_overwritten_before_it_was_read_is_benign(target, sites):
+    """The fate that is told and the outcome that is seen are found out independently."""
+    model = FaultModel(roles=frozenset((Role.DESTINATION,)), sites=sites)
+    campaign = run_campaign(Plan(target=target("sorting"), runs=80, seed=3, model=model))
+    fates = {
+        (run.result.followed.activation, run.result.outcome)
+        for run in campaign.runs
+        if run.result.followed.activation is Activation.OVERWRITTEN
+    }
+    expected = set() if sites != DATA_REGISTERS else {(Activation.OVERWRITTEN, Outcome.BENIGN)}
+    assert fates - {(Activation.OVERWRITTEN, Outcome.BENIGN)} == set()
+    assert fates >= expected
+    assert {run.result.outcome for run in campaign.runs} > {Outcome.BENIGN}
 
 
 def test_a_null_injection_changes_nothing(target):

@@ -13,11 +13,13 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.errors import FaultError, RecordError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi import record
 from mavfi_cli.fi.isolated.outcome import Outcome, shares
@@ -140,15 +142,8 @@ def run_campaign(
         TargetError: the program cannot be attacked; says why.
     """
     start = time.perf_counter()
-    place = Workplace(plan.target)
-    try:
-        golden = golden_run(plan.target, place)
-        profiled = None
-        if plan.strategy().rule is Rule.INSTRUCTION:
-            rng = generator(plan.seed, Stream.FAULT, "profile")
-            profiled = profile_program(plan.target, place, rng, windows=plan.windows)
-    finally:
-        place.close()
+    with _one_processor():
+        golden, profiled = _prepare(plan)
     faults = _draw(plan, profiled)
     records = [_planned(plan, profiled, index, fault) for index, fault in enumerate(faults)]
     if folder is not None:
@@ -170,6 +165,29 @@ def run_campaign(
         runs=tuple(runs),
         wall_s=time.perf_counter() - start,
     )
+
+
+@contextmanager
+def _one_processor() -> Iterator[None]:
+    """Tracer and target hand over to each other all the time: fastest on one processor."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, [max(before)])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def _prepare(plan: Plan) -> tuple[Golden, Profiled | None]:
+    place = Workplace(plan.target)
+    try:
+        golden = golden_run(plan.target, place)
+        if plan.strategy().rule is not Rule.INSTRUCTION:
+            return golden, None
+        rng = generator(plan.seed, Stream.FAULT, "profile")
+        return golden, profile_program(plan.target, place, rng, windows=plan.windows)
+    finally:
+        place.close()
 
 
 def _outcome_of(result: RunResult) -> dict[str, Any]:
@@ -254,8 +272,7 @@ class _Worker:
     current: _Worker | None = None
 
     def __init__(self, plan: Plan, golden: Golden, processors: list[int]) -> None:
-        # Tracer and target hand over to each other all the time: fastest on one processor.
-        os.sched_setaffinity(0, processors)
+        os.sched_setaffinity(0, processors)  # see _one_processor
         self.plan, self.golden = plan, golden
         self.place = Workplace(plan.target)
 
@@ -294,21 +311,24 @@ def _execute(
     with ProcessPoolExecutor(
         jobs, mp_context=context, initializer=_start_worker, initargs=(plan, golden, queue)
     ) as pool:
-        for results in pool.map(_work, chunks):
-            yield from results
+        try:
+            for results in pool.map(_work, chunks):
+                yield from results
+        except BrokenProcessPool:
+            raise FaultError("a worker process was killed; the campaign is incomplete") from None
     queue.close()
 
 
 def _execute_here(
     plan: Plan, golden: Golden, tasks: list[_Task], processors: list[int]
 ) -> Iterator[tuple[int, RunResult]]:
-    worker = _Worker(plan, golden, processors[-1:])
-    try:
-        for task in tasks:
-            yield worker.run(task)
-    finally:
-        worker.place.close()
-        os.sched_setaffinity(0, processors)
+    with _one_processor():
+        worker = _Worker(plan, golden, processors[-1:])
+        try:
+            for task in tasks:
+                yield worker.run(task)
+        finally:
+            worker.place.close()
 
 
 CSV_COLUMNS = (
