@@ -61,12 +61,10 @@ def main() -> NoReturn:
     """Entry point: a known error is one line and exit code 1, a usage error exit code 2."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up
-    try:
-        cli.main(prog_name="mavfi", standalone_mode=False)
+    try:  # not standalone: click hands back the code of an Exit instead of leaving with it
+        code = cli.main(prog_name="mavfi", standalone_mode=False)
     except click.ClickException as error:
         error.show()
-        sys.exit(error.exit_code)
-    except click.exceptions.Exit as error:
         sys.exit(error.exit_code)
     except (Interrupted, KeyboardInterrupt, click.Abort):
         click.echo("interrupted", err=True)
@@ -77,4 +75,4 @@ def main() -> NoReturn:
     except MavfiError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
-    sys.exit(0)
+    sys.exit(code if isinstance(code, int) else 0)
