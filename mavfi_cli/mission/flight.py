@@ -17,7 +17,7 @@ import numpy as np
 
 from mavfi_cli.autonomy.pilot import Mode
 from mavfi_cli.autonomy.planners import Planner
-from mavfi_cli.core.errors import LinkLost, NoAutopilot
+from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Codec, Message, dialect
@@ -101,8 +101,11 @@ class Flight:
         Raises:
             NoAutopilot: nothing was heard.
             LinkLost: the other end closed the connection.
+            Interrupted: Ctrl-C, before there is anything to record.
         """
         while self._session.phase is Phase.CONNECTING:
+            if self._interrupts:
+                raise Interrupted("interrupted")
             self._turn()
         if self._session.failure is not None:
             raise self._session.failure
@@ -175,6 +178,11 @@ class Flight:
         self.outcome, self.reason, self.end_s = outcome, reason, self.stamp_s
         text = outcome.value.replace("_", " ") + (f": {reason}" if reason else "")
         self._note("outcome", text)
+
+    def explain(self, why: str) -> None:
+        """Add why the vehicle fell silent, where its process is known to have failed."""
+        if self.outcome is Outcome.LINK_LOST:
+            self.reason = f"{self.reason}: {why}"
 
     # One turn of the loop -------------------------------------------------------------------------
 

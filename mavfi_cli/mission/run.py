@@ -56,31 +56,30 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
     begun = time.perf_counter()
     platform = load_platform(config.platform)
     planner = planners.find(config.planner)
-    with _vehicle(config) as (transport, truth_folder, process):
+    with _interruptible() as interrupt, _vehicle(config) as (transport, truth_folder, process):
         warm_up()
-        with _interruptible() as interrupt:
-            flight = Flight(config, transport, platform, planner, watcher, interrupt)
-            try:
-                if truth_folder is None:  # before connecting: from then on the vehicle's clock runs
-                    flight.brief(briefing.of_config(config))
-                flight.connect()
-                if truth_folder is not None:
-                    flight.brief(briefing.of_simulation(truth_folder))
-            except MavfiError:
-                transport.close()
-                if process is not None and (failure := _failure(process)):
-                    raise failure from None
-                raise
-            name = Path(config.world).stem if config.link is None else "link"
-            folder = new_run_folder(out, f"{name}-{config.seed}")
-            flight.injection.begin(folder.fault)
-            flight_begun = time.perf_counter()
-            with flight.isolated_nodes():
-                crash = _fly(flight, folder)
-            flight_wall_s = time.perf_counter() - flight_begun
+        flight = Flight(config, transport, platform, planner, watcher, interrupt)
+        try:
+            if truth_folder is None:  # before connecting: from then on the vehicle's clock runs
+                flight.brief(briefing.of_config(config))
+            flight.connect()
+            if truth_folder is not None:
+                flight.brief(briefing.of_simulation(truth_folder))
+        except MavfiError:
+            transport.close()
+            if process is not None and (failure := _failure(process)):
+                raise failure from None
+            raise
+        name = Path(config.world).stem if config.link is None else "link"
+        folder = new_run_folder(out, f"{name}-{config.seed}")
+        flight.injection.begin(folder.fault)
+        flight_begun = time.perf_counter()
+        with flight.isolated_nodes():
+            crash = _fly(flight, folder)
+        flight_wall_s = time.perf_counter() - flight_begun
         transport.close()  # the vehicle sees the end and saves its truth
-        if process is not None:
-            process.stop()
+        if process is not None and (failure := _failure(process)):
+            flight.explain(str(failure))
         host = {
             "started": started.isoformat(timespec="seconds"),
             "startup_s": round(flight_begun - begun, 3),
@@ -93,7 +92,7 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
             "vehicle_stage_wall_s": _vehicle_stages(truth_folder),
         }
         truth, referee = _read_truth(truth_folder)
-    _write(flight, folder, config, host, truth, referee, crash)
+        _write(flight, folder, config, host, truth, referee, crash)
     return folder
 
 
@@ -132,6 +131,7 @@ def _vehicle(
         finally:
             transport.close()
             process.stop()
+            process.close()
 
 
 def _failure(process: VehicleProcess) -> MavfiError | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import subprocess
 import sys
@@ -30,6 +31,7 @@ class VehicleProcess:
                 )
             except OSError as error:
                 ours.close()
+                self.close()
                 raise VehicleProcessError(f"cannot start the vehicle: {error}") from None
         self._socket = ours
 
@@ -45,19 +47,24 @@ class VehicleProcess:
             self._process.kill()
             self._process.wait()
 
+    def close(self) -> None:
+        """Forget what it said; after `stop`."""
+        self._errors.close()
+
     def failure(self) -> VehicleProcessError | None:
         """What it said when it ended with an error; None where it ended well."""
-        if self._process.poll() in (None, 0):
+        code = self._process.poll()
+        if code is None or code == 0:
             return None
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         told = [line for line in lines if line.startswith("error: ")]
         if told:
             return VehicleProcessError(told[-1].removeprefix("error: "))
-        last = lines[-1] if lines else "no message"
-        return VehicleProcessError(
-            f"the vehicle process ended with code {self._process.returncode}: {last}"
-        )
+        killed = code < 0
+        how = f"was killed by {signal.Signals(-code).name}" if killed else f"ended with code {code}"
+        last = f": {lines[-1]}" if lines else ""
+        return VehicleProcessError(f"the vehicle process {how}{last}")
 
 
 def _command_line(config: MissionConfig, fd: int, truth_folder: Path) -> list[str]:

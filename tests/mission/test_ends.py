@@ -1,0 +1,124 @@
+"""Missions that end badly leave a record that says so, and no process behind."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.autonomy import collision
+from mavfi_cli.mission.run_folder import load_run
+
+MAVLOGDUMP = Path(sys.executable).parent / "mavlogdump.py"
+
+
+def dumped(tlog):
+    """Message types in a tlog, as the real mavlogdump.py reads them."""
+    done = subprocess.run(
+        [sys.executable, str(MAVLOGDUMP), "--format", "json", str(tlog)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    return [line["meta"]["type"] for line in lines]
+
+
+def test_mavlogdump_reads_the_whole_flight(short_flight):
+    kinds = dumped(short_flight.tlog)
+    result = load_run(short_flight.path).result
+    ticks = round(result["simulated_s"] / 0.02) + 1
+    assert kinds.count("LOCAL_POSITION_NED") == ticks
+    assert kinds.count("SET_POSITION_TARGET_LOCAL_NED") == ticks
+    assert {"HEARTBEAT", "COMMAND_LONG", "COMMAND_ACK", "ENCAPSULATED_DATA"} <= set(kinds)
+    assert "BAD_DATA" not in kinds
+
+
+@pytest.mark.parametrize("text", ["waiting until ready", "taking off", "flies a plan"])
+def test_interrupted_by_ctrl_c_the_record_is_whole(fly_short, at_event, text):
+    watcher = at_event(text, lambda: signal.raise_signal(signal.SIGINT))
+    run = load_run(fly_short(watcher).path)
+    assert run.result["outcome"] == "interrupted"
+    assert run.result["referee"] is not None
+    assert (run.trace.num_rows > 0) == (text == "flies a plan")
+    assert watcher.events[-1].text == "interrupted"
+
+
+def test_ctrl_c_on_the_command_line_exits_with_130(flying):
+    mission = flying()
+    mission.await_line("flies a plan")
+    with mission.vehicle_descriptor() as _vehicle:
+        mission.process.send_signal(signal.SIGINT)
+        code, out, _, folder = mission.end()
+    assert code == 130
+    assert out.startswith("INTERRUPTED\n")
+    assert load_run(folder).result["outcome"] == "interrupted"
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"result.json", "trace.parquet", "flight.tlog", "flight.svg"}
+
+
+def test_a_killed_mission_leaves_its_tlog_and_no_vehicle(flying, mavfi, await_end):
+    mission = flying()
+    mission.await_line("flies a plan")
+    with mission.vehicle_descriptor() as vehicle:
+        mission.process.kill()
+        code, _, _, folder = mission.end()
+        assert code == -signal.SIGKILL
+        await_end(vehicle)
+    assert {path.name for path in folder.iterdir()} == {"flight.tlog"}
+    assert dumped(folder / "flight.tlog").count("LOCAL_POSITION_NED") > 400
+    shown = mavfi("show", folder)
+    assert shown.returncode == 1
+    assert shown.stderr == f"error: {folder}: no result.json (cut off before its end)\n"
+
+
+def test_a_vehicle_that_is_killed_is_a_lost_link(fly_short, at_event, kill_vehicle):
+    folder = fly_short(at_event("flies a plan", kill_vehicle))
+    run = load_run(folder.path)
+    assert run.result["outcome"] == "link_lost"
+    assert "SIGKILL" in run.result["reason"]
+    assert run.result["referee"] is None
+    assert run.trace.num_rows > 0
+    assert "truth_x_m" not in run.trace.column_names
+    assert "BAD_DATA" not in dumped(folder.tlog)
+
+
+@pytest.mark.parametrize("node", ["octomap", "planner"])
+def test_a_node_that_is_killed_is_a_crash(fly_short, at_event, node):
+    def kill_node():
+        listed = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+        (pid,) = [
+            int(child)
+            for child in listed
+            if b"sitl" not in Path(f"/proc/{child}/cmdline").read_bytes()
+        ]
+        os.kill(pid, signal.SIGKILL)
+
+    folder = fly_short(at_event("taking off", kill_node), isolate=(node,))
+    result = load_run(folder.path).result
+    assert result["outcome"] == "crash"
+    assert result["reason"] == f"node {node} crashed: killed by SIGKILL"
+    assert result["referee"]["collision"] is None
+    assert (folder.path / "crash.txt").read_text().startswith(f"node {node} crashed")
+
+
+@pytest.mark.parametrize("isolate", [(), ("collision_check",)])
+def test_an_error_in_a_kernel_is_a_crash_with_its_traceback(
+    fly_short, at_event, monkeypatch, isolate
+):
+    real, calls = collision.step, []
+
+    def breaks_later(*arguments):
+        calls.append(1)
+        if len(calls) > 5:
+            raise IndexError("no such voxel")
+        return real(*arguments)
+
+    monkeypatch.setattr(collision, "step", breaks_later)
+    folder = fly_short(isolate=isolate)
+    result = load_run(folder.path).result
+    assert result["outcome"] == "crash"
+    where = "node collision_check crashed: " if isolate else ""
+    assert result["reason"] == f"{where}IndexError: no such voxel"
+    assert "Traceback" in (folder.path / "crash.txt").read_text()
