@@ -183,6 +183,6 @@ def _caption(axes: Axes, result: dict[str, Any]) -> None:
         fontsize=10, loc="left",
     )  # fmt: skip
     axes.legend(
-        loc="upper left", bbox_to_anchor=(0.0, -0.1), ncols=4, frameon=False, fontsize=8,
-        handletextpad=0.4, columnspacing=1.2,
+        loc="upper left", bbox_to_anchor=(-0.02, -0.1), ncols=7, frameon=False, fontsize=8,
+        handletextpad=0.3, columnspacing=0.9,
     )  # fmt: skip
