@@ -23,9 +23,9 @@ def doctor(as_json: bool) -> None:
         checks.append(check)
         if not as_json:
             colour, mark = _MARKS[check.verdict.value]
-            click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<12} {check.found}")
+            click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<20} {check.found}")
             if check.remedy:
-                click.echo(f"{'':20} -> {check.remedy}")
+                click.echo(f"{'':28} -> {check.remedy}")
     if as_json:
         click.echo(json.dumps([check.to_dict() for check in checks], indent=2))
     if any(check.verdict is Verdict.FAILED for check in checks):

@@ -16,12 +16,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from mavfi_cli.core.errors import MavfiError
-
-if TYPE_CHECKING:
-    from mavfi_cli.fi.native.breakpoints import Mechanism
+from typing import Any
 
 
 class Verdict(Enum):
@@ -65,6 +60,9 @@ height_m = -vehicle.truth.position_ned_m[2]
 print(f"the simulated quadrotor climbs ({height_m:.1f} m in 2 s)")
 sys.exit(0 if height_m > 1.0 else 1)
 """
+_ALLOW_PTRACE = (
+    "allow ptrace: sysctl kernel.yama.ptrace_scope=1; in a container --cap-add SYS_PTRACE"
+)
 _EXTRAS = {"train": "torch", "cluster": "distributed", "view": "rerun"}
 
 
@@ -170,38 +168,16 @@ def _injection() -> Iterator[Check]:
         yield Check(name="Tracing", verdict=Verdict.LIMITED, found="not Linux on x86-64",
                     remedy="instruction-level injection is not available here")  # fmt: skip
         return
-    from mavfi_cli.fi.native.breakpoints import Mechanism, perf_allowed
+    from mavfi_cli.fi.native.doctor import check_counting, check_tracing
 
-    refused = perf_allowed()
-    traced = _traced(Mechanism.DEBUG)
-    allow = "allow ptrace: sysctl kernel.yama.ptrace_scope=1, or docker run --cap-add SYS_PTRACE"
-    yield Check(
-        name="Tracing",
-        verdict=Verdict.LIMITED if traced else Verdict.OK,
-        found=f"ptrace fails: {traced}"
-        if traced
-        else "ptrace stops a program where it is asked to",
-        remedy=allow if traced else "",
-    )
-    if refused is None and not traced:
-        refused = _traced(Mechanism.PERF)
-    yield Check(
-        name="Breakpoints",
-        verdict=Verdict.LIMITED if refused else Verdict.OK,
-        found=f"counted by the tracer (perf: {refused})" if refused else "counted by the kernel",
-        remedy="sysctl kernel.perf_event_paranoid=2; Linux 5.13 or newer" if refused else "",
-    )  # fmt: skip
-
-
-def _traced(mechanism: Mechanism) -> str | None:
-    """Stop `true` at its entry point; None where that works, else why not."""
-    from mavfi_cli.fi.native.spawn import Command, run_to_entry, spawn
-
-    nowhere = Path(os.devnull)
-    try:
-        tracee = spawn(Command.of(["true"]), stdout=nowhere, stderr=nowhere, mechanism=mechanism)
-        stopped = run_to_entry(tracee)
-        tracee.kill()
-    except (MavfiError, OSError) as error:
-        return str(error)
-    return None if stopped else "the program ended before its entry point"
+    for capability, works in (
+        (check_tracing(), "a program was stopped, a register flipped and read back"),
+        (check_counting(), "executions are counted by the kernel"),
+    ):
+        limited = capability.problem is not None
+        yield Check(
+            name=capability.name,
+            verdict=Verdict.LIMITED if limited else Verdict.OK,
+            found=capability.problem or works,
+            remedy=(capability.remedy or _ALLOW_PTRACE) if limited else "",
+        )
