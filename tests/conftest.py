@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import select
+import socket
 import subprocess
 import sys
+import threading
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 
+sys.path.insert(0, str(Path(__file__).parent / "link"))  # the scripted autopilots live there
+TICK_WALL_S = 0.001
 SHORT = MissionConfig(world="farm", seed=5, start=(2.0, 2.0, 0.0), goal=(10.0, 6.0, 5.0))
 
 
@@ -64,3 +72,62 @@ def mavfi():
         )  # fmt: skip
 
     return run
+
+
+@pytest.fixture
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class AutopilotOnUdp:
+    """A scripted autopilot that calls a UDP port, 20 times as fast as real time.
+
+    Attributes:
+        muted: kinds of messages that it no longer sends.
+        extra: messages that it sends at every tick besides.
+        noise: makes bytes to send at every tick, or None.
+    """
+
+    def __init__(self, autopilot, port):
+        self.autopilot = autopilot
+        self.muted = set()
+        self.extra = []
+        self.noise = None
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        decoder, encoder = Codec(255, 255), Codec(1, 1)
+        while not self._over.wait(TICK_WALL_S):
+            inbox = []
+            while select.select([self._socket], [], [], 0.0)[0]:
+                with contextlib.suppress(ConnectionError):  # nobody listens yet
+                    inbox += decoder.decode(self._socket.recv(65536))
+            messages = [*self.autopilot.advance(inbox), *self.extra]
+            frames = [encoder.encode(m) for m in messages if m.get_type() not in self.muted]
+            for frame in [self.noise(), *frames] if self.noise else frames:
+                with contextlib.suppress(ConnectionError):
+                    self._socket.send(frame)
+
+    def close(self):
+        self._over.set()
+        self._thread.join()
+        self._socket.close()
+
+
+@pytest.fixture
+def autopilot_on_udp(free_port):
+    """Starts a scripted autopilot on UDP; it and the URL under which a mission hears it."""
+    with contextlib.ExitStack() as stack:
+
+        def start(autopilot):
+            link = AutopilotOnUdp(autopilot, free_port)
+            stack.callback(link.close)
+            return link, f"udpin:127.0.0.1:{free_port}"
+
+        yield start

@@ -8,6 +8,7 @@ run while the vehicle already simulates the next tick.
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -37,7 +38,7 @@ from mavfi_cli.mission.trace import Trace
 
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
 IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing
-LOST_S = 5.0  # a foreign autopilot that says nothing for so long is lost
+LOST_S = 5.0  # a foreign autopilot that tells no new state for so long is lost
 _POSITION = dialect.MAVLink_local_position_ned_message
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
@@ -72,7 +73,7 @@ class Flight:
         self._mode: Mode | None = None
         self._camera_asked = False
         self._next_progress_s = 0.0
-        self._idle_s = 0.0
+        self._unheard_s = self._unspoken_s = 0.0
         self._on_clock = config.link is None
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
@@ -188,12 +189,21 @@ class Flight:
 
     def _turn(self) -> None:
         """Take what came, and do the control tick of every state in it."""
+        foreign = self._config.link is not None
+        begun = time.monotonic()
         with self.wall.measure("wait"):
-            data = self._transport.receive(SILENCE_S if self._config.link is None else IDLE_S)
-        if not data:
-            self._silence()
-            return
-        self._idle_s = 0.0
+            data = self._transport.receive(IDLE_S if foreign else SILENCE_S)
+        waited_s = time.monotonic() - begun
+        stamp_s = self._take(data) if data else None
+        if stamp_s is not None and self._tick(stamp_s):
+            self._unheard_s = self._unspoken_s = 0.0
+        elif foreign:
+            self._go_without(waited_s)
+        elif not data:
+            raise LinkLost(f"the simulated vehicle said nothing for {SILENCE_S:g} s")
+
+    def _take(self, data: bytes) -> float | None:
+        """Take the messages in the data; the stamp of the newest state among them, s."""
         stamp_ms = None
         with self.wall.measure("link"):
             for message in self._codec.decode(data, datagram=self._transport.datagram):
@@ -202,8 +212,7 @@ class Flight:
                 self._record(message.get_msgbuf())
                 if type(message) is _POSITION and self._is_autopilot(message):
                     stamp_ms = message.time_boot_ms
-        if stamp_ms is not None:
-            self._tick(stamp_ms / 1e3)
+        return None if stamp_ms is None else stamp_ms / 1e3
 
     def _is_autopilot(self, message: Message) -> bool:
         system = self._session.telemetry.system or message.get_srcSystem()
@@ -212,23 +221,29 @@ class Flight:
             and message.get_srcSystem() == system
         )
 
-    def _silence(self) -> None:
-        if self._config.link is None:
-            raise LinkLost(f"the simulated vehicle said nothing for {SILENCE_S:g} s")
-        self._idle_s += IDLE_S
-        if self._idle_s >= LOST_S and self._on_clock:
-            raise LinkLost(f"{self._config.link}: nothing was heard for {LOST_S:g} s")
+    def _go_without(self, waited_s: float) -> None:
+        """A foreign autopilot told no new state: speak to it all the same, but not for ever."""
+        self._unheard_s += waited_s
+        self._unspoken_s += waited_s
+        if self._unheard_s >= LOST_S and self._on_clock:
+            raise LinkLost(f"{self._config.link}: no new state was heard for {LOST_S:g} s")
+        if self._unspoken_s < IDLE_S:
+            return
+        self._unspoken_s = 0.0
         self.stamp_s += IDLE_S
         self._send(self._session.tick(self.stamp_s))
         if isinstance(self._session.failure, NoAutopilot):
             raise self._session.failure
 
-    def _tick(self, stamp_s: float) -> None:
-        """One control tick: publish what is due, decide, answer, and only then compute."""
+    def _tick(self, stamp_s: float) -> bool:
+        """One control tick: publish what is due, decide, answer, and only then compute.
+
+        False, and nothing is done, where the stamp is not new.
+        """
         if not self._on_clock:
             self._take_clock(stamp_s)
         if stamp_s <= self.stamp_s and len(self.trace):
-            return
+            return False
         self.stamp_s = stamp_s
         state, companion = self._session.state, self.companion
         if companion is not None:
@@ -242,6 +257,7 @@ class Flight:
         if companion is not None:
             companion.executor.compute()
         self._tell(state)
+        return True
 
     def _take_clock(self, stamp_s: float) -> None:
         """From the first state on, the foreign vehicle's clock is ours: begin the talk anew."""

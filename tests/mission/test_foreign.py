@@ -1,0 +1,176 @@
+"""Missions with an autopilot at the far end of a UDP socket."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from fake_autopilot import FakeArduCopter, FakePX4
+
+from mavfi_cli.core.errors import CommandRefused, ConfigError, Interrupted, NoAutopilot
+from mavfi_cli.link.codec import dialect
+from mavfi_cli.link.session import SessionSettings
+from mavfi_cli.mission import flight
+from mavfi_cli.mission.run_folder import load_run
+
+SPEED = 5.0
+
+
+@pytest.fixture
+def sitl_on_udp(free_port):
+    """A stand-alone simulated vehicle that sends to a port; the URL to hear it."""
+    line = [
+        sys.executable, "-m", "sitl", "--world", "farm", "--seed", "5", "--start=2,2,0",
+        "--goal=10,6,5", "--link", f"onboard=udpout:127.0.0.1:{free_port}", "--speed", str(SPEED),
+    ]  # fmt: skip
+    with contextlib.ExitStack() as stack:
+        process = subprocess.Popen(line, stderr=subprocess.DEVNULL)
+        stack.callback(process.wait)
+        stack.callback(process.kill)
+        yield f"udpin:127.0.0.1:{free_port}"
+
+
+def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_event):
+    watcher = at_event("", None)
+    run = load_run(fly_short(watcher, link=sitl_on_udp, start=None, land=True).path)
+    assert run.result["outcome"] == "success"
+    assert run.result["referee"] is None
+    assert run.result["world"] is None
+    assert run.folder.path.name.startswith("link-")
+    assert [e.text for e in watcher.events if e.kind == "phase"] == [
+        "waiting until ready", "arming", "taking off", "offboard", "landing", "done",
+    ]  # fmt: skip
+    names = ("x_m", "y_m", "z_m")
+    heard = np.column_stack([run.trace[name].to_numpy() for name in names])
+    quality = run.result["quality_of_flight"]
+    distance_m = np.linalg.norm(np.diff(heard, axis=0), axis=1).sum()
+    assert quality["distance_m"] == pytest.approx(distance_m)
+    assert quality["goal_distance_m"] <= 1.1
+    assert quality["energy_regression_j"] is None
+    assert quality["min_clearance_m"] is None
+
+
+def test_a_goal_must_be_named(fly_short, free_port):
+    with pytest.raises(ConfigError, match="needs --goal"):
+        fly_short(link=f"udpin:127.0.0.1:{free_port}", goal=None)
+
+
+@pytest.fixture
+def hurried(monkeypatch):
+    """Ten seconds of patience are for people; 0.3 s will do for a test."""
+    monkeypatch.setattr(flight, "LOST_S", 0.3)
+    settings = flight.SessionSettings
+
+    def shorter(**options):
+        return settings(connect_timeout_s=0.3, **options)
+
+    monkeypatch.setattr(flight, "SessionSettings", shorter)
+
+
+def test_nobody_there(fly_short, free_port, hurried):
+    assert SessionSettings().connect_timeout_s == 10.0
+    url = f"udpin:127.0.0.1:{free_port}"
+    with pytest.raises(NoAutopilot, match=f"no autopilot at {url}: no heartbeat within"):
+        fly_short(link=url)
+
+
+def test_ctrl_c_while_it_waits_for_somebody(fly_short, free_port, monkeypatch):
+    """The first thing that the flight sends, nobody hears: that is the moment."""
+    real = flight.Flight._send
+
+    def send(self, messages):
+        signal.raise_signal(signal.SIGINT)
+        real(self, messages)
+
+    monkeypatch.setattr(flight.Flight, "_send", send)
+    with pytest.raises(Interrupted):
+        fly_short(link=f"udpin:127.0.0.1:{free_port}")
+
+
+def test_an_autopilot_that_refuses_to_arm_says_why(autopilot_on_udp, fly_short):
+    autopilot = FakePX4()
+    autopilot.refuse_arming = "Preflight Fail: ekf2 missing data\t"
+    _, url = autopilot_on_udp(autopilot)
+    with pytest.raises(CommandRefused, match=r"refused arming: .*\(Preflight Fail: ekf2 missing"):
+        fly_short(link=url)
+
+
+@pytest.mark.parametrize("autopilot", [FakePX4, FakeArduCopter])
+def test_a_flight_without_a_camera_ends_by_the_clock(autopilot, autopilot_on_udp, fly_short):
+    _, url = autopilot_on_udp(autopilot())
+    run = load_run(fly_short(link=url, time_limit_s=3.0).path)
+    assert run.result["outcome"] == "timeout"
+    assert run.result["images"]["received"] == 0
+    assert run.result["quality_of_flight"]["distance_m"] < 0.5
+
+
+def cut(link, *kinds):
+    return lambda: link.muted.update(kinds)
+
+
+EVERYTHING = ("HEARTBEAT", "LOCAL_POSITION_NED", "ATTITUDE_QUATERNION", "SYS_STATUS",
+              "EXTENDED_SYS_STATE", "HOME_POSITION", "COMMAND_ACK", "STATUSTEXT")  # fmt: skip
+
+
+def test_a_stream_that_stops_in_flight_is_a_lost_link(
+    autopilot_on_udp, fly_short, at_event, hurried
+):
+    link, url = autopilot_on_udp(FakePX4())
+    folder = fly_short(at_event("offboard", cut(link, *EVERYTHING)), link=url)
+    result = load_run(folder.path).result
+    assert result["outcome"] == "link_lost"
+    assert result["reason"] == f"{url}: no new state was heard for 0.3 s"
+
+
+def test_states_that_stop_while_the_rest_goes_on_are_a_lost_link(
+    autopilot_on_udp, fly_short, at_event, hurried
+):
+    """There never is a silence, only nothing to fly by."""
+    link, url = autopilot_on_udp(FakePX4())
+    link.extra.append(dialect.MAVLink_vfr_hud_message(0, 0, 0, 0, 0, 0))
+    folder = fly_short(at_event("offboard", cut(link, "LOCAL_POSITION_NED")), link=url)
+    result = load_run(folder.path).result
+    assert result["outcome"] == "link_lost"
+    assert "no new state was heard" in result["reason"]
+
+
+def test_heartbeats_that_stop_are_a_lost_link(autopilot_on_udp, fly_short, at_event):
+    link, url = autopilot_on_udp(FakePX4())
+    result = load_run(fly_short(at_event("offboard", cut(link, "HEARTBEAT")), link=url).path).result
+    assert (result["outcome"], result["reason"]) == ("link_lost", "no heartbeat for 3 s")
+
+
+def test_an_autopilot_that_talks_much_but_tells_no_position_is_not_waited_for_for_ever(
+    autopilot_on_udp, fly_short, monkeypatch
+):
+    settings = flight.SessionSettings
+    monkeypatch.setattr(flight, "SessionSettings", lambda **o: settings(ready_timeout_s=0.5, **o))
+    link, url = autopilot_on_udp(FakePX4())
+    link.muted.add("LOCAL_POSITION_NED")
+    link.extra.append(dialect.MAVLink_vfr_hud_message(0, 0, 0, 0, 0, 0))
+    with pytest.raises(CommandRefused, match=r"no position and attitude within 0\.5 s"):
+        fly_short(link=url)
+
+
+def test_a_failsafe_is_told_in_the_autopilot_s_terms(autopilot_on_udp, fly_short, at_event):
+    autopilot = FakePX4()
+    _, url = autopilot_on_udp(autopilot)
+
+    def failsafe():
+        autopilot.tell("Failsafe activated: battery\t")
+        autopilot.mode = "AUTO.RTL"
+
+    run = load_run(fly_short(at_event("offboard", failsafe), link=url).path)
+    assert run.result["outcome"] == "failsafe"
+    assert "AUTO.RTL" in run.result["reason"]
+    assert any("battery" in event["text"] for event in run.result["events"])
+
+
+def test_garbage_on_the_link_does_not_disturb_the_flight(autopilot_on_udp, fly_short):
+    link, url = autopilot_on_udp(FakePX4())
+    rng = np.random.default_rng(1)
+    link.noise = lambda: rng.bytes(int(rng.integers(1, 300)))
+    result = load_run(fly_short(link=url, time_limit_s=2.0).path).result
+    assert result["outcome"] == "timeout"
