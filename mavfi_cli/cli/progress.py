@@ -25,7 +25,7 @@ class _Plain(Watcher):
     """A line for what happens, and one every ten simulated seconds."""
 
     def __init__(self) -> None:
-        self._next_s = 0.0
+        self._next_s = _PLAIN_EVERY_S
 
     def on_progress(self, progress: Progress) -> None:
         if progress.stamp_s >= self._next_s:
