@@ -13,7 +13,6 @@ from sitl.autopilot import services
 from sitl.autopilot.commander import GPS_FIX_US, Commander, Result
 from sitl.autopilot.commands import Command, acknowledge, execute, from_int, from_long
 from sitl.autopilot.flight_modes import External, Hold, Land, Return, Sticks, Takeoff
-from sitl.autopilot.geodesy import Origin
 from sitl.autopilot.guidance import Guidance, Situation, climbs
 from sitl.autopilot.link import Link
 from sitl.autopilot.modes import Mode, mode_from_custom
@@ -30,6 +29,7 @@ from sitl.autopilot.streams import Preset
 from sitl.autopilot.telemetry_status import consumed_mah
 from sitl.autopilot.text import Severity, text_messages
 from sitl.autopilot.truth import Truth, Vector
+from sitl.geodesy import Origin
 
 COMPONENT = 1
 _BUTTONS_CENTRED = (0, 0, 500, 0)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.autopilot.geodesy import Origin
+from sitl.geodesy import Origin
 
 Setpoint = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass, field
 
 from sitl.autopilot.commander import Commander
-from sitl.autopilot.geodesy import Origin
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint, no_setpoint
 from sitl.autopilot.truth import Truth, Vector
+from sitl.geodesy import Origin
 
 UNIX_EPOCH_S = 1_750_000_000  # the unix time of boot: fixed, so that runs repeat
 

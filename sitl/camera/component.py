@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.geodesy import Origin
 from sitl.camera import messages
 from sitl.camera.depth import render_depth
 from sitl.camera.geometry import CameraPose, Optics, camera_pose
 from sitl.camera.schedule import Schedule
+from sitl.geodesy import Origin
 
 Vector = NDArray[np.float64]
 Message = Any  # of pymavlink's `common` dialect

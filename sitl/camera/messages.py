@@ -12,9 +12,9 @@ import zlib
 from typing import Any
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.geodesy import Origin
 from sitl.camera.depth import Image
 from sitl.camera.geometry import CameraPose, Optics
+from sitl.geodesy import Origin
 
 PAYLOAD_BYTES = 253
 _PIXEL_PITCH_MM = 0.01  # any would do: field of view = 2 atan(sensor / 2 / focal length)

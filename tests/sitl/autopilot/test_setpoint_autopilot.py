@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.geodesy import Origin
 from sitl.autopilot.setpoint import SetpointRefused, global_setpoint, local_setpoint
+from sitl.geodesy import Origin
 
 NAN = math.nan
 

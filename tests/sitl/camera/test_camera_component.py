@@ -10,9 +10,9 @@ import pytest
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
 from mavfi_cli.link.codec import Codec, dialect
-from sitl.autopilot.geodesy import Origin
 from sitl.camera.component import COMPONENT_ID, Camera
 from sitl.camera.depth import render_depth
+from sitl.geodesy import Origin
 from sitl.world import load_world
 
 BOXES = load_world("dense", seed=1).boxes_enu_m

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.autopilot.geodesy import EARTH_RADIUS_M, Origin
+from sitl.geodesy import EARTH_RADIUS_M, Origin
 
 metres = st.floats(-20_000.0, 20_000.0)
 
