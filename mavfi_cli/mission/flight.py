@@ -38,6 +38,7 @@ from mavfi_cli.mission.trace import Trace
 
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
 IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing
+CAMERA_BELOW_M = 1.0  # below the take-off height the camera is started
 LOST_S = 5.0  # a foreign autopilot that tells no new state for so long is lost
 _POSITION = dialect.MAVLink_local_position_ned_message
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -267,6 +268,13 @@ class Flight:
         self._session = self._new_session()
         self._session.telemetry = telemetry
 
+    def _nearly_up(self, state: VehicleState | None) -> bool:
+        """High enough in the take-off that a map begun now is there when the companion takes over."""
+        if self._session.phase is Phase.OFFBOARD:
+            return True
+        height_m = -1.0 if state is None else float(state.position_enu_m[2])
+        return self._airborne() and height_m >= self._config.takeoff_height_m - CAMERA_BELOW_M
+
     def _airborne(self) -> bool:
         return self._session.phase in (Phase.TAKING_OFF, Phase.OFFBOARD, Phase.LANDING)
 
@@ -352,7 +360,7 @@ class Flight:
         for text in session.telemetry.texts.since(self._texts):
             self._note("autopilot", text.text.strip())
         self._texts = session.telemetry.texts.total
-        if session.phase is Phase.TAKING_OFF and not self._camera_asked:
+        if not self._camera_asked and self._nearly_up(state):
             self._camera_asked = True
             session.camera.start(1.0 / self._config.camera_rate_hz)
         for struck in self.injection.news():
