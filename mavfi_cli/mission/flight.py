@@ -269,7 +269,7 @@ class Flight:
         self._session.telemetry = telemetry
 
     def _nearly_up(self, state: VehicleState | None) -> bool:
-        """High enough in the take-off that a map begun now is there when the companion takes over."""
+        """High enough that a map begun now is there when the companion takes over."""
         if self._session.phase is Phase.OFFBOARD:
             return True
         height_m = -1.0 if state is None else float(state.position_enu_m[2])
