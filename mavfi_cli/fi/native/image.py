@@ -11,7 +11,7 @@ import bisect
 import functools
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,23 +123,46 @@ class LoadedObject:
     text: tuple[range, ...]  # offsets
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Region:
+    """Compiled code without a file, named by its build or by the bytes in memory."""
+
+    span: range  # addresses
+    build_id: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """Of an object, the only code that counts as its text."""
+
+    text: tuple[range, ...]  # offsets, ascending
+
+
+Regions = Mapping[str, "range | Region | Part"]
+
+
 class Image:
     """The objects of one process at one moment."""
 
-    def __init__(self, pid: int, regions: Mapping[str, range] | None = None) -> None:
+    def __init__(self, pid: int, regions: Regions | None = None) -> None:
         """Read the maps of a process.
 
         Args:
             pid: the process.
-            regions: addresses of compiled code without a file, by name.
+            regions: by name, addresses of compiled code without a file, and which part of a
+                loaded object counts as its text.
         """
         self.objects: dict[str, LoadedObject] = {}
         for path, mappings in _files(pid).items():
             loaded = _load(path, mappings)
             if loaded is not None:
                 self.objects.setdefault(loaded.name, loaded)
-        for name, span in (regions or {}).items():
-            self.objects[name] = _region(pid, name, span)
+        for name, what in (regions or {}).items():
+            if isinstance(what, Part):
+                self.objects[name] = replace(self.named(name), text=what.text)
+            else:
+                region = what if isinstance(what, Region) else Region(span=what)
+                self.objects[name] = _region(pid, name, region)
         self._sorted = sorted(self.objects.values(), key=lambda loaded: loaded.start)
         self._starts = [loaded.start for loaded in self._sorted]
 
@@ -282,16 +305,19 @@ def _load(path: str, mappings: list[FileMapping]) -> LoadedObject | None:
     )
 
 
-def _region(pid: int, name: str, span: range) -> LoadedObject:
-    with open(f"/proc/{pid}/mem", "rb", buffering=0) as memory:
-        memory.seek(span.start)
-        code = memory.read(len(span))
+def _region(pid: int, name: str, region: Region) -> LoadedObject:
+    span, build_id = region.span, region.build_id
+    if not build_id:
+        with open(f"/proc/{pid}/mem", "rb", buffering=0) as memory:
+            memory.seek(span.start)
+            code = memory.read(len(span))
+        build_id = "sha256:" + hashlib.sha256(code).hexdigest()[:40]
     return LoadedObject(
         name=name,
         path=None,
         bias=span.start,
         start=span.start,
         end=span.stop,
-        build_id="sha256:" + hashlib.sha256(code).hexdigest()[:40],
+        build_id=build_id,
         text=(range(len(span)),),
     )

@@ -10,7 +10,7 @@ while it is attached, the tracer hears of it first: take its end from the result
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.fi import record
 from mavfi_cli.fi.native.breakpoints import ExecutionCounter
 from mavfi_cli.fi.native.fault import InstructionFault, Stage
-from mavfi_cli.fi.native.image import Image, Location, scope_of
+from mavfi_cli.fi.native.image import Image, Location, Regions, scope_of
 from mavfi_cli.fi.native.inject import (
     NOTHING,
     Followed,
@@ -68,7 +68,7 @@ def profile_invocation(
     invocation: int,
     *,
     objects: tuple[str, ...],
-    regions: Mapping[str, range] | None = None,
+    regions: Regions | None = None,
     inner: tuple[Stage, ...] = (),
     limit: int = 2_000_000,
     armed: Notice | None = None,
@@ -83,7 +83,7 @@ def profile_invocation(
         entry: the kernel's entry.
         invocation: which one from now on, from 1.
         objects: in scope.
-        regions: addresses of compiled code without a file, by name; may be in `objects`.
+        regions: as `Image` takes them; may be in `objects`.
         inner: further stages after the kernel's entry; the last is a function's entry, and the
             window is that function's invocation.
         limit: refuse longer invocations.
@@ -115,7 +115,7 @@ def count_executions(
     invocation: int,
     what: Location,
     *,
-    regions: Mapping[str, range] | None = None,
+    regions: Regions | None = None,
     armed: Notice | None = None,
 ) -> int:
     """How often an instruction executes during one invocation of a kernel.
@@ -157,7 +157,7 @@ def attack(
     fault: InstructionFault,
     *,
     path: Path,
-    regions: Mapping[str, range] | None = None,
+    regions: Regions | None = None,
     window: int = 64,
     armed: Notice | None = None,
     stopped: Callable[[Tracee], None] | None = None,
