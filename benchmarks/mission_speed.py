@@ -1,0 +1,70 @@
+"""Speed of a golden mission: times real time, and where the host's time goes.
+
+Prints the tables of docs/results.md:
+
+    python benchmarks/mission_speed.py [--runs 7] [--world dense] [--seed 3]
+
+`wait` is one process waiting for the other, and for being woken; the two overlap.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from typing import Any
+
+
+def fly(world: str, seed: int, out: str) -> dict[str, Any]:
+    """One mission in a fresh process."""
+    line = [sys.executable, "-m", "mavfi_cli", "fly", "--world", world, "--seed", str(seed)]
+    line += ["--out", out, "--no-picture", "--quiet", "--json"]
+    run = subprocess.run(line, capture_output=True, text=True, check=True)
+    result: dict[str, Any] = json.loads(run.stdout)
+    return result
+
+
+def stages(title: str, results: list[dict[str, Any]], key: str) -> None:
+    """Median host milliseconds a simulated second, by stage."""
+    simulated_s = results[0]["simulated_s"]
+    print(f"\n| {title} | ms a simulated second |\n|---|---|")
+    names = sorted({name for r in results for name in r["host"][key]})
+    rows = [
+        (statistics.median(r["host"][key].get(name, 0.0) for r in results), name) for name in names
+    ]
+    for seconds, name in sorted(rows, reverse=True):
+        print(f"| {name} | {1e3 * seconds / simulated_s:.2f} |")
+
+
+def main() -> None:
+    """Fly, and print medians."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=7)
+    parser.add_argument("--world", default="dense")
+    parser.add_argument("--seed", type=int, default=3)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as out:
+        fly(given.world, given.seed, out)  # warms the caches
+        results = [fly(given.world, given.seed, out) for _ in range(given.runs)]
+    factors = sorted(r["simulated_s"] / r["host"]["flight_wall_s"] for r in results)
+    startups = [r["host"]["startup_s"] for r in results]
+    memory = {
+        side: max(r["host"]["memory_mb"][side] for r in results)
+        for side in ("companion", "vehicle")
+    }
+    print(f"{given.world}, seed {given.seed}: {results[0]['simulated_s']:.1f} simulated seconds, "
+          f"{given.runs} runs")  # fmt: skip
+    print(f"times real time: median {statistics.median(factors):.1f} "
+          f"({factors[0]:.1f} to {factors[-1]:.1f})")  # fmt: skip
+    print(f"start-up to first heartbeat: median {statistics.median(startups):.2f} s")
+    print(f"peak memory: {memory['companion']:.0f} MB companion + {memory['vehicle']:.0f} MB vehicle "
+          f"= {sum(memory.values()):.0f} MB")  # fmt: skip
+    stages("companion", results, "stage_wall_s")
+    stages("vehicle", results, "vehicle_stage_wall_s")
+
+
+if __name__ == "__main__":
+    main()
