@@ -73,7 +73,7 @@ class PlanRequest:
 class PlanFailure:
     """A planner that found nothing."""
 
-    stamp_s: float
+    stamp_s: float  # when the trajectory should have begun
     reason: str
 
 
@@ -124,12 +124,17 @@ class Pilot:
         self._trajectory_seq = 0
         self._collision_seq = 0
         self._awaiting_plan = False
+        self._asked_s = 0.0  # start of the plan that is awaited
+        self._asked_rate = 1.0  # rate of the clock when it was asked for
+        self._abandoned: set[float] = set()  # starts of plans that are on their way for nothing
+        self._flown = False  # whether any plan has been adopted yet
         self._wanted = True
         self._not_before_s = 0.0
         self._failures = 0
         self._stamp_s = 0.0
         self._look_started_s: float | None = None
 
+    @np.errstate(over="ignore", invalid="ignore")
     def on_report(self, report: CollisionReport) -> None:
         """Take the verdict of the collision check.
 
@@ -164,20 +169,34 @@ class Pilot:
         severity = (Mode.FLYING, Mode.EVADING, Mode.SLOWING, Mode.STOPPING)
         if severity.index(mode) > severity.index(self.mode):
             if mode is Mode.STOPPING:
-                self.counters.stops += 1
-                self._wanted = True
-                self._awaiting_plan = False
+                self._brake()
+                self._plan_anew()
             elif mode is Mode.SLOWING:
                 self.counters.slowdowns += 1
             self.mode = mode
+
+    def _brake(self) -> None:
+        """Stop on the trajectory."""
+        if self.mode is not Mode.STOPPING:
+            self.counters.stops += 1
+        self.mode = Mode.STOPPING
+
+    def _plan_anew(self) -> None:
+        """Want a plan; the one under way would begin where the vehicle will not be."""
+        self._wanted = True
+        if self._awaiting_plan:
+            self._awaiting_plan = False
+            self._abandoned.add(self._asked_s)
 
     def on_plan(self, result: Trajectory | PlanFailure) -> None:
         """Take a plan, or the news that there is none.
 
         A trajectory is ignored when it is out of order, does not know of the newest foreseen
-        collision, or comes too late for its own start.
+        collision, begins at another time than asked for, or comes too late for its own start.
+        So is every answer to a request that was given up meanwhile.
         """
-        if not self._awaiting_plan:
+        if not self._awaiting_plan or result.stamp_s in self._abandoned:
+            self._abandoned.discard(result.stamp_s)
             self.counters.plans_ignored += 1
             return
         self._awaiting_plan = False
@@ -188,13 +207,14 @@ class Pilot:
         stale = (
             result.trajectory_seq <= self._trajectory_seq
             or result.future_collision_seq < self._collision_seq
+            or result.stamp_s != self._asked_s
         )
         late = self._rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
         if stale or late:
             self.counters.plans_ignored += 1
             self._wanted = True
             if late:
-                self.mode = Mode.STOPPING
+                self._brake()
             return
         self._failures = 0
         self._look_started_s = None
@@ -207,14 +227,17 @@ class Pilot:
         self._failures += 1
         self._wanted = True
         self._not_before_s = self._stamp_s + self.params.retry_s
-        if self.mode is not Mode.WAITING:
-            self.mode = Mode.STOPPING
+        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
+            return
+        if self.trajectory is not None:
+            self._brake()
         if self._failures >= self.params.attempts_max:
             self.mode = Mode.GAVE_UP
         elif self._failures == self.params.look_round_after:
             self._look_started_s = self._stamp_s
             self.counters.look_rounds += 1
 
+    @np.errstate(over="ignore", invalid="ignore")  # of corrupted waypoints
     def update(self, stamp_s: float, state: VehicleState) -> Directive:
         """One control tick: advance along the trajectory and say what to do."""
         step_s = stamp_s - self._stamp_s if self._stamp_s else 0.0
@@ -222,8 +245,8 @@ class Pilot:
         if self._hold is None:
             self._hold_here(state)
         if self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
-            self._adopt_next(stamp_s)
             self._advance(step_s)
+            self._adopt_next(stamp_s)
             self._guard(state)
             distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
             if distance_m <= self.params.goal_tolerance_m:
@@ -247,13 +270,15 @@ class Pilot:
         """Switch to the next trajectory once its start has come."""
         if self._next is None or stamp_s < self._next.stamp_s:
             return
-        if self.trajectory is not None or self.counters.plans_requested > 1:
-            self.counters.replans += 1
+        self.counters.replans += self._flown
+        self._flown = True
         moving = self.mode not in (Mode.WAITING, Mode.STOPPING)
         late_s = stamp_s - self._next.stamp_s
         self.trajectory, self._next = self._next, None
-        self.time_s = late_s if moving else 0.0
-        self._rate, self._rate_change = (self._rate, 0.0) if moving else (1.0, 0.0)
+        self.time_s = max(0.0, late_s) if moving else 0.0
+        # The plan departs at the velocity of its request: its clock goes on as the old one went.
+        self._rate = min(1.0, self._rate / self._asked_rate) if moving else 1.0
+        self._rate_change = 0.0
         self.mode = Mode.FLYING
 
     def _advance(self, step_s: float) -> None:
@@ -283,8 +308,7 @@ class Pilot:
             self._hold_here(state)
             self._stand()
             self._next = None
-            self._wanted = True
-            self._awaiting_plan = False
+            self._plan_anew()
             self.mode = Mode.WAITING
             self.counters.stops += 1
 
@@ -316,6 +340,7 @@ class Pilot:
         self._awaiting_plan = True
         self.counters.plans_requested += 1
         start = self._start_of_plan(stamp_s, state)
+        self._asked_s, self._asked_rate = start[0], self._rate or 1.0
         return PlanRequest(
             stamp_s=start[0],
             position_enu_m=start[1],

@@ -160,7 +160,7 @@ class Companion:
             self._planning_params,
         )
         if found.trajectory is None:
-            return PlanFailure(stamp_s=stamp_s, reason=found.reason)
+            return PlanFailure(stamp_s=request.stamp_s, reason=found.reason)
         return found.trajectory
 
     # Messages as they take effect
