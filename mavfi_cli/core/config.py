@@ -31,8 +31,17 @@ def load_toml(path: Path, cls: type[T]) -> T:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(str(error), path=path) from None
+        raise syntax_error(error, path) from None
     return structure(data, cls, path=path, text=text)
+
+
+def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:
+    """What is wrong with a file that is no TOML, with its line where the parser tells it."""
+    problem, at, place = str(error).rpartition(" (at line ")
+    if not at:
+        return ConfigError(str(error), path=path)
+    line, _, column = place.rstrip(")").partition(", ")
+    return ConfigError(f"{problem} ({column})", path=path, line=int(line))
 
 
 def structure(
@@ -123,7 +132,7 @@ def _first_problem(error: BaseException, key: str) -> tuple[str, str]:
             if isinstance(note, AttributeValidationNote):
                 key = f"{key}.{note.name}" if key else note.name
             elif isinstance(note, IterableValidationNote):
-                key = f"{key}[{note.index}]"
+                key += f".{note.index}" if isinstance(note.index, str) else f"[{note.index}]"
         return _first_problem(inner, key)
     return key, "is missing" if isinstance(error, KeyError) else str(error)
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.config import structure
+from mavfi_cli.core.config import structure, syntax_error
 from mavfi_cli.core.errors import ConfigError, WorldError
 from mavfi_cli.core.seeds import Stream, generator
 from sitl.world.generate import CLEAR_RADIUS_M
@@ -77,7 +77,7 @@ def read_scene(path: Path) -> Scene:
     except UnicodeDecodeError:
         raise ConfigError("not a UTF-8 text file", path=path) from None
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(str(error), path=path) from None
+        raise syntax_error(error, path) from None
     scene = structure(data, Scene, path=path, text=text)
     _refuse_bad_lengths(scene, path, text)
     return scene

@@ -60,7 +60,9 @@ def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
         ('name = "x"\n[[box]]\na = nan', "expected a finite number"),
         ('name = "x"\nbox = []\n[sub]\nb = 1', r"sub\.a: is missing"),
         ('name = "x"', "box: is missing"),
-        ("name = = 3", "line 1, column 8"),
+        ("box = []\nname = = 3", r"file\.toml:2: Invalid value \(column 8\)$"),
+        ('name = "x', r"file\.toml: "),
+        ('name = "x"\nbox = []\n[named.one]\na = "k"', r"file\.toml:4: named\.one\.a: expected"),
         ('name = "bad"\nbox = []', "a bad name"),
     ],
 )
