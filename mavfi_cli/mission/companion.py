@@ -93,13 +93,18 @@ class Companion:
         self._tracking_state: tracking.TrackingState | None = None
         self._latency = LatencyModel(platform, config.seed)
         self.executor = Executor(
-            draw_latency_s=self._latency.draw_s, cores=platform.cores, wall=wall
+            draw_latency_s=self._latency.draw_s,
+            cores=platform.cores,
+            wall=wall,
+            restart_s=config.node_restart_s,
+            watchdog_s=config.node_watchdog_s,
         )
         add = self.executor.add
         add("point_cloud", self._run_point_cloud, self._take_cloud)
         add("octomap", self._run_octomap, self._take_snapshot)
         add("collision_check", self._run_collision_check, self._take_report)
         add("planner", self._run_planner, self._take_plan)
+        self._control = add("control", self._run_control, lambda _output, _stamp_s: None)
         self._snapshot: occupancy.MapSnapshot | None = None
         self._checked: Trajectory | None = None
         self._commands: deque[tuple[float, Command]] = deque()  # (due stamp, command)
@@ -163,6 +168,14 @@ class Companion:
             return PlanFailure(stamp_s=request.stamp_s, reason=found.reason)
         return found.trajectory
 
+    def _run_control(self, job: tuple[tracking.TrackingInputs, float], _stamp_s: float) -> Command:
+        inputs, yaw_rad = job
+        state = self._tracking_state
+        if state is None:
+            state = tracking.TrackingState(yaw_rad=yaw_rad, stamp_s=inputs.stamp_s)
+        self._tracking_state, command = tracking.step(state, inputs, self._tracking_params)
+        return command
+
     # Messages as they take effect
 
     def take_frame(self, frame: DepthFrame) -> None:
@@ -225,15 +238,15 @@ class Companion:
             self.executor.submit("planner", (directive.plan, self._snapshot))
         if directive.trajectory is not None and directive.trajectory is not self._checked:
             self._check()
+        delay_s = self._control_delay_s()
         command = self._track(stamp_s, state, directive)
-        self._commands.append((stamp_s + self._control_delay_s(), command))
+        if command is not None:  # else the last one stays in force: the node is down
+            self._commands.append((stamp_s + delay_s, command))
         while self._commands and self._commands[0][0] <= stamp_s:
             self._take_command(stamp_s, self._commands.popleft()[1])
         return self.command
 
-    def _track(self, stamp_s: float, state: VehicleState, directive: Directive) -> Command:
-        if self._tracking_state is None:
-            self._tracking_state = tracking.TrackingState(yaw_rad=state.yaw_rad, stamp_s=stamp_s)
+    def _track(self, stamp_s: float, state: VehicleState, directive: Directive) -> Command | None:
         inputs = tracking.TrackingInputs(
             stamp_s=stamp_s,
             position_enu_m=state.position_enu_m,
@@ -245,13 +258,12 @@ class Companion:
             hold_enu_m=directive.hold_enu_m,
             hold_yaw_rad=directive.hold_yaw_rad,
         )
-        self._tracking_state, command = tracking.step(
-            self._tracking_state, inputs, self._tracking_params
-        )
+        command: Command | None = self.executor.call("control", (inputs, state.yaw_rad), stamp_s)
         return command
 
     def _control_delay_s(self) -> float:
         latency_s = self._latency.draw_s("control")
+        self._control.busy_s += latency_s
         return latency_s if latency_s >= SAME_TICK_S else 0.0
 
     def _take_command(self, stamp_s: float, command: Command) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.mission.fault_config import FaultConfig
 
-ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner")
+ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 Vector3 = tuple[float, float, float]
 
 
@@ -25,6 +25,8 @@ class MissionConfig:
         realtime: pace the simulated vehicle by the wall clock.
         land: land and disarm after the goal was reached.
         fault: what to inject; None for a golden flight.
+        node_restart_s: from the death of a node until its successor works, simulated.
+        node_watchdog_s: a node that works for so long hangs and is killed, simulated.
         isolate: nodes that work in processes of their own; changes nothing in the record.
     """
 
@@ -48,6 +50,8 @@ class MissionConfig:
     realtime: bool = False
     link: str | None = None
     land: bool = False
+    node_restart_s: float = 1.0
+    node_watchdog_s: float = 5.0
     fault: FaultConfig | None = None
     isolate: tuple[str, ...] = ()
 
@@ -60,6 +64,8 @@ class MissionConfig:
             "time_limit_s": (self.time_limit_s, 1.0, 86400.0),
             "map_resolution_m": (self.map_resolution_m, 0.05, 1.0),
             "map_range_m": (self.map_range_m, 2.0, 25.0),
+            "node_restart_s": (self.node_restart_s, 0.0, 3600.0),
+            "node_watchdog_s": (self.node_watchdog_s, 0.1, 3600.0),
             "camera_rate_hz": (self.camera_rate_hz, 0.1, 50.0),
         }
         for name, (value, low, high) in positive.items():

@@ -4,20 +4,36 @@ A node runs one kernel. It has a queue of one: a newer input replaces a waiting 
 invocation that starts at `t` occupies the node, and one core of the platform, until `t` plus
 its latency; only then is its output published. The real computation is done at any host time
 in between, so the vehicle's simulation need not wait for it.
+
+A node in a process of its own may die. The input that it worked on is lost, and it starts anew,
+with fresh state, a restart time after its output was due. A node that hangs works on until the
+watchdog kills it. Both are decided by *what* became of the process, never by when the host
+noticed, so they repeat.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.mission.node_process import NodeProcess
+from mavfi_cli.mission.node_process import NodeLost, NodeProcess
 
 Run = Callable[[Any, float], Any]  # (input, start stamp) -> output
 Publish = Callable[[Any, float], None]  # (output, stamp at which it takes effect)
+_Event = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loss:
+    """One end of a node's process."""
+
+    node: str
+    stamp_s: float  # when the output was due, or the watchdog acted
+    hung: bool
+    how: str
 
 
 @dataclass(slots=True, eq=False)
@@ -33,6 +49,8 @@ class Node:
     dropped: int = 0  # inputs that a newer one replaced before they were looked at
     busy_s: float = 0.0
     process: NodeProcess | None = None  # where the real work is done; None: here
+    losses: list[Loss] = field(default_factory=list)
+    restarts: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -87,15 +105,21 @@ class Executor:
     Attributes:
         draw_latency_s: latency of the next invocation of a node, by its name.
         cores: how many nodes can work at the same time; the rest wait in the order of asking.
+        restart_s: from a node's end until its successor is ready, simulated.
+        watchdog_s: an invocation that has not ended after so long is killed, simulated.
+        losses: of all nodes, in order.
     """
 
     draw_latency_s: Callable[[str], float]
     cores: int
     wall: WallClock = field(default_factory=WallClock)
+    restart_s: float = 1.0
+    watchdog_s: float = 5.0
     now_s: float = 0.0
+    losses: list[Loss] = field(default_factory=list)
     timetable: list[Invocation] = field(default_factory=list)
     _nodes: dict[str, Node] = field(default_factory=dict)
-    _events: list[tuple[float, int, _Job]] = field(default_factory=list)  # heap by time, then order
+    _events: list[tuple[float, int, _Event]] = field(default_factory=list)  # heap: time, order
     _waiting: list[Node] = field(default_factory=list)
     _uncomputed: list[_Job] = field(default_factory=list)
     _working: int = 0
@@ -107,15 +131,38 @@ class Executor:
         self._nodes[name] = node
         return node
 
-    def fork(self, names: Sequence[str]) -> NodeProcess:
-        """Let these nodes do their real work in one process of their own, from now on.
+    def isolate(self, name: str, process: NodeProcess | None = None) -> None:
+        """Let a node do its real work in a process of its own from now on; `close` ends it.
 
-        Their state moves there; the caller closes the process.
+        Args:
+            name: of the node.
+            process: one that serves it; default a fork of this one, to which its state moves.
         """
-        process = NodeProcess({name: self._nodes[name].run for name in names})
-        for name in names:
-            self._nodes[name].process = process
-        return process
+        node = self._nodes[name]
+        node.process = process or NodeProcess.fork({name: node.run})
+
+    def close(self) -> None:
+        """End the processes of all nodes."""
+        for node in self._nodes.values():
+            if node.process is not None:
+                node.process.close(kill=True)
+                node.process = None
+
+    def call(self, name: str, value: Any, stamp_s: float) -> Any:
+        """Have a node work at once, outside the queue; None while it is down, or if it is lost."""
+        node = self._nodes[name]
+        if node.busy:
+            node.dropped += 1
+            return None
+        node.invocations += 1
+        try:
+            return _Job(node=node, start_s=stamp_s, input=value).result(self.wall)
+        except NodeLost as loss:
+            node.busy = True
+            gone_s = stamp_s + self.watchdog_s if loss.hung else stamp_s
+            self._note_loss(node, gone_s, loss)
+            self._at(gone_s + self.restart_s, lambda stamp_s: self._revive(node, stamp_s))
+            return None
 
     @property
     def nodes(self) -> dict[str, Node]:
@@ -142,9 +189,9 @@ class Executor:
     def advance(self, stamp_s: float) -> None:
         """Publish every output that takes effect up to `stamp_s`, in the order of time."""
         while self._events and self._events[0][0] <= stamp_s:
-            end_s, _, job = heapq.heappop(self._events)
-            self.now_s = max(self.now_s, end_s)
-            self._finish(job, end_s)
+            due_s, _, event = heapq.heappop(self._events)
+            self.now_s = max(self.now_s, due_s)
+            event(due_s)
         self.now_s = max(self.now_s, stamp_s)
 
     def compute(self) -> None:
@@ -169,14 +216,50 @@ class Executor:
         self._uncomputed.append(job)
         end_s = self.now_s + latency_s
         self.timetable.append(Invocation(node=node.name, start_s=self.now_s, end_s=end_s))
-        heapq.heappush(self._events, (end_s, self._count, job))
+        self._at(end_s, lambda stamp_s: self._finish(job, stamp_s))
+
+    def _at(self, stamp_s: float, event: _Event) -> None:
+        heapq.heappush(self._events, (stamp_s, self._count, event))
         self._count += 1
 
     def _finish(self, job: _Job, end_s: float) -> None:
-        output = job.result(self.wall)
+        try:
+            output = job.result(self.wall)
+        except NodeLost as loss:
+            self._lose(job, end_s, loss)
+            return
         job.node.busy = False
         self._working -= 1
         job.node.publish(output, end_s)
         self._start_if_free(job.node)
+        self._start_waiting()
+
+    def _start_waiting(self) -> None:
         while self._waiting and self._working < self.cores:
             self._start_if_free(self._waiting.pop(0))
+
+    def _lose(self, job: _Job, end_s: float, loss: NodeLost) -> None:
+        """The output will never come: the node stays busy until it is dead, then until it is up."""
+        gone_s = max(end_s, job.start_s + self.watchdog_s) if loss.hung else end_s
+        job.node.busy_s += gone_s - end_s
+        self._note_loss(job.node, gone_s, loss)
+        self._at(gone_s, lambda stamp_s: self._bury(job.node, stamp_s))
+
+    def _note_loss(self, node: Node, gone_s: float, loss: NodeLost) -> None:
+        entry = Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how)
+        node.losses.append(entry)
+        self.losses.append(entry)
+
+    def _bury(self, node: Node, stamp_s: float) -> None:
+        self._working -= 1
+        self._at(stamp_s + self.restart_s, lambda up_s: self._revive(node, up_s))
+        self._start_waiting()
+
+    def _revive(self, node: Node, _stamp_s: float) -> None:
+        """A new process with fresh state: this one's copy of the node has never worked."""
+        if node.process is not None:
+            node.process.close(kill=True)
+        node.process = NodeProcess.fork({node.name: node.run})
+        node.restarts += 1
+        node.busy = False
+        self._start_if_free(node)

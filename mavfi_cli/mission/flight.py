@@ -31,6 +31,7 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.events import EventLog
+from mavfi_cli.mission.executor import Node
 from mavfi_cli.mission.injection import Injection, NoInjection
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Progress, Watcher
@@ -71,6 +72,7 @@ class Flight:
         self._early: list[tuple[float, bytes]] = []  # packets from before the run folder
         self._phase: Phase | None = None
         self._texts = 0
+        self._losses = 0
         self._mode: Mode | None = None
         self._camera_asked = False
         self._next_progress_s = 0.0
@@ -132,10 +134,13 @@ class Flight:
     def isolated_nodes(self) -> Iterator[None]:
         """Each node that the mission isolates works in a process of its own meanwhile."""
         assert self.companion is not None
-        with contextlib.ExitStack() as stack:
+        executor = self.companion.executor
+        try:
             for name in self._config.isolate:
-                stack.callback(self.companion.executor.fork([name]).close)
+                executor.isolate(name)
             yield
+        finally:
+            executor.close()
 
     def fly(self, tlog: Path) -> None:
         """Fly until the mission has an outcome.
@@ -251,7 +256,7 @@ class Flight:
             companion.executor.advance(stamp_s)
         if companion is not None and state is not None and self._airborne():
             self._offer_frames(companion)
-            with self.wall.measure("control"):
+            with self.wall.measure("pilot"):
                 self._control(stamp_s, state, companion)
         with self.wall.measure("link"):
             self._send(self._session.tick(stamp_s))
@@ -365,12 +370,20 @@ class Flight:
             session.camera.start(1.0 / self._config.camera_rate_hz)
         for struck in self.injection.news():
             self._note("fault", struck)
+        if self.companion is not None:
+            self._tell_losses(self.companion)
         companion = self.companion
         if companion is not None and companion.mode is not self._mode:
             self._tell_mode(companion)
         if state is not None and self.stamp_s >= self._next_progress_s:
             self._next_progress_s = self.stamp_s + 1.0
             self._watcher.on_progress(self._progress(state))
+
+    def _tell_losses(self, companion: Companion) -> None:
+        losses = companion.executor.losses
+        for loss in losses[self._losses :]:
+            self._note("node", f"node {loss.node} {'' if loss.hung else 'crashed: '}{loss.how}")
+        self._losses = len(losses)
 
     def _tell_mode(self, companion: Companion) -> None:
         mode, before = companion.mode, self._mode
@@ -419,7 +432,7 @@ class Flight:
         """Counters of pilot, kernels and camera link."""
         companion = self.companion
         if companion is None:
-            return {"pilot": None, "kernels": {}, "images": {}}
+            return {"pilot": None, "kernels": {}, "nodes": {}, "images": {}}
         kernels = {
             name: {
                 "invocations": node.invocations,
@@ -431,6 +444,7 @@ class Flight:
         return {
             "pilot": asdict(companion.pilot.counters),
             "kernels": kernels,
+            "nodes": {name: _ends(node) for name, node in companion.executor.nodes.items()},
             "images": {"received": self._images.received, "lost": self._images.lost},
         }
 
@@ -445,3 +459,14 @@ class Flight:
             }
             for plan in self.companion.plans
         ]
+
+
+def _ends(node: Node) -> dict[str, Any]:
+    """How often a node died, and of what."""
+    crashes = [
+        {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}
+        for loss in node.losses
+        if not loss.hung
+    ]
+    hangs = sum(loss.hung for loss in node.losses)
+    return {"crashes": crashes, "hangs": hangs, "restarts": node.restarts}

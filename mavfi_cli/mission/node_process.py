@@ -8,10 +8,14 @@ so where a node runs changes nothing in the record of a mission.
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import os
 import pickle
+import resource
+import select
 import signal
 import socket
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,6 +26,13 @@ from mavfi_cli.core.errors import NodeCrashed
 
 Run = Callable[[Any, float], Any]
 _LENGTH = 8
+
+# A node hangs when one invocation takes this much of the processor, or of the wall clock where it
+# waits for something. The slowest healthy one takes well under half a second; what the limits are
+# does not enter the record, only whether they were passed.
+HANG_CPU_S = 5.0
+HANG_WALL_S = 120.0
+_LOOK_S = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,23 +51,54 @@ class _Answer:
     error: str | None = None
 
 
+class NodeLost(Exception):
+    """A node's process is gone, or had to be killed: what the executor makes the best of."""
+
+    def __init__(self, *, hung: bool, how: str) -> None:
+        super().__init__(how)
+        self.hung = hung
+        self.how = how
+
+
 class NodeProcess:
     """Runs kernels for the executor: hand in orders, later take the answers.
 
     Args:
-        runs: kernel by node name; the child uses its own copies.
+        connection: our end of the socket pair.
+        pid: of the process, a child of ours.
+        ending: tells how the process ended where somebody else heard of it first, else None.
+        errors_kill: an exception in a kernel ends its node as a crash, instead of the mission.
     """
 
-    def __init__(self, runs: Mapping[str, Run]) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._pid = os.fork()
-        if self._pid == 0:
-            ours.close()
-            _serve(theirs, runs)
-        theirs.close()
-        self._socket = ours
+    def __init__(
+        self,
+        connection: socket.socket,
+        pid: int,
+        *,
+        ending: Callable[[], str | None] = lambda: None,
+        errors_kill: bool = False,
+    ) -> None:
+        self._socket = connection
+        self._pid = pid
+        self._ending = ending
+        self._errors_kill = errors_kill
         self._answers: dict[int, _Answer] = {}
         self._count = 0
+
+    @classmethod
+    def fork(cls, runs: Mapping[str, Run]) -> NodeProcess:
+        """A fork of this process.
+
+        Args:
+            runs: kernel by node name; the child uses its own copies.
+        """
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        pid = os.fork()
+        if pid == 0:
+            ours.close()
+            serve(theirs, runs)
+        theirs.close()
+        return cls(ours, pid)
 
     @property
     def pid(self) -> int:
@@ -64,37 +106,57 @@ class NodeProcess:
         return self._pid
 
     def order(self, node: str, value: Any, start_s: float) -> int:
-        """Have an input worked on; the number under which to ask for the output."""
+        """Have an input worked on; the number under which to ask for the output.
+
+        A process that is gone already is noticed when the output is asked for.
+        """
         self._count += 1
         order = _Order(number=self._count, node=node, input=value, start_s=start_s)
-        with self._crash_of(node):
-            _send(self._socket, order)
+        with contextlib.suppress(OSError):
+            send(self._socket, order)
         return order.number
 
     def take(self, node: str, number: int) -> tuple[Any, float]:
         """Wait for the output of an order; the output and the host seconds it took.
 
         Raises:
-            NodeCrashed: the process ended, or the kernel raised an error.
+            NodeLost: the process ended, or hung and was killed.
+            NodeCrashed: the kernel raised an error.
         """
-        with self._crash_of(node):
+        begun_s, used_s = time.monotonic(), self._cpu_s()
+        try:
             while number not in self._answers:
-                answer: _Answer = _receive(self._socket)
+                while not select.select([self._socket], [], [], _LOOK_S)[0]:
+                    if (
+                        self._cpu_s() - used_s > HANG_CPU_S
+                        or time.monotonic() - begun_s > HANG_WALL_S
+                    ):
+                        raise NodeLost(hung=True, how="hung: killed by the watchdog")
+                answer: _Answer = receive(self._socket)
                 self._answers[answer.number] = answer
+        except (OSError, EOFError, pickle.UnpicklingError):
+            raise NodeLost(hung=False, how=self._end()) from None
         answer = self._answers.pop(number)
         if answer.error is not None:
+            if self._errors_kill:
+                raise NodeLost(hung=False, how=answer.error.partition("\n")[0])
             raise NodeCrashed(node, answer.error)
         return answer.output, answer.host_s
 
-    @contextlib.contextmanager
-    def _crash_of(self, node: str) -> Any:
+    def _cpu_s(self) -> float:
+        """Processor seconds that the process has used; 0 once it is gone."""
         try:
-            yield
-        except (OSError, EOFError):
-            raise NodeCrashed(node, self._end()) from None
+            return time.clock_gettime(
+                ~self._pid << 3 | 2
+            )  # the clock that clock_getcpuclockid names
+        except OSError:
+            return 0.0
 
     def _end(self) -> str:
         """How the process ended, in words."""
+        told = self._ending()
+        if told is not None:
+            return told
         with contextlib.suppress(ChildProcessError):
             _, status = os.waitpid(self._pid, 0)
             if os.WIFSIGNALED(status):
@@ -102,20 +164,25 @@ class NodeProcess:
             return f"ended with code {os.waitstatus_to_exitcode(status)}"
         return "ended"
 
-    def close(self) -> None:
-        """End the process."""
+    def close(self, *, kill: bool = False) -> None:
+        """End the process: it ends itself when the connection closes, unless it cannot hear."""
         self._socket.close()
+        if kill:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(self._pid, 0)
 
 
-def _serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
+def serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
     """The child's whole life: work on orders until the parent closes. Does not return."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the parent decides when it is over
+    faulthandler.disable()
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         while True:
-            order: _Order = _receive(connection)
+            order: _Order = receive(connection)
             begun = perf_counter()
             output, error = None, None
             try:
@@ -123,7 +190,7 @@ def _serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
             except Exception as failure:  # the node's boundary: a crash is a result
                 error = f"{type(failure).__name__}: {failure}\n{traceback.format_exc()}"
             host_s = perf_counter() - begun
-            _send(
+            send(
                 connection,
                 _Answer(number=order.number, output=output, host_s=host_s, error=error),
             )
@@ -133,21 +200,30 @@ def _serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
         os._exit(1)
 
 
-def _send(connection: socket.socket, value: Any) -> None:
+def send(connection: socket.socket, value: Any) -> None:
+    """Send one value as a pickle."""
     data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
     connection.sendall(len(data).to_bytes(_LENGTH, "little") + data)
 
 
-def _receive(connection: socket.socket) -> Any:
+def receive(connection: socket.socket) -> Any:
+    """Receive one value.
+
+    Raises:
+        EOFError: the other end has closed.
+    """
     size = int.from_bytes(_exactly(connection, _LENGTH), "little")
     return pickle.loads(_exactly(connection, size))
 
 
-def _exactly(connection: socket.socket, size: int) -> bytes:
-    data = bytearray()
-    while len(data) < size:
-        piece = connection.recv(size - len(data))
-        if not piece:
+def _exactly(connection: socket.socket, size: int) -> bytearray:
+    """In one buffer whatever the pieces, so that the memory of a node is the same each time."""
+    data = bytearray(size)
+    view, filled = memoryview(data), 0
+    while filled < size:
+        count = connection.recv_into(view[filled:])
+        if not count:
             raise EOFError
-        data += piece
-    return bytes(data)
+        filled += count
+    view.release()
+    return data

@@ -53,6 +53,7 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
         f"foreseen, {counters['slowdowns']} slow-downs, {counters['stops']} stops",
     ]
     lines += fault_lines(result)
+    lines += node_lines(result)
     response = result.get("response_time_s") or {}
     if response.get("median") is not None:
         lines.append(
@@ -65,6 +66,20 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
             f"Host        {host['flight_wall_s']:.2f} s for {result['simulated_s']:.1f} simulated "
             f"seconds: {factor:.0f} times real time, after {host['startup_s']:.1f} s of start-up"
         )
+    return lines
+
+
+def node_lines(result: dict[str, Any]) -> list[str]:
+    """Which nodes died, and of what."""
+    lines = []
+    for name, node in (result.get("nodes") or {}).items():
+        ends = [f"{c['how']} at {c['stamp_s']:.2f} s" for c in node["crashes"][:3]]
+        if len(node["crashes"]) > 3:
+            ends.append(f"{len(node['crashes']) - 3} more crashes")
+        if node["hangs"]:
+            ends.append(f"hung {node['hangs']} times" if node["hangs"] > 1 else "hung once")
+        if ends:
+            lines.append(f"Node        {name}: {'; '.join(ends)}; restarted {node['restarts']}x")
     return lines
 
 

@@ -1,0 +1,152 @@
+"""Nodes that die or hang: counted, restarted with fresh state, and the record repeats."""
+
+import json
+import os
+import signal
+
+import pytest
+
+from mavfi_cli.autonomy import point_cloud, tracking
+from mavfi_cli.autonomy.occupancy import OccupancyMap
+from mavfi_cli.mission import node_process
+from mavfi_cli.mission.executor import Executor
+from mavfi_cli.mission.run_folder import load_run
+
+
+def record(folder):
+    result = json.loads(folder.result.read_text())
+    del result["host"]
+    return folder.trace.read_bytes(), result
+
+
+@pytest.fixture
+def at_invocation(monkeypatch):
+    """Does something in the n-th call of a kernel, in the first process that serves it only."""
+    here = os.getpid()
+
+    def patch(owner, name, number, action):
+        real, calls = getattr(owner, name), []
+        token, theirs = os.pipe()
+        os.write(theirs, b"1")
+        os.set_blocking(token, False)
+
+        def kernel(*arguments):
+            calls.append(1)
+            if len(calls) == number and os.getpid() != here and taken(token):
+                action()
+            return real(*arguments)
+
+        monkeypatch.setattr(owner, name, kernel)
+
+    def taken(token):
+        try:
+            return os.read(token, 1) == b"1"
+        except BlockingIOError:
+            return False
+
+    return patch
+
+
+def crash():
+    signal.signal(signal.SIGSEGV, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def hang():
+    while True:
+        pass
+
+
+KERNELS = {
+    "point_cloud": (point_cloud, "generate"),
+    "octomap": (OccupancyMap, "insert"),
+    "control": (tracking, "step"),
+}
+
+
+@pytest.mark.parametrize("node", KERNELS)
+def test_a_crashed_node_is_restarted_and_the_mission_goes_on(fly_short, at_invocation, node):
+    records = []
+    for _ in range(2):
+        at_invocation(*KERNELS[node], 12, crash)
+        records.append(record(fly_short(isolate=(node,))))
+    assert records[0] == records[1]
+    result = records[0][1]
+    ends = result["nodes"].pop(node)
+    assert [c["how"] for c in ends["crashes"]] == ["killed by SIGSEGV"]
+    assert (ends["hangs"], ends["restarts"]) == (0, 1)
+    assert all(n == {"crashes": [], "hangs": 0, "restarts": 0} for n in result["nodes"].values())
+    (event,) = [e for e in result["events"] if e["kind"] == "node"]
+    assert event["text"] == f"node {node} crashed: killed by SIGSEGV"
+    assert result["outcome"] == "success"
+
+
+def test_a_hung_node_is_killed_by_the_watchdog(fly_short, at_invocation, monkeypatch, mavfi):
+    monkeypatch.setattr(node_process, "HANG_CPU_S", 0.3)
+    records, folder = [], None
+    for _ in range(2):
+        at_invocation(*KERNELS["octomap"], 5, hang)
+        folder = fly_short(isolate=("octomap",), node_watchdog_s=1.0)
+        records.append(record(folder))
+    assert records[0] == records[1]
+    result = load_run(folder.path).result
+    ends = result["nodes"]["octomap"]
+    assert (ends["crashes"], ends["hangs"], ends["restarts"]) == ([], 1, 1)
+    assert result["kernels"]["octomap"]["busy_s"] > result["config"]["node_watchdog_s"]
+    shown = mavfi("show", folder.path)
+    assert "octomap: hung once; restarted 1x" in shown.stdout
+
+
+def test_every_node_can_be_isolated_without_a_trace(fly_short, short_flight):
+    folder = fly_short(isolate=("point_cloud", "collision_check", "control"))
+    assert record(folder) == record(short_flight)
+
+
+def dying(value, _stamp_s):
+    if value == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return value
+
+
+@pytest.fixture
+def executor():
+    made = Executor(draw_latency_s=lambda _name: 0.1, cores=1, restart_s=1.0)
+    yield made
+    made.close()
+
+
+def test_the_input_is_lost_and_the_newest_waits_for_the_restart(executor):
+    published = []
+    executor.add("a", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
+    executor.isolate("a")
+    for stamp_s, value in [(0.0, "first"), (0.2, "die"), (0.4, "old"), (0.5, "new")]:
+        executor.advance(stamp_s)
+        executor.submit("a", value)
+    executor.advance(5.0)
+    # Due at 0.3, up again 1 s later, and then 0.1 s of work.
+    assert published == [("first", 0.1), ("new", 1.4)]
+    assert executor.nodes["a"].dropped == 1
+    assert [(loss.stamp_s, loss.how) for loss in executor.losses] == [
+        (pytest.approx(0.3), "killed by SIGKILL")
+    ]
+
+
+def test_a_node_that_is_down_leaves_its_core_to_others(executor):
+    published = []
+    executor.add("a", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
+    executor.add("b", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
+    executor.isolate("a")
+    executor.submit("a", "die")
+    executor.submit("b", "other")
+    executor.advance(0.5)
+    assert published == [("other", 0.2)]
+
+
+def test_a_call_of_a_node_that_is_down_gives_nothing(executor):
+    executor.add("a", dying, lambda _value, _stamp_s: None)
+    executor.isolate("a")
+    given = []
+    for stamp_s, value in [(0.0, 1), (0.02, "die"), (0.5, 2), (1.0, 3), (1.02, 4), (1.04, 5)]:
+        executor.advance(stamp_s)
+        given.append(executor.call("a", value, stamp_s))
+    assert given == [1, None, None, None, 4, 5]
