@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from mavfi_cli.mission.config import MissionConfig
 
 _PLAIN_EVERY_S = 10.0
-_TOLD = ("phase", "autopilot", "plan", "stop", "fault", "outcome")
+_TOLD = ("phase", "autopilot", "plan", "stop", "fault", "node", "outcome")
 
 
 class _Plain(Watcher):
     """A line for what happens, and one every ten simulated seconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, title: str) -> None:
+        self._title = title
         self._next_s = _PLAIN_EVERY_S
 
     def on_progress(self, progress: Progress) -> None:
@@ -33,6 +34,9 @@ class _Plain(Watcher):
             click.echo(_line(progress), err=True)
 
     def on_event(self, event: Event) -> None:
+        if self._title:  # only now, so that a mission that cannot begin gets one line
+            click.echo(self._title, err=True)
+            self._title = ""
         if event.kind in _TOLD:
             click.echo(f"{event.stamp_s:7.2f} s  {event.text}", err=True)
 
@@ -40,17 +44,22 @@ class _Plain(Watcher):
 class _Live(Watcher):
     """One line that is rewritten, with the events scrolling above it."""
 
-    def __init__(self, live: Live) -> None:
+    def __init__(self, live: Live, title: str) -> None:
         self._live = live
+        self._title = title
 
     def on_progress(self, progress: Progress) -> None:
         self._live.update(_line(progress), refresh=True)
 
     def on_event(self, event: Event) -> None:
+        from rich.text import Text  # not markup: an autopilot may say anything
+
+        if self._title:
+            self._live.console.print(Text(self._title, "bold"))
+            self._title = ""
         if event.kind in _TOLD:
-            self._live.console.print(
-                f"[dim]{event.stamp_s:7.2f} s[/dim]  {event.text}", highlight=False
-            )
+            stamp = (f"{event.stamp_s:7.2f} s", "dim")
+            self._live.console.print(Text.assemble(stamp, "  ", event.text))
 
 
 def _line(progress: Progress) -> str:
@@ -70,14 +79,12 @@ def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
     where = config.link or f"{config.world}, seed {config.seed}"
     title = f"Flying {config.vehicle} in {where}" if config.link is None else f"Flying {where}"
     if not sys.stderr.isatty():
-        click.echo(title, err=True)
-        yield _Plain()
+        yield _Plain(title)
         return
     from rich.console import Console
     from rich.live import Live
 
     console = Console(stderr=True)
-    console.print(f"[bold]{title}[/bold]", highlight=False)
     # No thread that refreshes: a mission may fork, and a fork must find one thread only.
     with Live("starting", console=console, auto_refresh=False, transient=True) as live:
-        yield _Live(live)
+        yield _Live(live, title)

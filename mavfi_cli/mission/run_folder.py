@@ -20,6 +20,7 @@ TLOG = "flight.tlog"
 PICTURE = "flight.svg"
 FAULT = "fault.json"
 CRASH = "crash.txt"
+_NEEDED = ("outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "host")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,4 +109,7 @@ def load_run(path: Path) -> Run:
         raise RecordError(f"{folder.path}: damaged ({error})") from None
     if not isinstance(result, dict) or result.get("schema") != 1:
         raise RecordError(f"{folder.result}: written by another version of mavfi")
+    missing = [key for key in _NEEDED if key not in result]
+    if missing:
+        raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")
     return Run(folder, result, trace)

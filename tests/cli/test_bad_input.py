@@ -1,0 +1,203 @@
+"""Bad input gets one clear line on stderr and exit code 1; nothing is flown, nothing is left."""
+
+import resource
+import socket
+import subprocess
+import sys
+
+import pytest
+from fake_autopilot import FakePX4
+
+from mavfi_cli.link import session
+from mavfi_cli.mission import flight
+
+
+@pytest.fixture
+def refused(command_line, tmp_path):
+    """Run `mavfi fly`, which must end with one line; the line. Also without --quiet."""
+
+    def run(*arguments):
+        code, out, err = command_line("fly", *arguments)
+        assert (code, out) == (1, "")
+        (line,) = err.splitlines()
+        assert line.startswith("error: ")
+        assert not (tmp_path / "runs").exists()
+        return line.removeprefix("error: ")
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("option", "given", "kind", "nearest"),
+    [
+        ("--world", "denze", "world", "dense"),
+        ("--planner", "rtstar", "planner", "rrtstar"),
+        ("--vehicle", "sollo", "vehicle", "solo"),
+        ("--platform", "x68", "platform", "x86"),
+        ("--isolate", "octomapp", "node", "octomap"),
+    ],
+)
+def test_an_unknown_name_gets_the_nearest(refused, option, given, kind, nearest):
+    line = refused(option, given)
+    assert line.startswith(f"unknown {kind} {given!r}: did you mean {nearest!r}? Known: ")
+
+
+def test_a_name_like_no_other_gets_the_list(refused):
+    assert refused("--world", "zzz").startswith("unknown world 'zzz': Known: dense, factory, farm")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--world", "factory", "--goal=18,10,5"), "goal (18, 10, 5) is inside an obstacle"),
+        (("--world", "factory", "--goal=18,10,99"), "goal (18, 10, 99) is outside"),
+        (("--world", "farm", "--goal=-300,10,5"), "goal (-300, 10, 5) is outside"),
+        (("--world", "factory", "--start=18,10,0"), "start (18, 10, 0) is blocked"),
+        (("--world", "farm", "--start=500,0,0"), "start (500, 0, 0) is outside"),
+    ],
+)
+def test_a_place_where_nobody_can_be(refused, arguments, said):
+    assert said in refused(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--v-max", "nan"), "v_max_mps: must be within 0.1 and 12, got nan"),
+        (("--a-max", "-1"), "a_max_mps2: must be within 0.5 and 8, got -1"),
+        (("--height", "0"), "takeoff_height_m: must be within"),
+        (("--time-limit", "inf"), "time_limit_s: must be within"),
+        (("--seed", "-1"), "seed: must be within 0 and 2^31 - 1, got -1"),
+        (("--camera", "2x2"), "camera_columns: must be within 4 and 1024 pixels, got 2"),
+        (("--goal", "nan,1,2"), "goal: must be three finite numbers"),
+        (("--start", "1,inf,2"), "start: must be three finite numbers"),
+    ],
+)
+def test_a_number_out_of_its_range_names_the_setting(refused, arguments, said):
+    assert refused(*arguments).startswith(said)
+
+
+@pytest.mark.parametrize("arguments", [("--goal", "1,2"), ("--camera", "big"), ("--wrold", "x")])
+def test_wrong_usage_exits_with_2_and_says_how_it_goes(command_line, arguments):
+    code, out, err = command_line("fly", *arguments)
+    assert (code, out) == (2, "")
+    assert "Usage: mavfi fly" in err
+    assert arguments[0] in err.splitlines()[-1]
+
+
+def test_an_unknown_command_gets_the_nearest(command_line):
+    code, _, err = command_line("fyl")
+    assert code == 2
+    assert "unknown command 'fyl': did you mean 'fly'?" in err
+
+
+# Files ---------------------------------------------------------------------------------------
+
+PLATFORM = 'name = "mine"\ncores = 4\n'
+WORLD = (
+    'name = "w"\nbounds_enu_m = [-10.0, -10.0, 0.0, 40.0, 20.0, 20.0]\n'
+    "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "line", "said"),
+    [
+        ("--platform", 'name = "mine"\ncores = \n', 2, "Invalid value"),
+        ("--platform", f"{PLATFORM}\n[kernels.octomap]\nlatensy_s = 1.0\n", 5, "'latency_s'"),
+        ("--platform", 'name = "mine"\ncores = "many"\n', 2, "cores: "),
+        ("--platform", f"{PLATFORM}\n[kernels.planner]\nlatency_s = -1.0\n", 4, "kernels.planner"),
+        ("--world", f"{WORLD}[[box]\n", 5, ""),
+        ("--world", f"{WORLD}goal_m = 3\n", 5, "'goal_enu_m'"),
+        ("--vehicle", 'name = "v"\nmass_kg = 1.0.0\n', 2, ""),
+        ("--vehicle", 'name = "v"\nmas_kg = 1.0\n', 2, "'mass_kg'"),
+    ],
+)
+def test_a_malformed_file_is_named_with_line_and_key(refused, tmp_path, option, text, line, said):
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    told = refused(option, "bad.toml")
+    assert told.startswith(f"bad.toml:{line}: ")
+    assert said in told
+
+
+@pytest.mark.parametrize("option", ["--platform", "--world", "--vehicle"])
+def test_a_file_that_is_not_there(refused, option):
+    assert "nowhere.toml" in refused(option, "nowhere.toml")
+
+
+# Links ---------------------------------------------------------------------------------------
+
+
+def test_a_link_that_is_no_url(refused):
+    assert refused("--link", "udpx:1", "--goal", "1,2,3").startswith("udpx:1: unknown kind")
+
+
+def test_a_port_in_use_for_the_companion(refused):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
+        assert refused("--link", url, "--goal", "1,2,3").startswith(f"{url}: ")
+
+
+def test_a_port_in_use_for_the_vehicle(mavfi):
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        url = f"tcpin:127.0.0.1:{taken.getsockname()[1]}"
+        done = mavfi("sitl", "--world", "farm", "--link", url)
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: {url}: ")
+    assert "in use" in line
+
+
+def test_no_autopilot_at_the_url(refused, free_port, monkeypatch):
+    settings = session.SessionSettings
+    monkeypatch.setattr(flight, "SessionSettings", lambda **o: settings(connect_timeout_s=0.2, **o))
+    url = f"udpin:127.0.0.1:{free_port}"
+    line = refused("--link", url, "--goal", "1,2,3")
+    assert line == f"no autopilot at {url}: no heartbeat within 0.2 s"
+
+
+def test_an_autopilot_that_refuses_to_arm_in_its_own_words(command_line, autopilot_on_udp):
+    autopilot = FakePX4()
+    autopilot.refuse_arming = "Preflight Fail: No valid data from Accel 0\t"
+    _, url = autopilot_on_udp(autopilot)
+    code, out, err = command_line("fly", "--link", url, "--goal", "1,2,3", "--quiet")
+    assert (code, out) == (1, "")
+    (line,) = err.splitlines()
+    assert line.startswith("error: autopilot refused arming: ")
+    assert line.endswith("(Preflight Fail: No valid data from Accel 0)")
+
+
+# The disk ------------------------------------------------------------------------------------
+
+
+def full_disk_at(size):
+    """The system refuses to let any file grow beyond a size."""
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+SHORT = ("fly", "--world", "farm", "--seed=5", "--start=2,2,0", "--goal=10,6,5", "--quiet")
+
+
+def test_a_full_disk_in_flight(mavfi, tmp_path):
+    done = mavfi(*SHORT, cwd=tmp_path, preexec_fn=full_disk_at(1 << 18))
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: runs/farm-5-001/flight.tlog: cannot write: File too large")
+    shown = mavfi("show", "runs/farm-5-001", cwd=tmp_path)
+    assert "cut off before its end" in shown.stderr
+
+
+def test_a_folder_that_cannot_be_made(refused, tmp_path):
+    (tmp_path / "file").write_text("")
+    line = refused(*SHORT[1:], "--out", "file/runs")
+    assert line.startswith("file/runs: ")
+
+
+def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
+    line = f"{sys.executable} -m mavfi_cli world list | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,151 @@
+"""Help, `show`, `world`, `doctor`."""
+
+import json
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from mavfi_cli.report.summary import event_lines, summary_lines
+
+HEAVY = ("numba", "numpy", "torch", "matplotlib", "scipy", "pyarrow", "ompl", "fcl", "pymavlink")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["fly", "--help"], ["bogus"]])
+def test_help_loads_nothing_heavy(arguments):
+    """What makes `mavfi --help` quick; how quick is measured in benchmarks/startup.py."""
+    program = (
+        "import sys, mavfi_cli.cli as c\nsys.argv = ['mavfi', *sys.argv[1:]]\n"
+        "try: c.main()\n"
+        f"finally: print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.stderr.splitlines()[-1] == "[]"
+
+
+def test_help_names_every_command(command_line):
+    code, out, _ = command_line("--help")
+    assert code == 0
+    for name in ("fly", "show", "world", "sitl", "doctor"):
+        assert f"\n  {name} " in out
+        sub_code, _, _ = command_line(name, "--help")
+        assert sub_code == 0
+
+
+# show ----------------------------------------------------------------------------------------
+
+
+def test_show_says_what_fly_said(command_line, short_flight):
+    result = json.loads(short_flight.result.read_text())
+    code, out, err = command_line("show", short_flight.path)
+    assert (code, err) == (0, "")
+    assert out.splitlines()[:-2] == summary_lines(result)
+    assert out.splitlines()[-1] == f"Run folder  {short_flight.path}"
+    assert command_line("show", short_flight.result)[1] == out
+
+
+def test_show_events_and_json(command_line, troubled_flight):
+    result = json.loads(troubled_flight.result.read_text())
+    _, out, _ = command_line("show", troubled_flight.path, "--events")
+    for line in event_lines(result):
+        assert line in out.splitlines()
+    _, out, _ = command_line("show", troubled_flight.path, "--json")
+    assert json.loads(out) == result
+
+
+@pytest.fixture
+def copied(short_flight, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(short_flight.path, folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda f: (f / "result.json").write_text('{"schema": 1, '), "damaged"),
+        (lambda f: (f / "result.json").write_bytes(b"\xff\xfe"), "damaged"),
+        (lambda f: (f / "result.json").write_text("[]"), "another version"),
+        (lambda f: (f / "result.json").write_text('{"schema": 99}'), "another version"),
+        (lambda f: (f / "result.json").write_text('{"schema": 1}'), "damaged"),
+        (lambda f: (f / "trace.parquet").write_bytes(b"PAR1 not"), "damaged"),
+        (lambda f: (f / "result.json").unlink(), "cut off before its end"),
+        (lambda f: [path.unlink() for path in f.iterdir()], "not a run folder"),
+        (shutil.rmtree, "no such run folder"),
+    ],
+)
+def test_show_says_in_one_line_what_is_wrong_with_a_run(command_line, copied, damage, said):
+    damage(copied)
+    code, out, err = command_line("show", copied)
+    assert (code, out) == (1, "")
+    (line,) = err.splitlines()
+    assert line.startswith("error: ")
+    assert said in line
+
+
+def test_show_does_without_a_trace(command_line, copied):
+    (copied / "trace.parquet").unlink()
+    assert command_line("show", copied)[0] == 0
+
+
+# world ---------------------------------------------------------------------------------------
+
+
+def test_world_list(command_line):
+    code, out, _ = command_line("world", "list")
+    assert code == 0
+    for name in ("sparse", "dense", "factory", "farm"):
+        assert any(line.startswith(name) for line in out.splitlines())
+
+
+def test_world_make_check_draw_a_file_of_ones_own(command_line, tmp_path):
+    assert command_line("world", "make", "dense", "--seed", "4", "-o", "mine.toml")[0] == 0
+    code, out, _ = command_line("world", "check", "mine.toml")
+    assert code == 0
+    assert out
+    assert command_line("world", "draw", "mine.toml", "-o", "mine.svg")[0] == 0
+    assert ET.parse(tmp_path / "mine.svg").getroot().tag.endswith("svg")
+
+
+def test_world_errors_pass_through(command_line):
+    code, out, err = command_line("world", "check", "denze")
+    assert (code, out) == (1, "")
+    assert err.startswith("error: unknown world 'denze': did you mean 'dense'?")
+
+
+def test_sitl_errors_pass_through(command_line):
+    code, out, err = command_line("sitl", "--vehicle", "sollo")
+    assert (code, out) == (1, "")
+    assert err.startswith("error: unknown vehicle 'sollo': did you mean 'solo'?")
+    assert command_line("sitl", "--speed", "-1")[0] == 2
+
+
+# doctor --------------------------------------------------------------------------------------
+
+
+def test_doctor(command_line):
+    code, out, _ = command_line("doctor", "--json")
+    checks = {check["name"]: check for check in json.loads(out)}
+    assert {"Python", "Processor", "Libraries", "Vehicle"} <= set(checks)
+    failed = [check for check in checks.values() if check["verdict"] == "failed"]
+    assert code == (1 if failed else 0)
+    assert checks["Vehicle"]["verdict"] == "ok"
+    for check in checks.values():
+        assert check["verdict"] == "ok" or check["remedy"]
+
+
+def test_doctor_exits_with_1_where_flying_would_not_work(command_line, monkeypatch):
+    from mavfi_cli.mission import machine
+
+    broken = machine.Check(
+        name="Libraries", verdict=machine.Verdict.FAILED, found="missing: ompl", remedy="pip"
+    )
+    monkeypatch.setattr(machine, "check_machine", lambda: iter([broken]))
+    code, out, _ = command_line("doctor")
+    assert code == 1
+    assert "missing: ompl" in out
+    assert "-> pip" in out
