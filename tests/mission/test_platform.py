@@ -1,0 +1,126 @@
+"""Compute platforms: their files, and the latencies that are drawn from them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
+from mavfi_cli.mission.platform import KERNELS, LatencyModel, load_platform, platform_names
+
+SOUND = 'name = "mine"\ncores = 2\n' + "".join(
+    f"[kernels.{kernel}]\nlatency_s = {0.01 * (k + 1):.2f}\nspread = 0.5\n"
+    for k, kernel in enumerate(KERNELS)
+)
+
+
+@pytest.fixture
+def load(tmp_path):
+    def of(text):
+        path = tmp_path / "mine.toml"
+        path.write_text(text)
+        return load_platform(str(path))
+
+    return of
+
+
+@pytest.mark.parametrize("name", platform_names())
+def test_shipped_platforms_have_every_kernel_with_its_source(name):
+    platform = load_platform(name)
+    assert platform.name == name
+    assert platform.cores >= 1
+    for kernel in KERNELS:
+        assert platform.kernels[kernel].latency_s > 0.0
+        assert platform.kernels[kernel].source
+
+
+def test_x86_is_the_paper_s(load):
+    x86 = load_platform("x86").kernels
+    assert x86["octomap"].latency_s == 0.289
+    assert x86["planner"].latency_s == 0.083
+    assert x86["control"].latency_s == 0.00046
+
+
+def test_a_file_of_one_s_own(load):
+    platform = load(SOUND)
+    assert (platform.name, platform.cores, platform.mass_kg) == ("mine", 2, 0.0)
+    assert platform.kernels["octomap"].latency_s == 0.02
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("cores = 2", "cores = 0", r"mine\.toml.*cores must be at least 1"),
+        ("cores = 2", "cores = 2.5", r"mine\.toml:2: cores: expected int"),
+        ("cores = 2", "corse = 2", r"mine\.toml:2: corse: unknown key; did you mean 'cores'"),
+        ("cores = 2", "cores = ", r"mine\.toml:2: Invalid value"),
+        ("[kernels.planner]", "[kernels.planer]", "without a latency: planner"),
+        ("latency_s = 0.02", "latency_s = -0.02", r"mine\.toml:6: kernels\.octomap: .*negative"),
+        ("latency_s = 0.02", "latency_s = nan", "finite"),
+        ("latency_s = 0.02", 'latency_s = "fast"', r"mine\.toml:7: kernels\.octomap\.latency_s"),
+        ("spread = 0.5", "spread = 2.5", "spread must be within 0 and 2"),
+        ("cores = 2", "cores = 2\npower_w = -1.0", "must not be negative"),
+    ],
+)
+def test_what_is_wrong_with_a_file(load, old, new, said):
+    with pytest.raises(ConfigError, match=said) as error:
+        load(SOUND.replace(old, new, 1))
+    assert "\n" not in str(error.value)
+
+
+def test_a_kernel_too_many(load):
+    with pytest.raises(ConfigError, match="unknown kernels: dreams"):
+        load(SOUND + "[kernels.dreams]\nlatency_s = 1.0\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("x87", UnknownName), ("none.toml", ConfigError), ("", UnknownName)]
+)
+def test_no_such_platform(name, kind):
+    with pytest.raises(kind):
+        load_platform(name)
+    assert issubclass(kind, MavfiError)
+
+
+def draws(model, kernel, count=4000):
+    return np.array([model.draw_s(kernel) for _ in range(count)])
+
+
+def test_latencies_are_log_normal_round_their_median(load):
+    logs = np.log(draws(LatencyModel(load(SOUND), 1), "octomap"))
+    error = 0.5 / math.sqrt(len(logs))
+    assert logs.mean() == pytest.approx(math.log(0.02), abs=4 * error)
+    assert logs.std() == pytest.approx(0.5, rel=0.06)
+    inside = np.abs(logs - math.log(0.02)) < 0.5
+    assert inside.mean() == pytest.approx(0.6827, abs=0.03)
+
+
+def test_without_spread_it_is_the_median_always(load):
+    model = LatencyModel(load(SOUND.replace("spread = 0.5", "spread = 0.0")), 1)
+    assert set(draws(model, "planner", 50)) == {0.04}
+
+
+def test_a_seed_repeats_and_another_differs(load):
+    profile = load(SOUND)
+    once, twice = (draws(LatencyModel(profile, 5), "planner", 20) for _ in range(2))
+    np.testing.assert_array_equal(once, twice)
+    assert (draws(LatencyModel(profile, 6), "planner", 20) != once).all()
+
+
+def test_one_kernel_s_draws_do_not_shift_another_s(load):
+    """So a faulty flight, whose kernels run at other times, stays paired with its golden one."""
+    profile = load(SOUND)
+    alone, mixed = LatencyModel(profile, 5), LatencyModel(profile, 5)
+    expected = draws(alone, "planner", 50)
+    found = []
+    for _ in range(50):
+        mixed.draw_s("octomap")
+        found.append(mixed.draw_s("planner"))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_the_kernels_draws_are_independent(load):
+    model = LatencyModel(load(SOUND), 5)
+    logs = np.log([draws(model, kernel, 2000) for kernel in KERNELS])
+    correlation = np.corrcoef(logs) - np.eye(len(KERNELS))
+    assert np.abs(correlation).max() < 0.1
