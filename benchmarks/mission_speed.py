@@ -60,8 +60,8 @@ def main() -> None:
     print(f"times real time: median {statistics.median(factors):.1f} "
           f"({factors[0]:.1f} to {factors[-1]:.1f})")  # fmt: skip
     print(f"start-up to first heartbeat: median {statistics.median(startups):.2f} s")
-    print(f"peak memory: {memory['companion']:.0f} MB companion + {memory['vehicle']:.0f} MB vehicle "
-          f"= {sum(memory.values()):.0f} MB")  # fmt: skip
+    sides = " + ".join(f"{megabytes:.0f} MB {side}" for side, megabytes in memory.items())
+    print(f"peak memory: {sides} = {sum(memory.values()):.0f} MB")
     stages("companion", results, "stage_wall_s")
     stages("vehicle", results, "vehicle_stage_wall_s")
 
