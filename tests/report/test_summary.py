@@ -1,0 +1,65 @@
+"""A run in words, for every way in which it can end."""
+
+import json
+
+import pytest
+
+from mavfi_cli.core.types import Outcome
+from mavfi_cli.report.summary import event_lines, outcome_line, summary_lines
+
+
+@pytest.fixture
+def result(short_flight):
+    return json.loads(short_flight.result.read_text())
+
+
+@pytest.mark.parametrize("outcome", Outcome)
+def test_every_outcome_has_its_words(result, outcome):
+    result.update(outcome=outcome.value, reason="why it was")
+    first = summary_lines(result)[0]
+    assert first.startswith(outcome.value.upper().replace("_", " "))
+    assert first.endswith("(why it was)")
+    result["reason"] = ""
+    assert "(" not in outcome_line(result)
+
+
+def test_the_figures_are_those_of_the_record(result):
+    text = "\n".join(summary_lines(result))
+    quality = result["quality_of_flight"]
+    for figure in (
+        f"{quality['flight_time_s']:.1f} s, ",
+        f"{quality['distance_m']:.1f} m flown",
+        f"{quality['goal_distance_m']:.2f} m from the goal",
+        f"{quality['min_clearance_m']:.2f} m at the closest",
+        f"{quality['energy_regression_j'] / 1e3:.1f} kJ (paper's regression)",
+        f"{quality['energy_propeller_j'] / 1e3:.1f} kJ (propeller shafts)",
+        f"{result['pilot']['plans_requested']} asked for",
+        f"{result['response_time_s']['median'] * 1e3:.0f} ms from depth frame",
+        f"{result['simulated_s'] / result['host']['flight_wall_s']:.0f} times real time",
+        "solo in farm, seed 5; planner rrtstar, platform x86",
+    ):
+        assert figure in text
+
+
+def test_what_is_not_known_is_said_so(result):
+    result["quality_of_flight"] = dict.fromkeys(result["quality_of_flight"])
+    result["response_time_s"] = {"median": None, "p95": None, "count": 0}
+    result["host"]["flight_wall_s"] = 0.0
+    text = "\n".join(summary_lines(result))
+    assert "Flight      not known, not known flown, not known from the goal" in text
+    assert "Clearance   not known at the closest" in text
+    assert "None" not in text
+    assert "nan" not in text
+    assert "Response" not in text
+    assert "Host" not in text
+
+
+def test_a_foreign_autopilot_is_named_by_its_link(result):
+    result["config"]["link"] = "udpin:127.0.0.1:14540"
+    assert "foreign autopilot at udpin:127.0.0.1:14540" in "\n".join(summary_lines(result))
+
+
+def test_events_come_one_a_line_in_order(result):
+    lines = event_lines(result)
+    assert len(lines) == len(result["events"])
+    assert lines[-1].split() == [f"{result['simulated_s']:.2f}", "s", "outcome", "success"]

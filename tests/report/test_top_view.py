@@ -1,0 +1,132 @@
+"""The picture of a flight: parsed as XML, and measured on the axes that it is drawn on."""
+
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.patches import Circle, Rectangle
+
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.types import Outcome
+from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.report.top_view import draw_top_view, write_top_view
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.fixture(scope="module")
+def run(troubled_flight):
+    return load_run(troubled_flight.path)
+
+
+@pytest.fixture(scope="module")
+def axes(run):
+    return draw_top_view(run).axes[0]
+
+
+def texts(path):
+    root = ET.parse(path).getroot()
+    assert root.tag == f"{SVG}svg"
+    return ["".join(element.itertext()) for element in root.iter(f"{SVG}text")]
+
+
+def changed(run, **changes):
+    return replace(run, result={**run.result, **changes})
+
+
+def test_equal_runs_give_equal_bytes_whatever_the_settings(run, tmp_path):
+    write_top_view(run, tmp_path / "a.svg")
+    with mpl.rc_context({"svg.hashsalt": "another", "svg.fonttype": "path"}):
+        write_top_view(run, tmp_path / "b.svg")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    assert {p.name for p in tmp_path.iterdir()} == {"a.svg", "b.svg"}
+
+
+def test_it_says_what_one_needs_to_know(run, tmp_path):
+    write_top_view(run, tmp_path / "flight.svg")
+    said = texts(tmp_path / "flight.svg")
+    quality = run.result["quality_of_flight"]
+    title = f"posts, seed 2: success, {quality['flight_time_s']:.1f} s, "
+    assert any(text.startswith(title) for text in said)
+    assert {"east, m", "north, m", "speed, m/s", "goal", "start", "planned", "new plan"} <= set(
+        said
+    )
+    assert not re.search(rb"\d{4}-\d\d-\d\dT", (tmp_path / "flight.svg").read_bytes())
+
+
+def test_obstacles_are_where_the_world_has_them(run, axes):
+    drawn = {
+        (*p.get_xy(), p.get_width(), p.get_height())
+        for p in axes.patches
+        if isinstance(p, Rectangle)
+    }
+    boxes = run.result["world"]["boxes"]
+    assert drawn == {(b[0], b[1], b[3] - b[0], b[4] - b[1]) for b in boxes}
+
+
+def test_the_path_is_the_truth_coloured_by_speed(run, axes):
+    (path,) = [c for c in axes.collections if isinstance(c, LineCollection)]
+    points = np.array([segment[0] for segment in path.get_segments()])
+    trace = run.trace
+    true = np.column_stack([trace["truth_x_m"].to_numpy(), trace["truth_y_m"].to_numpy()])
+    np.testing.assert_array_equal(points, true[:-1])
+    speeds = np.linalg.norm(
+        np.column_stack([trace[f"truth_v{axis}_mps"].to_numpy() for axis in "xyz"]), axis=1
+    )
+    np.testing.assert_allclose(path.get_array(), speeds[1:])
+    assert path.get_clim() == (0.0, run.result["config"]["v_max_mps"])
+
+
+def test_every_plan_and_every_mark_is_drawn(run, axes):
+    assert len(axes.lines) == len(run.result["plans"])
+    places = {
+        label: collection.get_offsets()
+        for collection in axes.collections
+        if isinstance(collection, PathCollection)
+        for label in [collection.get_label()]
+    }
+    for kind, label in (("replan", "new plan"), ("slow", "slows down"), ("stop", "stops")):
+        told = [e["position_enu_m"][:2] for e in run.result["events"] if e["kind"] == kind]
+        if told:
+            np.testing.assert_array_equal(places[label], told)
+        else:
+            assert label not in places
+    (goal,) = [p for p in axes.patches if isinstance(p, Circle)]
+    assert goal.get_center() == tuple(run.result["goal_enu_m"][:2])
+    assert goal.get_radius() == run.result["config"]["goal_tolerance_m"]
+
+
+def test_scales_are_equal_and_everything_of_the_flight_is_inside(run, axes):
+    assert axes.get_aspect() == 1.0
+    (low_x, high_x), (low_y, high_y) = axes.get_xlim(), axes.get_ylim()
+    x, y = run.trace["truth_x_m"].to_numpy(), run.trace["truth_y_m"].to_numpy()
+    assert low_x < x.min() < x.max() < high_x
+    assert low_y < y.min() < y.max() < high_y
+
+
+@pytest.mark.parametrize("outcome", [o for o in Outcome if o is not Outcome.SUCCESS])
+def test_a_flight_that_failed_shows_where(run, outcome):
+    axes = draw_top_view(changed(run, outcome=outcome.value)).axes[0]
+    (mark,) = [c for c in axes.collections if c.get_label().replace(" ", "_") == outcome.value]
+    end = [run.trace["truth_x_m"][-1].as_py(), run.trace["truth_y_m"][-1].as_py()]
+    np.testing.assert_array_equal(mark.get_offsets(), [end])
+
+
+def test_without_referee_world_or_trace_there_is_a_picture_all_the_same(run, tmp_path):
+    heard = run.trace.drop_columns([c for c in run.trace.column_names if c.startswith("truth_")])
+    foreign = replace(changed(run, world=None, referee=None), trace=heard)
+    empty = replace(changed(run, world=None, plans=[], events=[]), trace=run.trace.slice(0, 0))
+    lost = replace(changed(run, world=None, goal_enu_m=None), trace=None)
+    unknown = changed(run, quality_of_flight=dict.fromkeys(run.result["quality_of_flight"]))
+    for number, odd in enumerate((foreign, empty, lost, unknown)):
+        write_top_view(odd, tmp_path / f"{number}.svg")
+        assert "east, m" in texts(tmp_path / f"{number}.svg")
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(run, tmp_path):
+    with pytest.raises(RecordError, match="No such file"):
+        write_top_view(run, tmp_path / "none" / "flight.svg")
