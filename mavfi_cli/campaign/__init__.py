@@ -1,0 +1,1 @@
+"""Many runs instead of one: isolated kernels, and missions by the thousand."""

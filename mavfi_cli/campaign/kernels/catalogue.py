@@ -1,0 +1,151 @@
+"""The kernels that can be attacked in isolation: how each is called and how outputs compare."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, tracking
+from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
+from mavfi_cli.campaign.kernels.difference import Compare, Output, numbers, paths, voxels
+from mavfi_cli.campaign.kernels.inputs import KernelInputs
+from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.mission.kernel_scope import KernelScope, kernel_scope
+
+Call = Callable[[], Output]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kernel:
+    """One kernel with everything that an isolated run of it needs.
+
+    Attributes:
+        name: as `--kernel` takes it.
+        title: as tables print it.
+        prepare: from the inputs to a call; everything before the kernel itself happens here.
+        compare: size of the difference of two outputs.
+        repeatable: the call leaves no state behind, so it is warmed up by calling it.
+        too_long: to be stepped as a whole; functions inside it are sampled.
+    """
+
+    name: str
+    title: str
+    prepare: Callable[[KernelInputs], Call]
+    compare: Compare = numbers
+    repeatable: bool = True
+    too_long: bool = False
+
+    def scope(self) -> KernelScope:
+        """Its machine code that can be hit, in a process in which it has run."""
+        return kernel_scope(self.name)
+
+
+def _point_cloud(inputs: KernelInputs) -> Call:
+    params = point_cloud.PointCloudParams()
+
+    def call() -> Output:
+        cloud = point_cloud.generate(inputs.frame, params)
+        return {"points_enu_m": cloud.points_enu_m, "origin_enu_m": cloud.origin_enu_m}
+
+    return call
+
+
+def _octomap(inputs: KernelInputs) -> Call:
+    world = occupancy.OccupancyMap(occupancy.OccupancyParams())
+    for cloud in inputs.mapped:
+        world.insert(cloud)
+
+    def call() -> Output:
+        world.insert(inputs.cloud)
+        payload = np.frombuffer(world.snapshot().payload, np.uint8)
+        return {"payload": payload, "nodes": np.array(world.nodes)}
+
+    return call
+
+
+def _collision_check(inputs: KernelInputs) -> Call:
+    params = collision.CollisionParams()
+
+    def call() -> Output:
+        _, report = collision.step(collision.CollisionState(), inputs.check, params)
+        return {
+            "collision": np.array(report.collision),
+            "time_to_collision_s": np.array(report.time_to_collision_s),
+            "future_collision_seq": np.array(report.future_collision_seq),
+        }
+
+    return call
+
+
+def _planner(name: str) -> Callable[[KernelInputs], Call]:
+    def prepare(inputs: KernelInputs) -> Call:
+        task, planner = inputs.task, planners.find(name)
+        problem = pose_problem(
+            task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
+        )
+
+        def call() -> Output:
+            result = planner.plan(problem, task.seed)
+            return {"found": np.array(result.found), "path_enu_m": result.path_enu_m}
+
+        return call
+
+    return prepare
+
+
+def _control(inputs: KernelInputs) -> Call:
+    def call() -> Output:
+        state, command = tracking.step(
+            inputs.tracking_state, inputs.tracking, inputs.tracking_params
+        )
+        return {
+            "velocity_enu_mps": command.velocity_enu_mps,
+            "acceleration_enu_mps2": command.acceleration_enu_mps2,
+            "yaw_rad": np.array(command.yaw_rad),
+            "integral_mps": state.integral_mps,
+        }
+
+    return call
+
+
+KERNELS = {
+    kernel.name: kernel
+    for kernel in (
+        Kernel(name="point_cloud", title="Point cloud", prepare=_point_cloud),
+        Kernel(
+            name="octomap",
+            title="OctoMap",
+            prepare=_octomap,
+            compare=voxels,
+            repeatable=False,
+            too_long=True,
+        ),
+        Kernel(name="collision_check", title="Collision check", prepare=_collision_check),
+        Kernel(name="rrt", title="RRT", prepare=_planner("rrt"), compare=paths),
+        Kernel(
+            name="rrtconnect", title="RRTConnect", prepare=_planner("rrtconnect"), compare=paths
+        ),
+        Kernel(name="rrtstar", title="RRT*", prepare=_planner("rrtstar"), compare=paths),
+        Kernel(name="control", title="PID", prepare=_control),
+    )
+}
+
+
+def find(name: str) -> Kernel:
+    """A kernel by its name.
+
+    Raises:
+        UnknownName: there is none; names the nearest.
+    """
+    try:
+        return KERNELS[name]
+    except KeyError:
+        raise UnknownName("kernel", name, KERNELS) from None
+
+
+def select(names: Iterable[str]) -> tuple[Kernel, ...]:
+    """The named kernels in the order of the pipeline; all where none is named."""
+    wanted = {find(name).name for name in names} or set(KERNELS)
+    return tuple(kernel for name, kernel in KERNELS.items() if name in wanted)

@@ -1,0 +1,72 @@
+"""What the kernels are fed: the inputs of one moment in the middle of a golden flight."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+
+from mavfi_cli.autonomy.collision import CollisionInputs
+from mavfi_cli.autonomy.occupancy import MapSnapshot
+from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingParams, TrackingState
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.types import DepthFrame, FloatArray, PointCloud
+
+_PROTOCOL = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanningTask:
+    """One request of the flight to a planner."""
+
+    snapshot: MapSnapshot
+    start_enu_m: FloatArray  # (3,)
+    goal_enu_m: FloatArray  # (3,)
+    bounds_enu_m: FloatArray  # (6,)
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelInputs:
+    """Inputs and states of all kernels, each as of one invocation of the golden flight."""
+
+    flight: str  # which flight, in words
+    frame: DepthFrame
+    mapped: tuple[PointCloud, ...]  # clouds that the map held already
+    cloud: PointCloud  # the next one
+    check: CollisionInputs
+    task: PlanningTask
+    tracking_state: TrackingState
+    tracking: TrackingInputs
+    tracking_params: TrackingParams
+
+
+def save_inputs(path: Path, inputs: KernelInputs) -> str:
+    """Write the inputs; returns the SHA-256 of the file.
+
+    Raises:
+        RecordError: the file could not be written.
+    """
+    data = pickle.dumps(inputs, protocol=_PROTOCOL)
+    write_atomically(path, lambda file: file.write(data))
+    return hashlib.sha256(data).hexdigest()
+
+
+def load_inputs(path: Path) -> tuple[KernelInputs, str]:
+    """Read inputs that `save_inputs` wrote, and the SHA-256 of the file.
+
+    The file is a pickle: load only what you wrote yourself.
+
+    Raises:
+        RecordError: no such file, or something else.
+    """
+    try:
+        data = path.read_bytes()
+        inputs = pickle.loads(data)
+    except (OSError, pickle.UnpicklingError, AttributeError, EOFError, ImportError) as error:
+        raise RecordError(f"{path}: not a file of kernel inputs ({error})") from None
+    if not isinstance(inputs, KernelInputs):
+        raise RecordError(f"{path}: not a file of kernel inputs")
+    return inputs, hashlib.sha256(data).hexdigest()
