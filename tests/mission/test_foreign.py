@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import socket
 import subprocess
 import sys
 
@@ -13,6 +14,7 @@ from mavfi_cli.core.errors import CommandRefused, ConfigError, Interrupted, NoAu
 from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.mission import flight
+from mavfi_cli.mission import run as run_module
 from mavfi_cli.mission.run_folder import load_run
 
 SPEED = 5.0
@@ -174,3 +176,18 @@ def test_garbage_on_the_link_does_not_disturb_the_flight(autopilot_on_udp, fly_s
     link.noise = lambda: rng.bytes(int(rng.integers(1, 300)))
     result = load_run(fly_short(link=url, time_limit_s=2.0).path).result
     assert result["outcome"] == "timeout"
+
+
+def test_the_link_opens_only_when_everything_is_loaded(fly_short, free_port, hurried, monkeypatch):
+    """Seconds of old messages, then a gap where the buffer was full, looked like a lost link."""
+    loaded = []
+
+    def warm_up():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", free_port))
+        loaded.append(True)
+
+    monkeypatch.setattr(run_module, "warm_up", warm_up)
+    with pytest.raises(NoAutopilot):
+        fly_short(link=f"udpin:127.0.0.1:{free_port}")
+    assert loaded == [True]
