@@ -1,4 +1,4 @@
-"""`mavfi kernels`: one fault a run in an isolated program, and what it did to the output."""
+"""`mavfi kernels`: one fault a run in an isolated kernel, and what it did to the output."""
 
 from __future__ import annotations
 
@@ -19,15 +19,22 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option("--program", required=True, help="The native program to attack.")
-@click.option("--args", default="", help="Its arguments, quoted as in a shell.")
-@click.option("--compare", default="stdout", show_default=True, help="stdout or file:PATH.")
-@click.option("--tolerance", default=0.0, help="Relative difference of numbers that is no SDC.")
+@click.option("--kernel", multiple=True, metavar="NAME",
+              help="point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar or control. "
+                   "May be repeated  [all].")  # fmt: skip
+@click.option("--world", default="dense", show_default=True,
+              help="World of the golden flight that feeds the kernels.")  # fmt: skip
+@click.option("--world-seed", default=3, show_default=True, help="Its seed.")
+@click.option("--program", help="Attack this native program instead of our kernels.")
+@click.option("--args", help="Its arguments, quoted as in a shell.")
+@click.option("--compare", help="What of it is compared: stdout or file:PATH  [stdout].")
+@click.option("--tolerance", default=0.0, type=click.FloatRange(min=0.0),
+              help="Relative difference that is no SDC.")  # fmt: skip
 @click.option("--runs", default=1000, show_default=True, type=click.IntRange(min=1))
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1))
 @click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
-@click.option("--scope", multiple=True, help="Shared object in scope; default the program.")
-@click.option("--function", help="Attack only inside invocations of this function.")
+@click.option("--scope", multiple=True, help="Program: shared object in scope.")
+@click.option("--function", help="Program: attack only inside calls of this function.")
 @click.option("--windows", default=16, show_default=True, help="Invocations that are sampled.")
 @click.option(
     "--sampling",
@@ -41,13 +48,44 @@ if TYPE_CHECKING:
 @click.option("--bits", default=1, type=click.IntRange(min=1), help="Bits flipped at once.")
 @click.option("--compat", help="Repeat another injector's habits: rosfi-2021.")
 @click.option("--null", is_flag=True, help="Do everything but the flip.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for records, JSON and CSV.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False),
+              help="Folder for records, JSON, CSV, plot; what it has is not repeated.")  # fmt: skip
+@click.option("--replay", type=click.Path(path_type=Path, file_okay=False),
+              help="Repeat the recorded runs of such a folder and compare.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def kernels(**options: Any) -> None:
-    """Flip bits in a native program, one fault a run, and compare its output.
+    """Flip bits in one kernel at a time, one fault a run, and compare its output.
+
+    Attacks the kernels of the autonomy, or with --program any native program.
 
     Outcomes: benign, crash, hang, SDC (silent data corruption), not injected.
     """
+    from mavfi_cli.cli.own_kernels import replay_folder, run_own_kernels
+
+    if options["replay"] is not None:
+        limit = options["runs"] if _given("runs") else 0
+        if not replay_folder(options["replay"], options["kernel"], limit):
+            raise click.exceptions.Exit(1)
+    elif options["program"] is not None:
+        _refuse(options, ("kernel",), "goes without --program")
+        _attack_program(options)
+    else:
+        _refuse(options, ("args", "compare", "scope", "function"), "needs --program")
+        run_own_kernels(options, _model(options))
+
+
+def _given(name: str) -> bool:
+    source = click.get_current_context().get_parameter_source(name)
+    return source is not click.core.ParameterSource.DEFAULT
+
+
+def _refuse(options: dict[str, Any], names: tuple[str, ...], why: str) -> None:
+    for name in names:
+        if options[name]:
+            raise click.UsageError(f"--{name} {why}")
+
+
+def _attack_program(options: dict[str, Any]) -> None:
     from mavfi_cli.fi.isolated.campaign import run_campaign
 
     as_json, out = options["as_json"], options["out"]
@@ -69,9 +107,9 @@ def _plan(options: dict[str, Any]) -> Plan:
     from mavfi_cli.fi.isolated.program import ProgramTarget, absolute_arguments
     from mavfi_cli.fi.native.spawn import Command
 
-    comparison = Comparison.of(options["compare"], options["tolerance"])
+    comparison = Comparison.of(options["compare"] or "stdout", options["tolerance"])
     try:
-        arguments: tuple[str, ...] = tuple(shlex.split(options["args"]))
+        arguments: tuple[str, ...] = tuple(shlex.split(options["args"] or ""))
     except ValueError as error:
         raise ConfigError(str(error), key="args") from None
     if comparison.file is not None:

@@ -39,10 +39,10 @@ class Journal:
         path = folder / PLAN
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            stored = json.loads(path.read_text()) if path.is_file() else None
-        except (OSError, ValueError) as error:
-            raise RecordError(f"{path}: {error}") from None
-        if stored is not None:
+        except OSError as error:
+            raise RecordError(f"{folder}: {error.strerror}") from None
+        if path.is_file():
+            stored = read_plan(folder)
             differs = sorted(key for key in known if stored.get(key) != known[key])
             if differs:
                 raise ConfigError(f"holds another campaign; it differs in {differs}", path=folder)
@@ -91,6 +91,20 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
         "bits": model.count,
     }
     return values
+
+
+def read_plan(folder: Path) -> dict[str, Any]:
+    """What the runs of a folder depend on.
+
+    Raises:
+        RecordError: the folder holds no campaign.
+    """
+    path = folder / PLAN
+    try:
+        plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RecordError(f"{path}: {error}") from None
+    return plan
 
 
 def read_runs(folder: Path, kernel: str | None = None) -> Iterator[dict[str, Any]]:

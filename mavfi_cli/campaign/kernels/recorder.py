@@ -12,8 +12,14 @@ from mavfi_cli.autonomy import planners, tracking, warm_up
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.pilot import Directive, PlanRequest
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
-from mavfi_cli.campaign.kernels.inputs import KernelInputs, PlanningTask
-from mavfi_cli.core.errors import MavfiError, TargetError
+from mavfi_cli.campaign.kernels.inputs import (
+    KernelInputs,
+    PlanningTask,
+    load_inputs,
+    save_inputs,
+)
+from mavfi_cli.campaign.kernels.journal import INPUTS
+from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import Command, DepthFrame, FloatArray, Outcome, PointCloud, VehicleState
 from mavfi_cli.link.transport import open_transport
@@ -54,7 +60,7 @@ def record_inputs(config: MissionConfig) -> KernelInputs:
     """
     recording = _Recording()
     _fly(config, recording)
-    name = f"golden flight: world {config.world}, seed {config.seed}"
+    name = flight_name(config)
     if min(len(recording.frames), len(recording.clouds), len(recording.ticks)) < 4:
         raise TargetError(name, "is too short to record kernels")
     return _middle(name, config, recording)
@@ -201,3 +207,31 @@ def _inputs_of(tick: _Tick) -> tracking.TrackingInputs:
         hold_enu_m=directive.hold_enu_m,
         hold_yaw_rad=directive.hold_yaw_rad,
     )
+
+
+def inputs_of_flight(config: MissionConfig, folder: Path) -> tuple[Path, str, str]:
+    """The inputs of a golden flight: from the folder where it has them, else flown now.
+
+    Returns:
+        The file, the flight in words, and the file's SHA-256.
+
+    Raises:
+        ConfigError: the folder has the inputs of another flight.
+    """
+    path = folder / INPUTS
+    if path.is_file():
+        known, sha256 = load_inputs(path)
+        if known.flight != flight_name(config):
+            raise ConfigError(f"holds inputs of a {known.flight}", path=path)
+        return path, known.flight, sha256
+    inputs = record_inputs(config)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{folder}: {error.strerror}") from None
+    return path, inputs.flight, save_inputs(path, inputs)
+
+
+def flight_name(config: MissionConfig) -> str:
+    """A golden flight in words."""
+    return f"golden flight: world {config.world}, seed {config.seed}"

@@ -1,0 +1,75 @@
+"""Repeat recorded runs to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.kernels import catalogue
+from mavfi_cli.campaign.kernels.attack import Attacker, golden_run
+from mavfi_cli.campaign.kernels.journal import INPUTS, read_plan, read_runs
+from mavfi_cli.campaign.kernels.place import Place, load, template_of
+from mavfi_cli.campaign.kernels.runs import completed, one_processor
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.fi import record
+
+# What a replay must repeat; how long things took is not part of it.
+_COMPARED = (
+    "outcome", "signal", "error", "magnitude", "within_tolerance", "output_sha256",
+    "not_injected_reason", "activation",
+)  # fmt: skip
+_INJECTION = ("applied", "reason", "address", "before", "after")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Replay:
+    """One repeated run."""
+
+    kernel: str
+    run: int
+    differs: tuple[str, ...]  # keys of the record; empty: identical
+    record: dict[str, Any]
+
+
+def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> Iterator[Replay]:
+    """Repeat the runs of a campaign's folder.
+
+    Args:
+        folder: of the campaign.
+        kernels: only these; all where none is named.
+        runs: only as many of each kernel, the first; 0 for all.
+
+    Raises:
+        RecordError: the folder holds no runs that can be repeated.
+        BuildMismatch: a record is of another build; says what differs.
+    """
+    tolerance = float(read_plan(folder)["tolerance"])
+    found = False
+    for kernel in catalogue.select(kernels):
+        records = [entry for entry in read_runs(folder, kernel.name) if entry["trigger"]]
+        if not records:
+            continue
+        found = True
+        template = template_of(kernel.name, folder / INPUTS)
+        with one_processor():
+            load(kernel.name, template)
+            with closing(Place(kernel.name, template)) as place:
+                attacker = Attacker(
+                    kernel=kernel, place=place, golden=golden_run(place), tolerance=tolerance
+                )
+                for entry in records[: runs or None]:
+                    record.require_same_build(entry, place.layout.image)
+                    yield _replay(attacker, entry)
+    if not found:
+        raise RecordError(f"{folder}: no runs that can be repeated")
+
+
+def _replay(attacker: Attacker, entry: dict[str, Any]) -> Replay:
+    again = completed(entry, attacker.run(record.fault_of(entry)))
+    differs = [name for name in _COMPARED if again[name] != entry[name]]
+    was, now = entry["injection"], again["injection"]
+    differs += [name for name in _INJECTION if now.get(name) != was.get(name)]
+    return Replay(kernel=entry["kernel"], run=entry["run"], differs=tuple(differs), record=again)

@@ -1,0 +1,153 @@
+"""Counts, shares and intervals of isolated runs, with all that the numbers depend on."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from mavfi_cli.campaign.kernels import catalogue, journal
+from mavfi_cli.campaign.kernels.runs import KernelRuns, Plan
+from mavfi_cli.fi.isolated.outcome import Outcome, shares
+
+SCHEMA = 1
+_COLUMNS = (
+    "kernel run outcome signal error relative absolute unit text within_tolerance object offset "
+    "symbol instruction k site role operand bits before after activation not_injected_reason "
+    "stop_s run_s output_sha256"
+)
+CSV_COLUMNS = _COLUMNS.split()
+_SHOWN = (Outcome.BENIGN, Outcome.CRASH, Outcome.HANG, Outcome.SDC, Outcome.NOT_INJECTED)
+
+
+def summarise(plan: Plan, campaign: Sequence[KernelRuns]) -> dict[str, Any]:
+    """The whole campaign as plain values."""
+    return {
+        "schema": SCHEMA,
+        "plan": journal.plan_to_json(plan),
+        "sampling": plan.strategy().name,
+        "kernels": [_kernel(runs) for runs in campaign],
+    }
+
+
+def _kernel(runs: KernelRuns) -> dict[str, Any]:
+    prepared, records = runs.prepared, runs.records
+    profile = prepared.profile
+    outcomes = [Outcome(entry["outcome"]) for entry in records]
+    sizes = [entry["magnitude"]["relative"] for entry in _with(records, Outcome.SDC)]
+    finite = sorted(size for size in sizes if size is not None)
+    run_s = sum(entry["run_s"] for entry in records)
+    return {
+        "kernel": prepared.kernel,
+        "title": catalogue.find(prepared.kernel).title,
+        "runs": len(records),
+        "population": "moments of one call" if profile is None else profile.in_words(),
+        "complete": None if profile is None else profile.complete,
+        "instructions": None if profile is None else profile.instructions,
+        "scope": list(prepared.layout.scope.objects),
+        "golden": {
+            "sha256": prepared.golden.sha256,
+            "cpu_s": prepared.golden.cpu_s,
+            "wall_s": prepared.golden.wall_s,
+        },
+        "outcomes": {
+            outcome.value: {
+                "count": share.count,
+                "of": share.total,
+                "share": None if math.isnan(share.share) else share.share,
+                "wilson95": [share.low, share.high],
+            }
+            for outcome, share in shares(outcomes).items()
+        },
+        "crashes": _counted(_crash(entry) for entry in _with(records, Outcome.CRASH)),
+        "not_injected": _counted(
+            entry["not_injected_reason"] for entry in _with(records, Outcome.NOT_INJECTED)
+        ),
+        "activation": _counted(entry["activation"]["activation"] for entry in records),
+        "sdc_relative": {
+            "median": finite[len(finite) // 2] if finite else None,
+            "largest": finite[-1] if finite else None,
+            "incomparable": len(sizes) - len(finite),
+        },
+        "within_tolerance": sum(bool(entry["within_tolerance"]) for entry in records),
+        "prepare_s": prepared.prepare_s,
+        "wall_s": runs.wall_s,
+        "injections_per_core_hour": 3600.0 * len(records) / run_s if run_s else None,
+    }
+
+
+def _with(records: Iterable[dict[str, Any]], outcome: Outcome) -> Iterator[dict[str, Any]]:
+    return (entry for entry in records if entry["outcome"] == outcome.value)
+
+
+def _crash(entry: Mapping[str, Any]) -> str:
+    number = entry["signal"]
+    if number:
+        known = {each.value for each in signal.Signals}
+        return signal.Signals(number).name if number in known else f"signal {number}"
+    return str(entry["error"]).partition(":")[0] or "exit"
+
+
+def _counted(names: Iterable[str]) -> dict[str, int]:
+    counts = Counter(names)
+    return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """The summary as text: one row a kernel, shares of injected runs with 95 % intervals."""
+    head = f"{'kernel':<17}{'runs':>6}" + "".join(f"{o.value:>21}" for o in _SHOWN)
+    lines = [head]
+    for kernel in summary["kernels"]:
+        cells = [_cell(kernel["outcomes"][outcome.value]) for outcome in _SHOWN]
+        lines.append(f"{kernel['title']:<17}{kernel['runs']:>6}" + "".join(cells))
+    lines.append("")
+    lines.append(
+        f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
+        "95 % Wilson interval"
+    )
+    lines.append(f"inputs: {summary['plan']['flight']}; tolerance {summary['plan']['tolerance']:g}")
+    for kernel in summary["kernels"]:
+        lines += _notes(kernel)
+    return "\n".join(lines)
+
+
+def _cell(row: Mapping[str, Any]) -> str:
+    if row["share"] is None:
+        return f"{'-':>21}"
+    low, high = (100.0 * edge for edge in row["wilson95"])
+    return f"{100.0 * row['share']:.1f} % ({low:.1f}-{high:.1f})".rjust(21)
+
+
+def _notes(kernel: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"{kernel['title']}: {kernel['population']}; scope {', '.join(kernel['scope'])}",
+    ]
+    for title in ("crashes", "not_injected", "activation"):
+        if kernel[title]:
+            parts = ", ".join(f"{name} {count}" for name, count in kernel[title].items())
+            lines.append(f"  {title.replace('_', ' ')}: {parts}")
+    sdc = kernel["sdc_relative"]
+    if sdc["median"] is not None:
+        lines.append(
+            f"  SDC, relative size: median {sdc['median']:.2g}, largest {sdc['largest']:.2g}; "
+            f"{sdc['incomparable']} of another shape or not a number"
+        )
+    return lines
+
+
+def csv_rows(campaign: Iterable[KernelRuns]) -> Iterator[list[str]]:
+    """Header and one row a run."""
+    yield list(CSV_COLUMNS)
+    for runs in campaign:
+        for entry in runs.records:
+            flat = {
+                **entry,
+                **(entry.get("corruption") or {}),
+                **entry["injection"],
+                **(entry["magnitude"] or {}),
+            }
+            flat["activation"] = entry["activation"]["activation"]
+            flat["bits"] = " ".join(str(bit) for bit in flat.get("bits", ()))
+            yield ["" if flat.get(name) is None else str(flat[name]) for name in CSV_COLUMNS]

@@ -1,0 +1,83 @@
+"""What one bit flip does to each kernel: stacked bars with confidence intervals."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.core.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLOURS = {"benign": "#b9cfe4", "crash": "#e4572e", "hang": "#f2b134", "sdc": "#6a3d7c"}
+_LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
+_LIGHT = ("benign", "hang")  # bars on which dark text is read
+
+
+def write_kernel_plot(summary: Mapping[str, Any], path: Path) -> None:
+    """Draw the summary of a kernel campaign as SVG, atomically; equal ones give equal bytes."""
+    import matplotlib as mpl
+
+    figure = draw_kernel_plot(summary)
+    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
+    write_atomically(path, lambda file: file.write(buffer.getvalue()))
+
+
+def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
+    """A matplotlib figure: one bar a kernel, shares of the injected runs in per cent."""
+    from matplotlib.figure import Figure
+
+    kernels = summary["kernels"]
+    figure = Figure(figsize=(max(5.2, 1.8 + 1.05 * len(kernels)), 4.4), layout="constrained")
+    axes = figure.add_subplot()
+    for place, kernel in enumerate(kernels):
+        _bar(axes, place, kernel["outcomes"])
+    axes.set_xticks(range(len(kernels)), [_tick(kernel) for kernel in kernels], fontsize=8)
+    axes.set_ylim(0.0, 100.0)
+    axes.set_xlim(-0.6, len(kernels) - 0.4)
+    axes.set_ylabel("share of injected runs, %")
+    axes.spines[["top", "right"]].set_visible(False)
+    handles = [axes.bar(0, 0, color=colour, label=_LABELS[n]) for n, colour in _COLOURS.items()]
+    figure.legend(handles=handles, loc="outside upper center", ncols=4, frameon=False)
+    figure.supxlabel(_caption(summary), fontsize=7, color="#5b6573")
+    return figure
+
+
+def _bar(axes: Axes, place: int, outcomes: Mapping[str, Any]) -> None:
+    base = 0.0
+    for number, (name, colour) in enumerate(_COLOURS.items()):
+        row = outcomes[name]
+        share = 100.0 * (row["share"] or 0.0)
+        axes.bar(place, share, bottom=base, width=0.66, color=colour)
+        if share >= 6.0:
+            colour = "#222831" if name in _LIGHT else "white"
+            axes.text(
+                place - 0.12, base + share / 2, f"{share:.0f}", color=colour, fontsize=8,
+                ha="center", va="center",
+            )  # fmt: skip
+        low, high = (100.0 * edge for edge in row["wilson95"])
+        if row["count"]:
+            top = base + share  # the interval of this share, drawn at its upper edge
+            axes.errorbar(
+                place + 0.1 + 0.06 * number, top, [[share - low], [high - share]],
+                color="#222831", elinewidth=0.9, capsize=2.0, clip_on=False,
+            )  # fmt: skip
+        base += share
+
+
+def _tick(kernel: Mapping[str, Any]) -> str:
+    injected = kernel["outcomes"]["benign"]["of"]
+    return f"{kernel['title']}\nn = {injected}"
+
+
+def _caption(summary: Mapping[str, Any]) -> str:
+    return (
+        f"one bit flip a run; sampling: {summary['sampling']}; whiskers: 95 % Wilson interval of "
+        "each share, at its upper edge"
+    )
