@@ -32,15 +32,31 @@ class Location:
         return f"{self.object}+{self.offset:#x}"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class ElfFacts:
     """What one ELF file says about itself."""
 
+    path: str
     build_id: str
     text: tuple[range, ...]  # linked addresses of its own code, without PLT and start-up stubs
     first_segment: int  # linked address of file offset 0
-    starts: tuple[int, ...]  # functions, ascending
-    functions: tuple[tuple[int, int, str], ...]  # start, size, name
+
+    @functools.cached_property
+    def functions(self) -> tuple[tuple[int, int, str], ...]:
+        """Start, size and name of all functions, ascending; read when first asked for.
+
+        Of all objects of a Python process that takes ten seconds, and few are asked.
+        """
+        try:
+            with open(self.path, "rb") as stream:
+                return tuple(sorted(set(_functions(ELFFile(stream)))))
+        except (OSError, ELFError) as error:
+            raise FaultError(f"{self.path}: not a readable ELF object ({error})") from None
+
+    @functools.cached_property
+    def starts(self) -> tuple[int, ...]:
+        """Where the functions begin."""
+        return tuple(start for start, _, _ in self.functions)
 
 
 @functools.lru_cache(maxsize=256)
@@ -56,19 +72,12 @@ def elf_facts(path: str, _modified_ns: int = 0) -> ElfFacts:
             text = _text(elf)
             loads = [s for s in elf.iter_segments() if s["p_type"] == "PT_LOAD"]
             first = loads[0]["p_vaddr"] - loads[0]["p_offset"]
-            functions = sorted(set(_functions(elf)))
             build_id = _build_id(elf)
     except (OSError, ELFError) as error:
         raise FaultError(f"{path}: not a readable ELF object ({error})") from None
     if not build_id:
         build_id = "sha256:" + hashlib.sha256(Path(path).read_bytes()).hexdigest()[:40]
-    return ElfFacts(
-        build_id=build_id,
-        text=text,
-        first_segment=first,
-        starts=tuple(start for start, _, _ in functions),
-        functions=tuple(functions),
-    )
+    return ElfFacts(path=path, build_id=build_id, text=text, first_segment=first)
 
 
 def _build_id(elf: Any) -> str:
