@@ -106,7 +106,7 @@ def _draw_path(
 ) -> None:
     from matplotlib.collections import LineCollection
 
-    step = max(1, len(positions) // 1500)
+    step = max(1, len(positions) // 400)
     points, shown = positions[::step, :2], speeds[::step]
     if len(points) < 2:
         return
