@@ -10,11 +10,14 @@ import click
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.mission.fault_config import FaultConfig
+    from mavfi_cli.mission.instruction_config import InstructionConfig
 
 _FAULT_OPTIONS = (
     "at", "bits", "field", "exact_bits", "effect", "persistence", "duration_s", "period_s",
     "together",
 )  # fmt: skip
+_INSTRUCTION_OPTIONS = ("sampling", "sites", "roles", "compat", "null")
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
@@ -99,9 +102,24 @@ class _Size(click.ParamType[Any]):
 @click.option(
     "--fault-seed", default=1, show_default=True, help="Seed of all that is drawn for the fault."
 )
+@click.option("--level", type=click.Choice(["source", "instruction"]), default="source",
+              show_default=True,
+              help="Corrupt a state between kernels, or an operand of one machine instruction of "
+                   "a kernel: --inject point_cloud, octomap, collision_check, planner, control, "
+                   "perception or planning.")  # fmt: skip
+@click.option("--sampling", default="instruction-uniform", show_default=True,
+              help="Instruction level: from which population the moment is drawn.")  # fmt: skip
+@click.option("--site", "sites", multiple=True,
+              help="Instruction level: general, flags, vector, x87, mask, instruction-pointer, "
+                   "opcode, memory. May be repeated.")  # fmt: skip
+@click.option("--role", "roles", multiple=True,
+              help="Instruction level: source or destination  [both].")  # fmt: skip
+@click.option("--compat", help="Instruction level: registers and bits as rosfi-2021 chose them.")
+@click.option("--null-injection", "null", is_flag=True,
+              help="Instruction level: do everything but the flip.")  # fmt: skip
 @click.option("--isolate", multiple=True, metavar="NODE",
               help="Let a node work in its own process: point_cloud, octomap, collision_check, "
-                   "planner. May be repeated; the record stays the same.")  # fmt: skip
+                   "planner, control. May be repeated; the record stays the same.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
               show_default=True, help="Where the run folder goes.")  # fmt: skip
 @click.option("--picture/--no-picture", default=True, help="Draw flight.svg.", show_default=True)
@@ -144,21 +162,41 @@ def fly(
 
 def _config(options: dict[str, Any]) -> MissionConfig:
     from mavfi_cli.mission.config import MissionConfig
-    from mavfi_cli.mission.fault_config import FaultConfig
 
-    asked = {name: options.pop(name) for name in _FAULT_OPTIONS}
-    target, seed = options.pop("inject"), options.pop("fault_seed")
-    fault = None
-    if target is not None:
-        exact = asked.pop("exact_bits") or None
-        fault = FaultConfig(target=target, seed=seed, exact_bits=exact, **asked)
-        fault.draw()  # says now what is wrong with it
+    fault, instruction = _fault(options)
     columns, rows = options.pop("camera")
     land = options.pop("land")
     return MissionConfig(
         camera_columns=columns,
         camera_rows=rows,
         fault=fault,
+        instruction=instruction,
         land=options["link"] is not None if land is None else land,
         **options,
     )
+
+
+def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConfig | None]:
+    """The fault that is asked for, taken out of the options; says now what is wrong with it."""
+    from mavfi_cli.core.errors import FaultSpecError
+    from mavfi_cli.mission.fault_config import FaultConfig
+    from mavfi_cli.mission.instruction_config import InstructionConfig
+
+    asked = {name: options.pop(name) for name in _FAULT_OPTIONS}
+    native = {name: options.pop(name) for name in _INSTRUCTION_OPTIONS}
+    target, seed, level = (options.pop(name) for name in ("inject", "fault_seed", "level"))
+    if target is None:
+        if level == "instruction":
+            raise FaultSpecError("--level instruction needs --inject NODE")
+        return None, None
+    exact = asked.pop("exact_bits") or None
+    if level == "source":
+        fault = FaultConfig(target=target, seed=seed, exact_bits=exact, **asked)
+        fault.draw()
+        return fault, None
+    instruction = InstructionConfig(
+        target=target, seed=seed, field=asked["field"], bits=asked["bits"], **native
+    )
+    instruction.strategy()
+    instruction.node()
+    return None, instruction

@@ -13,13 +13,17 @@ import click
 @click.option("--without-fault", is_flag=True, help="Fly the paired golden mission instead.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
               show_default=True, help="Where the new run folder goes.")  # fmt: skip
+@click.option("--gdb", is_flag=True,
+              help="Instruction level: stop the node at the injected instruction and wait for a "
+                   "debugger.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
-def replay(run: Path, without_fault: bool, out: Path, as_json: bool) -> None:
+def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) -> None:
     """Repeat RUN, a run folder, and say whether the record is the same to the byte.
 
     Exits with 1 where a repetition differs. With --without-fault a difference is the point: it is
     what the fault did.
     """
+    from mavfi_cli.fi.record import read
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.replay import (
         config_of,
@@ -36,7 +40,12 @@ def replay(run: Path, without_fault: bool, out: Path, as_json: bool) -> None:
     for text in version_differences(recorded, installed_versions()):
         click.echo(f"warning: another build: {text}", err=True)
     config = config_of(recorded, with_fault=not without_fault)
-    again = load_run(fly_mission(config, out, Watcher()).path)
+    repeat = read(recorded.folder.fault) if config.instruction is not None else None
+    again = load_run(
+        fly_mission(
+            config, out, Watcher(), repeat=repeat, for_debugger=_say_where if gdb else None
+        ).path
+    )
     identical = same_file(recorded.folder.trace, again.folder.trace) and not differing_results(
         recorded.result, again.result
     )
@@ -65,3 +74,11 @@ def replay(run: Path, without_fault: bool, out: Path, as_json: bool) -> None:
         click.echo(f"Run folder  {again.folder.path}")
     if not identical and not without_fault:
         raise click.exceptions.Exit(1)
+
+
+def _say_where(pid: int) -> None:
+    click.echo(
+        f"the node waits at the injected instruction, the fault in place: gdb -p {pid}  "
+        f"(or let it go on: kill -CONT {pid})",
+        err=True,
+    )

@@ -8,6 +8,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 Vector3 = tuple[float, float, float]
@@ -24,7 +25,8 @@ class MissionConfig:
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
         realtime: pace the simulated vehicle by the wall clock.
         land: land and disarm after the goal was reached.
-        fault: what to inject; None for a golden flight.
+        fault: a source-level fault to inject; None for a golden flight.
+        instruction: an instruction-level fault to inject instead.
         node_restart_s: from the death of a node until its successor works, simulated.
         node_watchdog_s: a node that works for so long hangs and is killed, simulated.
         isolate: nodes that work in processes of their own; changes nothing in the record.
@@ -53,6 +55,7 @@ class MissionConfig:
     node_restart_s: float = 1.0
     node_watchdog_s: float = 5.0
     fault: FaultConfig | None = None
+    instruction: InstructionConfig | None = None
     isolate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -74,6 +77,8 @@ class MissionConfig:
         for name, place in (("start", self.start), ("goal", self.goal)):
             if place is not None and not all(map(math.isfinite, place)):
                 raise ConfigError("must be three finite numbers", key=name)
+        if self.fault is not None and self.instruction is not None:
+            raise ConfigError("one mission takes one fault", key="instruction")
         for node in self.isolate:
             if node not in ISOLATABLE:
                 raise UnknownName("node", node, ISOLATABLE)

@@ -51,6 +51,7 @@ class Node:
     process: NodeProcess | None = None  # where the real work is done; None: here
     losses: list[Loss] = field(default_factory=list)
     restarts: int = 0
+    finished: int = 0  # invocations that are over, well or not
 
 
 @dataclass(slots=True, eq=False)
@@ -108,6 +109,7 @@ class Executor:
         restart_s: from a node's end until its successor is ready, simulated.
         watchdog_s: an invocation that has not ended after so long is killed, simulated.
         losses: of all nodes, in order.
+        on_start: hears of every invocation: node, input, start stamp.
     """
 
     draw_latency_s: Callable[[str], float]
@@ -117,6 +119,7 @@ class Executor:
     watchdog_s: float = 5.0
     now_s: float = 0.0
     losses: list[Loss] = field(default_factory=list)
+    on_start: Callable[[str, Any, float], None] = lambda _node, _input, _start_s: None
     timetable: list[Invocation] = field(default_factory=list)
     _nodes: dict[str, Node] = field(default_factory=dict)
     _events: list[tuple[float, int, _Event]] = field(default_factory=list)  # heap: time, order
@@ -155,6 +158,8 @@ class Executor:
             node.dropped += 1
             return None
         node.invocations += 1
+        node.finished += 1
+        self.on_start(name, value, stamp_s)
         try:
             return _Job(node=node, start_s=stamp_s, input=value).result(self.wall)
         except NodeLost as loss:
@@ -212,6 +217,7 @@ class Executor:
         node.busy = True
         node.invocations += 1
         node.busy_s += latency_s
+        self.on_start(node.name, job.input, job.start_s)
         self._working += 1
         self._uncomputed.append(job)
         end_s = self.now_s + latency_s
@@ -223,6 +229,7 @@ class Executor:
         self._count += 1
 
     def _finish(self, job: _Job, end_s: float) -> None:
+        job.node.finished += 1
         try:
             output = job.result(self.wall)
         except NodeLost as loss:

@@ -18,7 +18,7 @@ import numpy as np
 
 from mavfi_cli.autonomy.pilot import Mode
 from mavfi_cli.autonomy.planners import Planner
-from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
+from mavfi_cli.core.errors import ConfigError, Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Codec, Message, dialect
@@ -33,6 +33,9 @@ from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.events import EventLog
 from mavfi_cli.mission.executor import Node
 from mavfi_cli.mission.injection import Injection, NoInjection
+from mavfi_cli.mission.instruction_injection import InstructionInjection
+from mavfi_cli.mission.instruction_plan import Recorder
+from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Progress, Watcher
 from mavfi_cli.mission.trace import Trace
@@ -117,12 +120,23 @@ class Flight:
     def brief(self, briefing: Briefing) -> None:
         """Tell where the goal is and how the camera is mounted; makes the companion ready."""
         self._briefing = briefing
+        if self._shortest_flight_s(briefing) <= 0.0:
+            raise ConfigError(
+                f"the goal is within {self._config.goal_tolerance_m:g} m of the take-off point",
+                key="goal",
+            )
         fault = self._config.fault
         if fault is not None:
             self.injection = Injection(fault, self._shortest_flight_s(briefing))
         self.companion = Companion(
             self._config, self._platform, self._planner, briefing, self.wall, self.injection
         )
+
+    def record(self, recorder: Recorder) -> None:
+        """Have the recorder hear what the flight asks of its nodes; after `brief`."""
+        assert self.companion is not None
+        recorder.briefing = self._briefing
+        self.companion.executor.on_start = recorder.on_start
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """No flight takes less: straight to the edge of the goal's tolerance at full speed."""
@@ -136,11 +150,25 @@ class Flight:
         assert self.companion is not None
         executor = self.companion.executor
         try:
+            attacked = self._arm()
             for name in self._config.isolate:
-                executor.isolate(name)
+                if name != attacked:
+                    executor.isolate(name)
             yield
         finally:
             executor.close()
+
+    def _arm(self) -> str | None:
+        """Put the node that an instruction-level fault attacks into its process."""
+        injection = self.injection
+        if not isinstance(injection, InstructionInjection):
+            return None
+        assert self.companion is not None
+        assert self._briefing is not None
+        executor, name = self.companion.executor, injection.node
+        setup = Setup(config=self._config, briefing=self._briefing, node=name)
+        executor.isolate(name, injection.start(setup, lambda: executor.nodes[name].finished))
+        return name
 
     def fly(self, tlog: Path) -> None:
         """Fly until the mission has an outcome.

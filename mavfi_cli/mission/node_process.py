@@ -67,6 +67,7 @@ class NodeProcess:
         connection: our end of the socket pair.
         pid: of the process, a child of ours.
         ending: tells how the process ended where somebody else heard of it first, else None.
+        patient: a debugger may hold it, so it never hangs.
         errors_kill: an exception in a kernel ends its node as a crash, instead of the mission.
     """
 
@@ -77,11 +78,15 @@ class NodeProcess:
         *,
         ending: Callable[[], str | None] = lambda: None,
         errors_kill: bool = False,
+        patient: bool = False,
     ) -> None:
         self._socket = connection
         self._pid = pid
         self._ending = ending
         self._errors_kill = errors_kill
+        self._patient = patient
+        if not patient:
+            connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in the middle of a word
         self._answers: dict[int, _Answer] = {}
         self._count = 0
 
@@ -127,15 +132,19 @@ class NodeProcess:
         try:
             while number not in self._answers:
                 while not select.select([self._socket], [], [], _LOOK_S)[0]:
-                    if (
-                        self._cpu_s() - used_s > HANG_CPU_S
-                        or time.monotonic() - begun_s > HANG_WALL_S
-                    ):
+                    used = self._cpu_s() - used_s > HANG_CPU_S
+                    if (used or time.monotonic() - begun_s > HANG_WALL_S) and not self._patient:
                         raise NodeLost(hung=True, how="hung: killed by the watchdog")
                 answer: _Answer = receive(self._socket)
                 self._answers[answer.number] = answer
-        except (OSError, EOFError, pickle.UnpicklingError):
+        except TimeoutError:
+            raise NodeLost(hung=True, how="hung: killed by the watchdog") from None
+        except (OSError, EOFError):
             raise NodeLost(hung=False, how=self._end()) from None
+        except NodeLost:
+            raise
+        except Exception:  # whatever a corrupted node's words make of the one who reads them
+            raise NodeLost(hung=False, how="garbled its output") from None
         answer = self._answers.pop(number)
         if answer.error is not None:
             if self._errors_kill:
@@ -170,8 +179,9 @@ class NodeProcess:
         if kill:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._pid, signal.SIGKILL)
-        with contextlib.suppress(ChildProcessError):
-            os.waitpid(self._pid, 0)
+        if self._ending() is None:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(self._pid, 0)
 
 
 def serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:

@@ -37,7 +37,7 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
     if values.get("link") is not None:
         raise RecordError(f"{run.folder.path}: a flight of a foreign autopilot does not repeat")
     if not with_fault:
-        values["fault"] = None
+        values["fault"] = values["instruction"] = None
     return structure(values, MissionConfig, path=run.folder.result)
 
 
@@ -85,7 +85,7 @@ def first_difference(this: Run, other: Run, *, truth: bool = False) -> Parting |
                 first = (row, column)
                 break
     if first is None:
-        return None
+        return _end(this, other, rows)
     row, column = first
     return Parting(
         stamp_s=this.trace["stamp_s"][row].as_py(),
@@ -93,6 +93,19 @@ def first_difference(this: Run, other: Run, *, truth: bool = False) -> Parting |
         this=this.trace[column][row].as_py(),
         other=other.trace[column][row].as_py(),
     )
+
+
+def _end(this: Run, other: Run, rows: int) -> Parting | None:
+    """Where one of two runs that were equal so far goes on, or ends otherwise."""
+    assert this.trace is not None
+    stamp_s = this.trace["stamp_s"][rows - 1].as_py() if rows else 0.0
+    ends = [str(run.result["outcome"]) for run in (this, other)]
+    if ends[0] != ends[1]:
+        return Parting(stamp_s=stamp_s, column="outcome", this=ends[0], other=ends[1])
+    lengths = [0 if run.trace is None else run.trace.num_rows for run in (this, other)]
+    if lengths[0] != lengths[1]:
+        return Parting(stamp_s=stamp_s, column="ticks", this=lengths[0], other=lengths[1])
+    return None
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -106,7 +119,7 @@ def same_file(this: Path, other: Path) -> bool:
 
 def without_fault(config: MissionConfig) -> MissionConfig:
     """The paired golden mission: same world, seed and noise."""
-    return dataclasses.replace(config, fault=None)
+    return dataclasses.replace(config, fault=None, instruction=None)
 
 
 def largest_deviation_m(this: Run, other: Run) -> float:

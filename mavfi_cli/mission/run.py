@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +29,28 @@ from mavfi_cli.mission import briefing, quality
 from mavfi_cli.mission.companion import response_times
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
+from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.instruction_injection import InstructionInjection, require_possible
+from mavfi_cli.mission.instruction_plan import PlannedFault, Recorder, plan_fault, planned_of
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.run_folder import CRASH, RunFolder, new_run_folder
+from mavfi_cli.mission.run_folder import CRASH, RunFolder, new_run_folder, stem_of
+from mavfi_cli.mission.spawned_node import SpawnedNode
 from mavfi_cli.mission.trace import write_trace
 from mavfi_cli.mission.vehicle_process import VehicleProcess
 
 _VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")
 
 
-def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder:
+def fly_mission(
+    config: MissionConfig,
+    out: Path,
+    watcher: Watcher,
+    *,
+    recorder: Recorder | None = None,
+    repeat: Mapping[str, Any] | None = None,
+    for_debugger: Callable[[int], None] | None = None,
+) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
     Whatever becomes of the flight, crash of the companion included, is a result and is recorded.
@@ -47,6 +59,9 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
         config: the mission.
         out: where the run folder goes.
         watcher: gets progress and events.
+        recorder: keeps what the flight asks of its nodes.
+        repeat: the record of an instruction-level fault to repeat, instead of drawing one.
+        for_debugger: called when the node waits for a debugger at the injected instruction.
 
     Raises:
         MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
@@ -56,20 +71,28 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
     begun = time.perf_counter()
     platform = load_platform(config.platform)
     planner = planners.find(config.planner)
-    with _interruptible() as interrupt, _vehicle(config) as (transport, truth_folder, process):
+    with (
+        _injection(config, out, repeat, for_debugger) as injection,
+        _interruptible() as interrupt,
+        _vehicle(config) as (transport, truth_folder, process),
+    ):
         flight = Flight(config, transport, platform, planner, watcher, interrupt)
+        if injection is not None:
+            flight.injection = injection
         try:
             if truth_folder is None:  # before connecting: from then on the vehicle's clock runs
                 flight.brief(briefing.of_config(config))
             flight.connect()
             if truth_folder is not None:
                 flight.brief(briefing.of_simulation(truth_folder))
+            if recorder is not None:
+                flight.record(recorder)
         except MavfiError:
             transport.close()
             if process is not None and (failure := _failure(process)):
                 raise failure from None
             raise
-        name = Path(config.world).stem if config.link is None else "link"
+        name = stem_of(config.world) if config.link is None else "link"
         folder = new_run_folder(out, f"{name}-{config.seed}")
         flight.injection.begin(folder.fault)
         flight_begun = time.perf_counter()
@@ -93,6 +116,33 @@ def fly_mission(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder
         truth, referee = _read_truth(truth_folder)
         _write(flight, folder, config, host, truth, referee, crash)
     return folder
+
+
+@contextlib.contextmanager
+def _injection(
+    config: MissionConfig,
+    out: Path,
+    repeat: Mapping[str, Any] | None,
+    for_debugger: Callable[[int], None] | None,
+) -> Iterator[InstructionInjection | None]:
+    """The instruction-level fault of a mission, its node's process already starting."""
+    if config.instruction is None:
+        yield None
+        return
+    require_possible(config.link)
+    planned = planned_of(repeat) if repeat is not None else _plan(config, config.instruction, out)
+    injection = InstructionInjection(planned, SpawnedNode(), for_debugger)
+    try:
+        yield injection
+    finally:
+        injection.close()
+
+
+def _plan(config: MissionConfig, asked: InstructionConfig, out: Path) -> PlannedFault:
+    def fly_golden(golden: MissionConfig, folder: Path, recorder: Recorder) -> None:
+        fly_mission(golden, folder, Watcher(), recorder=recorder)
+
+    return plan_fault(config, asked, out, installed_versions(), fly_golden)
 
 
 def _fly(flight: Flight, folder: RunFolder) -> str | None:
@@ -198,12 +248,13 @@ def _write(
     else:
         qof = flight.own_quality()
     assert flight.outcome is not None
+    asked = config.fault or config.instruction
     result = {
         "schema": 1,
         "outcome": flight.outcome.value,
         "reason": flight.reason,
         "config": config.to_dict(),
-        "seeds": {"root": config.seed, "fault": config.fault.seed if config.fault else None},
+        "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
         "simulated_s": flight.end_s,
         "quality_of_flight": qof.to_dict(),
         **flight.statistics(),

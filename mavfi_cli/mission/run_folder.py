@@ -20,6 +20,7 @@ TLOG = "flight.tlog"
 PICTURE = "flight.svg"
 FAULT = "fault.json"
 CRASH = "crash.txt"
+_SECTIONS = ("outcome", "config", "quality_of_flight", "pilot", "events", "versions", "host")
 _NEEDED = ("outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "host")
 
 
@@ -57,6 +58,12 @@ class RunFolder:
     def write_result(self, result: dict[str, Any]) -> None:
         """Write result.json atomically."""
         write_json(self.result, result)
+
+
+def stem_of(world: str) -> str:
+    """What a world's runs are called: its name, or its file's, without what paths do not like."""
+    name = world.removesuffix(".toml").rpartition("/")[2]
+    return "".join(c if c.isalnum() or c in "-_." else "-" for c in name) or "world"
 
 
 def new_run_folder(parent: Path, stem: str) -> RunFolder:
@@ -109,6 +116,9 @@ def load_run(path: Path) -> Run:
         raise RecordError(f"{folder.path}: damaged ({error})") from None
     if not isinstance(result, dict) or result.get("schema") != 1:
         raise RecordError(f"{folder.result}: written by another version of mavfi")
+    lacking = [name for name in _SECTIONS if name not in result]
+    if lacking:
+        raise RecordError(f"{folder.result}: damaged (without {', '.join(lacking)})")
     missing = [key for key in _NEEDED if key not in result]
     if missing:
         raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")

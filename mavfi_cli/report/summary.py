@@ -97,6 +97,8 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
     fault = result.get("fault")
     if not fault:
         return []
+    if fault["level"] == "instruction":
+        return _instruction_lines(fault)
     trigger = fault["trigger"]
     when = {
         "random": f"at a random moment ({trigger['drawn_time_s']:.2f} s into the flight)",
@@ -119,20 +121,54 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
     return lines
 
 
+def _instruction_lines(fault: dict[str, Any]) -> list[str]:
+    """What was drawn, from how much, and what came of it."""
+    place = fault["symbol"] or f"{fault['object']}+{fault['offset']:#x}"
+    lines = [
+        f"Fault       node {fault['node']}, invocation {fault['invocation']} of "
+        f"{fault['invocations']} of {fault['kernel']}, at {fault['stamp_s']:.2f} s; "
+        f"{fault['sampling']}, windows {fault['windows']}",
+        f"            before execution {fault['k']} of {fault['instruction']} ({place})",
+    ]
+    if fault["state"] == "null":
+        return [*lines, "            null injection: nothing was flipped"]
+    corruption, injection = fault["corruption"], fault["injection"]
+    if fault["state"] == "not_injected":
+        return [*lines, f"            not injected: {fault['reason']}"]
+    bits = ", ".join(map(str, corruption["bits"]))
+    what = corruption["operand"] or corruption["site"]
+    activation = fault["activation"]["activation"].replace("_", " ")
+    return [
+        *lines,
+        f"            bit {bits} of {corruption['role']} {what}: "
+        f"{injection['before']} -> {injection['after']}; {activation}",
+    ]
+
+
 def _change_line(stamp_s: float, change: dict[str, Any]) -> str:
     place = f"[{change['index']}]" if change["state"].startswith("waypoint") else ""
     bits = ", ".join(map(str, change["bits"])) or "none: the value was that already"
     return (
         f"            at {stamp_s:.2f} s: {change['state']}{place} "
-        f"{_value(change['before'])} -> {_value(change['after'])} (bit {bits})"
+        f"{_told(change, 'before')} -> {_told(change, 'after')} (bit {bits})"
     )
+
+
+def _told(change: dict[str, Any], when: str) -> str:
+    """A value as a number; infinities and NaN, which JSON cannot hold, as their bits."""
+    value, pattern = change[when], change[f"{when}_hex"]
+    if value is None:
+        return {"0x7ff0000000000000": "inf", "0xfff0000000000000": "-inf"}.get(
+            pattern, f"nan {pattern}"
+        )
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
 def difference_lines(run: Run, golden: Run) -> list[str]:
     """What a run did otherwise than its golden pair: first difference, and what became of it."""
     parting = first_difference(run, golden)
     if parting is None:
-        return ["Effect      none: no state differs from the golden flight (masked)"]
+        return ["Effect      none: no state ever differs from the golden flight (masked)"]
     lines = [
         f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
         f"{_value(parting.this)} instead of {_value(parting.other)}",

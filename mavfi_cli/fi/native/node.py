@@ -10,6 +10,8 @@ while it is attached, the tracer hears of it first: take its end from the result
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,6 +163,7 @@ def attack(
     window: int = 64,
     armed: Notice | None = None,
     stopped: Callable[[Tracee], None] | None = None,
+    leave_stopped: bool = False,
     **context: Any,
 ) -> Attack:
     """Apply one fault in a node; its record is on the disk before the node runs to the trigger.
@@ -173,6 +176,7 @@ def attack(
         window: how many instructions a destination fault is followed.
         armed: called once the node runs towards the trigger.
         stopped: called at the stop, before the flip (to wait for a debugger, say).
+        leave_stopped: let the node go stopped (SIGSTOP) after the flip, for a debugger.
         context: what else belongs in the record: kernel, stage, sampling rule, seed, scope.
 
     Raises:
@@ -193,6 +197,8 @@ def attack(
                 stopped(tracee)
             injection, followed = _corrupt(tracee, fault, window)
             reason = "" if injection is None else injection.reason
+            if leave_stopped and tracee.ended is None:
+                os.kill(pid, signal.SIGSTOP)
     finally:
         if tracee.ended is None:
             tracee.detach()

@@ -1,0 +1,167 @@
+"""An instruction-level fault's way through a mission: the tracer's thread beside the flight."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.core.errors import FaultError
+from mavfi_cli.fi import record
+from mavfi_cli.fi.native.image import Image
+from mavfi_cli.fi.native.node import Attack, attack
+from mavfi_cli.mission.injection import SCHEMA, NoInjection
+from mavfi_cli.mission.instruction_plan import PlannedFault
+from mavfi_cli.mission.kernel_scope import KernelScope
+from mavfi_cli.mission.node_process import NodeProcess
+from mavfi_cli.mission.node_server import Setup
+from mavfi_cli.mission.spawned_node import SpawnedNode, TracerThread
+
+_TIMING = ("stop_s",)
+
+
+class InstructionInjection(NoInjection):
+    """One instruction-level fault in one mission; messages pass as they are.
+
+    Args:
+        planned: the fault.
+        spawned: the process that will be the attacked node.
+        for_debugger: leave the node stopped at the injected instruction, and say so here.
+    """
+
+    def __init__(
+        self,
+        planned: PlannedFault,
+        spawned: SpawnedNode,
+        for_debugger: Callable[[int], None] | None = None,
+    ) -> None:
+        self._planned = planned
+        self._spawned = spawned
+        self._for_debugger = for_debugger
+        self._path: Path | None = None
+        self._tracer: TracerThread[Attack] | None = None
+        self._told = False
+        self._finished: Callable[[], int] = lambda: 0
+
+    @property
+    def node(self) -> str:
+        """The attacked node."""
+        return self._planned.node
+
+    def begin(self, path: Path) -> None:
+        """Where the record goes."""
+        self._path = path
+
+    def start(self, setup: Setup, finished: Callable[[], int]) -> NodeProcess:
+        """Arm the fault; the process that serves the node.
+
+        Args:
+            setup: of the node.
+            finished: how many invocations of the node are over.
+
+        Raises:
+            BuildMismatch: the record that is repeated is of another build.
+            TracingForbidden: the operating system refuses.
+        """
+        scope = self._spawned.begin(setup)
+        self._finished = finished
+        pid = self._spawned.pid
+        if self._planned.recorded is not None:
+            record.require_same_build(self._planned.recorded, Image(pid, scope.regions))
+        self._tracer = TracerThread(lambda armed: self._attack(pid, scope, armed))
+        self._tracer.await_armed()
+        return NodeProcess(
+            self._spawned.connection,
+            pid,
+            ending=self._ending,
+            errors_kill=True,
+            patient=self._for_debugger is not None,
+        )
+
+    def _attack(self, pid: int, scope: KernelScope, armed: Callable[[], None]) -> Attack:
+        assert self._path is not None
+        debugging = self._for_debugger is not None
+        done = attack(
+            pid,
+            self._planned.fault,
+            path=self._path,
+            regions=scope.regions,
+            window=0 if debugging else 64,
+            armed=armed,
+            leave_stopped=debugging,
+            scope=list(scope.objects),
+            **self._planned.context,
+        )
+        if self._for_debugger is not None and done.ended is None:
+            self._for_debugger(pid)
+        return done
+
+    def _ending(self) -> str | None:
+        """How the node ended, where the tracer heard of it."""
+        if self._tracer is None:
+            return None
+        ended = self._tracer.result().ended
+        if ended is None:
+            return None
+        if ended.signal is not None:
+            return f"killed by {signal.Signals(ended.signal).name}"
+        return f"ended with code {ended.exit_code}"
+
+    def news(self) -> list[str]:
+        """The fault, once the invocation that it struck is over."""
+        if self._told or self._tracer is None or self._finished() < self._planned.order:
+            return []
+        self._told = True
+        done = self._tracer.result()
+        if self._planned.fault.corruption is None:
+            return []
+        return [attack_text(done.record)]
+
+    def finish(self) -> dict[str, Any] | None:
+        """The record at the end of the mission, without what a clock measured."""
+        if self._tracer is None:
+            self._spawned.kill()
+            return None
+        return in_result(self._tracer.result().record)
+
+    def close(self) -> None:
+        """End the node's process where no executor has it."""
+        if self._tracer is None:
+            self._spawned.kill()
+
+
+def in_result(written: Mapping[str, Any]) -> dict[str, Any]:
+    """A fault record as result.json carries it: the same in every repetition."""
+    injection = {k: v for k, v in written["injection"].items() if k not in _TIMING}
+    state = "applied" if injection["applied"] else "not_injected"
+    if written["corruption"] is None and not written.get("not_injected_reason"):
+        state = "null"
+    reason = written.get("not_injected_reason", "")
+    return {**written, "schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
+
+
+def attack_text(written: Mapping[str, Any]) -> str:
+    """What was hit, in one line."""
+    place = written["symbol"] or f"{written['object']}+{written['offset']:#x}"
+    where = f"{written['kernel']}, {written['instruction']} at {place}"
+    if not written["injection"]["applied"]:
+        return f"fault in {where}: not injected ({written.get('not_injected_reason', '')})"
+    corruption = written["corruption"]
+    bits = ", ".join(map(str, corruption["bits"]))
+    what = corruption["operand"] or corruption["site"]
+    activation = written["activation"]["activation"].replace("_", " ")
+    return f"fault in {where}: bit {bits} of {corruption['role']} {what}, {activation}"
+
+
+def require_possible(link: str | None) -> None:
+    """Refuse what cannot work.
+
+    Raises:
+        FaultError: the flight does not repeat.
+    """
+    if link is not None:
+        raise FaultError(
+            "an instruction-level fault is drawn from the golden flight, and a foreign autopilot "
+            "flies no two alike: leave out --link"
+        )

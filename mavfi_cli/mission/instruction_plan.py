@@ -1,0 +1,203 @@
+"""From what a user asks for to one exact instruction-level fault of a mission.
+
+What the golden flight asked of each node, how often each kernel was entered, and each profile
+are kept below the output folder, by everything that they depend on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+import mavfi_cli
+from mavfi_cli.core.errors import FaultError, RecordError
+from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.fi import record
+from mavfi_cli.fi.native.fault import InstructionFault
+from mavfi_cli.fi.sampling import draw_fault
+from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.instruction_profile import (
+    KernelProfile,
+    Order,
+    count_entries,
+    profile_kernel,
+)
+from mavfi_cli.mission.kernel_scope import kernel_of_node
+from mavfi_cli.mission.node_server import Setup
+
+T = TypeVar("T")
+CACHE = ".profiles"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedFault:
+    """One exact fault.
+
+    Attributes:
+        node: the attacked node.
+        order: in which of its invocations the fault strikes, from 1.
+        context: what else the record says: kernel, invocation, simulated time, sampling.
+        recorded: the record that is repeated; None for a fault that was drawn.
+    """
+
+    fault: InstructionFault
+    node: str
+    order: int
+    context: Mapping[str, Any]
+    recorded: Mapping[str, Any] | None = None
+
+
+class Recorder:
+    """Keeps what a flight asks of its nodes."""
+
+    def __init__(self) -> None:
+        self.briefing: Briefing | None = None
+        self.orders: dict[str, list[Order]] = {}
+
+    def on_start(self, node: str, value: Any, start_s: float) -> None:
+        """An invocation begins."""
+        self.orders.setdefault(node, []).append((value, start_s))
+
+
+def plan_fault(
+    config: MissionConfig,
+    asked: InstructionConfig,
+    out: Path,
+    versions: Mapping[str, str],
+    fly_golden: Callable[[MissionConfig, Path, Recorder], object],
+) -> PlannedFault:
+    """Draw the fault that a mission and a seed stand for.
+
+    Args:
+        config: the mission.
+        asked: what is to be injected.
+        out: the folder below which golden flight and profiles are kept.
+        versions: of the libraries.
+        fly_golden: flies a mission into a folder and records it.
+
+    Raises:
+        FaultError: the kernel is never entered, or cannot be attacked here.
+    """
+    strategy, node = asked.strategy(), asked.node()
+    kernel = kernel_of_node(node, config.planner)
+    golden = replace(config, fault=None, instruction=None, isolate=())
+    folder = out / CACHE / _key(golden, versions)
+
+    def fly() -> tuple[Briefing, dict[str, list[Order]]]:
+        recorder = Recorder()
+        fly_golden(golden, folder, recorder)
+        assert recorder.briefing is not None
+        return recorder.briefing, recorder.orders
+
+    briefing, all_orders = _kept(folder / "orders.pickle", fly)
+    setup = Setup(config=golden, briefing=briefing, node=node)
+    orders = all_orders.get(node, [])
+    counts = _kept(folder / f"entries-{kernel}.pickle", lambda: count_entries(setup, orders))
+    if not counts or not counts[-1]:
+        raise FaultError(f"the golden flight never enters {kernel}")
+    rng = generator(asked.seed, Stream.FAULT, "instruction")
+    invocation = int(rng.integers(counts[-1])) + 1
+    order = int(np.searchsorted(counts, invocation)) + 1
+    profiling = generator(config.seed, Stream.FAULT, "profile", kernel, invocation)
+    found: KernelProfile = _kept(
+        folder / f"profile-{kernel}-{invocation}.pickle",
+        lambda: profile_kernel(setup, orders[:order], invocation, profiling),
+    )
+    fault = draw_fault(
+        found.profile,
+        replace(strategy, whole_process=False),
+        rng,
+        code_at=found.first.code_at,
+        locate=found.first.image.locate,
+    )
+    context = {
+        "node": node,
+        "kernel": kernel,
+        "invocation": invocation,
+        "invocations": counts[-1],
+        "node_invocation": order,
+        "stamp_s": round(orders[order - 1][1], 9),
+        "sampling": asked.sampling_name(),
+        "windows": found.windows,
+        "profiled_instructions": found.profile.executed,
+        "seed": asked.seed,
+        "request": asked.to_dict(),
+    }
+    drawn = replace(fault, corruption=None) if asked.null else fault
+    return PlannedFault(fault=drawn, node=node, order=order, context=context)
+
+
+def planned_of(recorded: Mapping[str, Any]) -> PlannedFault:
+    """The fault of a record, to repeat it.
+
+    Raises:
+        RecordError: not the record of an instruction-level fault in a mission.
+    """
+    fault = record.fault_of(recorded)
+    try:
+        context = {name: recorded[name] for name in _CONTEXT}
+    except KeyError as error:
+        raise RecordError(f"the fault record is damaged: it has no {error}") from None
+    return PlannedFault(
+        fault=fault,
+        node=context["node"],
+        order=context["node_invocation"],
+        context=context,
+        recorded=recorded,
+    )
+
+
+_CONTEXT = (
+    "node", "kernel", "invocation", "invocations", "node_invocation", "stamp_s", "sampling",
+    "windows", "profiled_instructions", "seed", "request",
+)  # fmt: skip
+
+
+def _kept(path: Path, make: Callable[[], T]) -> T:
+    """A value from its file, or made and kept there."""
+    if path.is_file():
+        kept: T = pickle.loads(path.read_bytes())
+        return kept
+    value = make()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{path.parent}: {error.strerror or error}") from None
+    write_atomically(path, lambda file: pickle.dump(value, file))
+    return value
+
+
+def _key(golden: MissionConfig, versions: Mapping[str, str]) -> str:
+    """A name for all that the golden flight depends on."""
+    values = golden.to_dict()
+    files = [Path(str(values[name])) for name in ("world", "platform", "vehicle")]
+    parts = [
+        json.dumps(values, sort_keys=True),
+        json.dumps(dict(versions), sort_keys=True),
+        _sources(),
+        *(hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()),
+    ]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+@cache
+def _sources() -> str:
+    """Digest of our own code: after an edit the golden flight may be another one."""
+    digest = hashlib.sha256()
+    package = Path(os.path.dirname(mavfi_cli.__file__))
+    for folder in (package, package.parent / "sitl"):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()

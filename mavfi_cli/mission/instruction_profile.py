@@ -1,0 +1,197 @@
+"""Which instructions one invocation of a mission's kernel executes, found without flying.
+
+A node is a function of its orders. The orders of the golden flight are given again to a node of
+its own, at the speed of the machine, which is counted, and stepped at the invocation asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.fi.native.breakpoints import ExecutionCounter
+from mavfi_cli.fi.native.fault import Stage
+from mavfi_cli.fi.native.image import Image, scope_of
+from mavfi_cli.fi.native.node import InvocationProfile, profile_invocation
+from mavfi_cli.fi.native.profile import Profile, Segment, WindowTooLong, record_window
+from mavfi_cli.fi.native.tracee import Tracee, stack_word
+from mavfi_cli.mission.kernel_scope import KernelScope
+from mavfi_cli.mission.node_process import NodeProcess
+from mavfi_cli.mission.node_server import Setup
+from mavfi_cli.mission.spawned_node import SpawnedNode, TracerThread
+
+T = TypeVar("T")
+Order = tuple[Any, float]  # input, start stamp
+Armed = Callable[[], None]
+WHOLE_LIMIT = 600_000  # instructions; more are sampled, where the kernel has inner functions
+WINDOWS = 16
+_ALWAYS_SAMPLED = "octomap"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelProfile:
+    """What was executed, and what is needed to draw from it."""
+
+    profile: Profile
+    first: InvocationProfile  # any window: image and code
+    windows: str  # how many of how many
+
+
+def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
+    """How often the kernel had been entered after each order.
+
+    Raises:
+        FaultError: this system does not count executions for us.
+    """
+    spawned = SpawnedNode()
+    counts = []
+    try:
+        scope = spawned.begin(setup)
+        address = Image(spawned.pid, scope.regions).address(scope.entry)
+        try:
+            counter = ExecutionCounter(spawned.pid, address)
+        except OSError as error:
+            raise FaultError(
+                f"executions cannot be counted here ({error}): see mavfi doctor"
+            ) from None
+        process = NodeProcess(spawned.connection, spawned.pid)
+        for value, start_s in orders:
+            process.take(setup.node, process.order(setup.node, value, start_s))
+            counts.append(counter.read())
+        counter.close()
+    finally:
+        spawned.kill()
+    return counts
+
+
+def profile_kernel(
+    setup: Setup, orders: Sequence[Order], invocation: int, rng: np.random.Generator
+) -> KernelProfile:
+    """Profile one invocation of the kernel, which happens in the last of the orders.
+
+    Raises:
+        TargetError: too long to be stepped, and without inner functions.
+    """
+    if setup.node != _ALWAYS_SAMPLED:
+        try:
+            return _whole(setup, orders, invocation)
+        except WindowTooLong as error:
+            if setup.node != "planner":
+                raise error
+    return _sampled(setup, orders, invocation, rng)
+
+
+def _traced(
+    setup: Setup, orders: Sequence[Order], work: Callable[[int, KernelScope, Armed], T]
+) -> T:
+    """Let a node work on the orders while a tracer does its own work on it."""
+    spawned = SpawnedNode()
+    try:
+        scope = spawned.begin(setup)
+        tracer = TracerThread(lambda armed: work(spawned.pid, scope, armed))
+        tracer.await_armed()
+        process = NodeProcess(spawned.connection, spawned.pid)
+        for value, start_s in orders[:-1]:
+            process.take(setup.node, process.order(setup.node, value, start_s))
+        process.order(setup.node, *orders[-1])
+        return tracer.result()
+    finally:
+        spawned.kill()
+
+
+def _whole(setup: Setup, orders: Sequence[Order], invocation: int) -> KernelProfile:
+    def work(pid: int, scope: KernelScope, armed: Armed) -> InvocationProfile:
+        return profile_invocation(
+            pid,
+            scope.entry,
+            invocation,
+            objects=scope.objects,
+            regions=scope.regions,
+            limit=WHOLE_LIMIT,
+            armed=armed,
+        )
+
+    found = _traced(setup, orders, work)
+    profile = Profile(segments=(found.segment,), windows_in_run=1, cost_s=0.0)
+    return KernelProfile(profile=profile, first=found, windows="1 of 1")
+
+
+def _sampled(
+    setup: Setup, orders: Sequence[Order], invocation: int, rng: np.random.Generator
+) -> KernelProfile:
+    """Step some invocations of one function of the kernel, drawn by how often it runs."""
+    counts = _traced(
+        setup, orders, lambda pid, scope, armed: _count_inner(pid, scope, armed, invocation)
+    )
+    total = sum(counts)
+    if not total:
+        raise FaultError(f"this invocation of {setup.node} calls none of its inner functions")
+    which = int(np.searchsorted(np.cumsum(counts), rng.integers(total), side="right"))
+    number = min(WINDOWS, counts[which])
+    drawn = sorted(1 + rng.choice(counts[which], size=number, replace=False))
+
+    def work(pid: int, scope: KernelScope, armed: Armed) -> list[InvocationProfile]:
+        return _windows(pid, scope, invocation, which, [int(m) for m in drawn], armed)
+
+    found = _traced(setup, orders, work)
+    profile = Profile(
+        segments=tuple(each.segment for each in found), windows_in_run=total, cost_s=0.0
+    )
+    return KernelProfile(profile=profile, first=found[0], windows=f"{number} of {total}")
+
+
+def _count_inner(pid: int, scope: KernelScope, armed: Armed, invocation: int) -> list[int]:
+    tracee = Tracee.attach(pid)
+    try:
+        image = Image(pid, scope.regions)
+        armed()
+        _reach(tracee, image, Stage(scope.entry, invocation))
+        tracee.registers.rearm()
+        back, top = stack_word(tracee), tracee.registers.sp
+        counters = [ExecutionCounter(tracee.tid, image.address(inner)) for inner in scope.inner]
+        while tracee.run_to(back) and tracee.registers.sp <= top:
+            tracee.step()
+        counts = [counter.read() for counter in counters]
+        for counter in counters:
+            counter.close()
+        return counts
+    finally:
+        if tracee.ended is None:
+            tracee.detach()
+
+
+def _windows(
+    pid: int, scope: KernelScope, invocation: int, which: int, drawn: list[int], armed: Armed
+) -> list[InvocationProfile]:
+    tracee = Tracee.attach(pid)
+    found = []
+    try:
+        image = Image(pid, scope.regions)
+        spans = scope_of(image, scope.objects)
+        code = tuple((s.start, tracee.read_memory(s.start, len(s) + 16)) for s in spans.spans)
+        armed()
+        start = Stage(scope.entry, invocation)
+        _reach(tracee, image, start)
+        passed = 0
+        for number in drawn:
+            inner = Stage(scope.inner[which], number)
+            _reach(tracee, image, Stage(inner.location, number - passed))
+            passed = number
+            trace = record_window(
+                tracee, spans, limit=WHOLE_LIMIT, program=f"node {pid}", until_return=True
+            )
+            segment = Segment(start=(start, inner), trace=trace)
+            found.append(InvocationProfile(segment=segment, image=image, code=code))
+    finally:
+        if tracee.ended is None:
+            tracee.detach()
+    return found
+
+
+def _reach(tracee: Tracee, image: Image, stage: Stage) -> None:
+    if not tracee.run_to(image.address(stage.location), stage.count):
+        raise TargetError(f"node {tracee.pid}", f"ended before {stage.location}")

@@ -1,0 +1,56 @@
+"""A node as a program of its own: the one process of a mission that is attacked.
+
+It is started afresh, without address randomisation and with a fixed environment, and its memory
+depends on the orders that it gets only: so a corrupted pointer meets the same things in every
+repetition. A fork of the companion would carry the traces of everything that ran there before.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+from dataclasses import dataclass
+
+from mavfi_cli.autonomy import planners, warm_up
+from mavfi_cli.core.wall import WallClock
+from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.injection import NoInjection
+from mavfi_cli.mission.kernel_scope import kernel_of_node, kernel_scope
+from mavfi_cli.mission.node_process import receive, send, serve
+from mavfi_cli.mission.platform import load_platform
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setup:
+    """The first message to the program; it answers with its `KernelScope`."""
+
+    config: MissionConfig
+    briefing: Briefing
+    node: str
+
+
+def main() -> None:
+    """Load every kernel, hear which node to be, and work until the connection closes."""
+    connection = socket.socket(fileno=int(sys.argv[1]))
+    warm_up()
+    try:
+        setup: Setup = receive(connection)
+    except (OSError, EOFError):
+        return
+    config = setup.config
+    companion = Companion(
+        config,
+        load_platform(config.platform),
+        planners.find(config.planner),
+        setup.briefing,
+        WallClock(),
+        NoInjection(),
+    )
+    send(connection, kernel_scope(kernel_of_node(setup.node, config.planner)))
+    serve(connection, {setup.node: companion.executor.nodes[setup.node].run})
+
+
+if __name__ == "__main__":
+    main()

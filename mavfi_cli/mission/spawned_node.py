@@ -1,0 +1,102 @@
+"""The companion's side of a node that is a program of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.native import linux
+from mavfi_cli.mission.kernel_scope import KernelScope
+from mavfi_cli.mission.node_process import receive, send
+from mavfi_cli.mission.node_server import Setup
+
+T = TypeVar("T")
+_CHANNEL = 3
+_KEPT = ("PATH", "HOME", "PYTHONPATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR")
+_FIXED = {"PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+
+class SpawnedNode:
+    """A started program; loads its kernels at once, so start it early."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
+        actions = [
+            (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
+            (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
+            (os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0),
+            (os.POSIX_SPAWN_DUP2, theirs.fileno(), _CHANNEL),
+        ]
+        line = [sys.executable, "-m", "mavfi_cli.mission.node_server", str(_CHANNEL)]
+        with theirs, linux.fixed_addresses():
+            self.pid = os.posix_spawn(
+                sys.executable, line, {**environment, **_FIXED},
+                file_actions=actions, setsid=True,
+            )  # fmt: skip
+        self.connection = ours
+
+    def begin(self, setup: Setup) -> KernelScope:
+        """Tell it which node it is, and wait until it is ready.
+
+        Raises:
+            TargetError: it could not start.
+        """
+        try:
+            send(self.connection, setup)
+            scope: KernelScope = receive(self.connection)
+        except (OSError, EOFError):
+            raise TargetError(f"node {setup.node}", "its process could not start") from None
+        return scope
+
+    def kill(self) -> None:
+        """End it, if nobody else did."""
+        self.connection.close()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(self.pid, 0)
+
+
+class TracerThread(Generic[T]):
+    """Work that traces a node, in a thread of its own: ptrace belongs to a thread.
+
+    Args:
+        work: gets a function to call once the node runs towards what is awaited.
+    """
+
+    def __init__(self, work: Callable[[Callable[[], None]], T]) -> None:
+        self._armed = threading.Event()
+        self._result: list[T] = []
+        self._error: BaseException | None = None
+
+        def run() -> None:
+            try:
+                self._result.append(work(self._armed.set))
+            except BaseException as error:
+                self._error = error
+            finally:
+                self._armed.set()
+
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+
+    def await_armed(self) -> None:
+        """Wait until the node runs towards what is awaited; raises what went wrong before."""
+        self._armed.wait()
+        if self._error is not None:
+            raise self._error
+
+    def result(self) -> T:
+        """Wait for the end of the work, and raise what it raised."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._result[0]
