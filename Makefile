@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 SOURCES := mavfi_cli sitl tests benchmarks
 
-.PHONY: fly test install install-dev lint docs clean
+.PHONY: fly test install install-dev lint clean
 
 fly: install
 	$(BIN)/mavfi fly --world dense

@@ -1,21 +1,15 @@
-"""Commands that live on the vehicle's side: run them as a process, as everything else does."""
+"""Commands that live on the vehicle's side: this process becomes theirs."""
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import subprocess
+import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
-import click
 
-
-def run_module(module: str, arguments: Sequence[str]) -> None:
-    """Run `python -m module arguments` with our own streams and leave with its exit code."""
-    with subprocess.Popen([sys.executable, "-m", module, *arguments]) as process:
-        while process.poll() is None:
-            with contextlib.suppress(KeyboardInterrupt):  # the child got the same Ctrl-C
-                process.wait()
-    code = process.returncode
-    raise click.exceptions.Exit(128 - code if code < 0 and -code in set(signal.Signals) else code)
+def run_module(module: str, arguments: Sequence[str]) -> NoReturn:
+    """Become `python -m module arguments`: its streams, its signals, its exit code."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

@@ -58,7 +58,7 @@ def of_config(config: MissionConfig) -> Briefing:
         ConfigError: no goal was given.
     """
     if config.goal is None:
-        raise ConfigError("a foreign autopilot needs --goal X,Y,Z (ENU, m, from its home)")
+        raise ConfigError("a foreign autopilot needs --goal X,Y,Z (ENU, m, from its local origin)")
     goal = np.array(config.goal)
     low, high = np.minimum(goal, 0.0) - MARGIN_M, np.maximum(goal, 0.0) + MARGIN_M
     return Briefing(

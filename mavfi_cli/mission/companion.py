@@ -38,6 +38,7 @@ from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
 # a shorter delay is below what the simulation resolves.
 SAME_TICK_S = 0.004
+BRAKE_SHARE = 0.6  # of a_max that stopping counts on, as planned motion does
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +74,10 @@ class Companion:
         v_max, a_max = config.v_max_mps, config.a_max_mps2
         self.pilot = Pilot(
             PilotParams(
-                goal_tolerance_m=config.goal_tolerance_m, v_max_mps=v_max, a_max_mps2=a_max
+                goal_tolerance_m=config.goal_tolerance_m,
+                v_max_mps=v_max,
+                a_max_mps2=a_max,
+                brake_mps2=BRAKE_SHARE * a_max,
             ),
             briefing.goal_enu_m,
         )

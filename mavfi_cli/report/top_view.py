@@ -22,7 +22,7 @@ _PLAN = "#7a8699"
 _GOOD = "#1b7f4b"
 _BAD = "#c22f2f"
 _MARKS: dict[str, dict[str, Any]] = {
-    "replan": {"marker": "o", "s": 26, "facecolors": "white", "edgecolors": "#222831"},
+    "replan": {"marker": "o", "s": 14, "facecolors": "white", "edgecolors": "#222831"},
     "slow": {"marker": "v", "s": 30, "facecolors": "#f2b134", "edgecolors": "#222831"},
     "stop": {"marker": "s", "s": 26, "facecolors": "#e4572e", "edgecolors": "#222831"},
 }
@@ -46,6 +46,7 @@ def draw_top_view(run: Run) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 6.0), layout="constrained")
+    figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
     axes = figure.add_subplot()
     world = run.result.get("world") or {}
     positions, speeds = _path(run)
@@ -56,7 +57,7 @@ def draw_top_view(run: Run) -> Figure:
     _draw_places(axes, run.result, positions)
     _draw_marks(axes, run.result["events"])
     _frame(axes, world, positions)
-    _caption(axes, run.result)
+    _caption(figure, axes, run.result)
     return figure
 
 
@@ -96,8 +97,8 @@ def _draw_plans(axes: Axes, plans: list[dict[str, Any]]) -> None:
         points = np.array(plan["points_enu_m"], dtype=float)
         if len(points):
             axes.plot(
-                points[:, 0], points[:, 1], color=_PLAN, linewidth=0.8, linestyle=(0, (4, 3)),
-                zorder=2, label="planned" if number == 0 else None,
+                points[:, 0], points[:, 1], color=_PLAN, linewidth=0.6, alpha=0.7,
+                linestyle=(0, (4, 3)), zorder=2, label="planned" if number == 0 else None,
             )  # fmt: skip
 
 
@@ -173,16 +174,17 @@ def _frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
     axes.tick_params(color="#aab1bd", labelsize=8)
 
 
-def _caption(axes: Axes, result: dict[str, Any]) -> None:
+def _caption(figure: Figure, axes: Axes, result: dict[str, Any]) -> None:
     config, qof = result["config"], result["quality_of_flight"]
     time_s, distance_m = qof["flight_time_s"], qof["distance_m"]
     figures = "" if time_s is None else f", {time_s:.1f} s, {distance_m:.1f} m"
     axes.set_title(
-        f"{config['link'] or Path(config['world']).stem}, seed {config['seed']}: "
+        f"{config['link'] or config['world'].removesuffix('.toml').rpartition('/')[2]}, "
+        f"seed {config['seed']}: "
         f"{result['outcome'].replace('_', ' ')}{figures}",
         fontsize=10, loc="left",
     )  # fmt: skip
-    axes.legend(
-        loc="upper left", bbox_to_anchor=(-0.02, -0.1), ncols=7, frameon=False, fontsize=8,
+    figure.legend(
+        loc="outside lower center", ncols=8, frameon=False, fontsize=8,
         handletextpad=0.3, columnspacing=0.9,
     )  # fmt: skip
