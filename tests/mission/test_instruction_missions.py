@@ -1,0 +1,154 @@
+"""Instruction-level faults in whole missions: drawn, struck, recorded, repeated."""
+
+import json
+import os
+import platform
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
+from mavfi_cli.fi import record as records
+from mavfi_cli.fi.native.breakpoints import perf_allowed
+from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
+
+traced = pytest.mark.skipif(
+    platform.machine() != "x86_64" or perf_allowed() is not None,
+    reason="executions cannot be counted here",
+)
+OF_THE_FAULT = ("host", "fault", "config", "seeds")
+
+
+def flown(folder, *, without=("host",)):
+    result = json.loads(folder.result.read_text())
+    for name in without:
+        del result[name]
+    return folder.trace.read_bytes(), folder.tlog.read_bytes(), result
+
+
+@pytest.fixture(scope="module")
+def attacked(fly_short):
+    """One flight with a fault in its control node."""
+    return fly_short(instruction=InstructionConfig(target="control", seed=2))
+
+
+@pytest.fixture
+def repeat(attacked, tmp_path):
+    """Flies the attacked mission again from its record, which may be changed."""
+    recorded = records.read(attacked.fault)
+    config = config_of(load_run(attacked.path))
+
+    def fly(change=lambda recorded: recorded, restart_s=config.node_restart_s, **options):
+        changed = change(json.loads(json.dumps(recorded)))
+        mission = replace(config, node_restart_s=restart_s)
+        return fly_mission(mission, tmp_path, Watcher(), repeat=changed, **options)
+
+    return fly
+
+
+@traced
+@pytest.mark.parametrize("node", ["control", "collision_check"])
+def test_a_null_injection_changes_nothing(fly_short, short_flight, node):
+    folder = fly_short(instruction=InstructionConfig(target=node, seed=3, null=True))
+    assert flown(folder, without=OF_THE_FAULT) == flown(short_flight, without=OF_THE_FAULT)
+    fault = load_run(folder.path).result["fault"]
+    assert (fault["state"], fault["node"], fault["corruption"]) == ("null", node, None)
+
+
+@traced
+def test_the_record_says_what_was_hit(attacked):
+    result = load_run(attacked.path).result
+    fault, written = result["fault"], records.read(attacked.fault)
+    assert fault["state"] == "applied"
+    assert written["state"] == "completed"
+    assert fault["kernel"] == "control"
+    assert fault["object"] == "numba:track"
+    assert 1 <= fault["invocation"] <= fault["invocations"]
+    assert fault["invocations"] == result["kernels"]["control"]["invocations"]
+    assert fault["sampling"] == "instruction-uniform"
+    assert fault["scope"] == ["numba:track"]
+    assert "stop_s" in written["injection"]
+    assert "stop_s" not in fault["injection"]
+    (event,) = [e for e in result["events"] if e["kind"] == "fault"]
+    assert event["stamp_s"] == pytest.approx(fault["stamp_s"], abs=0.021)
+    before, after = (int(fault["injection"][name], 16) for name in ("before", "after"))
+    assert before ^ after == sum(1 << bit for bit in fault["corruption"]["bits"])
+
+
+@traced
+def test_a_replay_is_the_same_to_the_byte(attacked, repeat):
+    assert flown(repeat()) == flown(attacked)
+
+
+@traced
+def test_a_wild_jump_kills_the_node_and_the_mission_goes_on(repeat):
+    def wild(recorded):
+        recorded["corruption"] = {
+            "site": "instruction-pointer", "role": "destination", "register": "rip",
+            "operand": "rip", "bits": [45], "memory_operand": 0,
+        }  # fmt: skip
+        return recorded
+
+    first, second = repeat(wild, 0.1), repeat(wild, 0.1)
+    assert flown(first) == flown(second)
+    result = load_run(first.path).result
+    ends = result["nodes"]["control"]
+    assert [crash["how"] for crash in ends["crashes"]] == ["killed by SIGSEGV"]
+    assert ends["restarts"] == 1
+    assert {"success", "collision", "timeout", "no_path"} >= {result["outcome"]}
+
+
+@traced
+def test_a_record_of_another_build_is_refused(repeat):
+    def other(recorded):
+        recorded["build_ids"]["numba:track"] = "sha256:0"
+        return recorded
+
+    with pytest.raises(BuildMismatch, match=r"numba:track has build id .*, recorded is sha256:0"):
+        repeat(other)
+
+
+@traced
+def test_the_node_waits_for_a_debugger_with_the_fault_in_place(repeat):
+    states = []
+
+    def look(pid):
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        states.extend(line.split()[1] for line in lines if line.startswith("State"))
+        os.kill(pid, signal.SIGCONT)
+
+    folder = repeat(for_debugger=look)
+    assert states == ["T"]
+    assert load_run(folder.path).result["fault"]["state"] == "applied"
+
+
+def test_a_stage_draws_one_of_its_nodes():
+    drawn = {InstructionConfig(target="perception", seed=seed).node() for seed in range(40)}
+    assert drawn == {"point_cloud", "octomap", "collision_check"}
+    assert InstructionConfig(target="planning").node() == "planner"
+
+
+def test_what_makes_no_sense_is_refused(fly_short, short_config):
+    with pytest.raises(UnknownName, match="octomap"):
+        InstructionConfig(target="octmap").node()
+    with pytest.raises(UnknownName, match="vector"):
+        InstructionConfig(target="octomap", sites=("vektor",)).strategy()
+    with pytest.raises(FaultSpecError, match="cannot be repeated"):
+        InstructionConfig(target="octomap", sampling="wall-clock").strategy()
+    config = replace(
+        short_config, instruction=InstructionConfig(target="control"), link="udpin:127.0.0.1:1"
+    )
+    with pytest.raises(FaultError, match="leave out --link"):
+        fly_mission(config, Path("."), Watcher())
+
+
+def test_the_habits_of_another_injector_keep_a_moment_that_repeats():
+    config = InstructionConfig(target="control", compat="rosfi-2021")
+    assert config.strategy().refused
+    assert config.sampling_name().startswith("instruction-uniform with")
