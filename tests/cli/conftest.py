@@ -1,3 +1,4 @@
+import subprocess
 import sys
 
 import pytest
@@ -9,6 +10,8 @@ from mavfi_cli import cli
 def command_line(monkeypatch, capfd, tmp_path):
     """Run the command line in this process, in an empty folder; exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
+    # A command that becomes another process would take the test's own with it.
+    monkeypatch.setattr("os.execv", lambda _path, line: sys.exit(subprocess.call(line)))
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["mavfi", *map(str, arguments)])

@@ -149,3 +149,11 @@ def test_doctor_exits_with_1_where_flying_would_not_work(command_line, monkeypat
     assert code == 1
     assert "missing: ompl" in out
     assert "-> pip" in out
+
+
+def test_sitl_is_the_process_that_was_started_so_signals_reach_it():
+    line = [sys.executable, "-m", "mavfi_cli", "sitl", "--link", "udpout:127.0.0.1:9"]
+    with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
+        assert any("Ctrl-C ends it" in told for told in process.stderr)
+        process.terminate()
+        assert process.wait(20) == 0
