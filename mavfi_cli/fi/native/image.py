@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from elftools.common.exceptions import ELFError
 from elftools.elf.elffile import ELFFile
 
@@ -98,15 +99,25 @@ def _text(elf: Any) -> tuple[range, ...]:
     )
 
 
+# Elf64_Sym, and the symbol types of functions (STT_FUNC, and STT_LOOS for indirect ones). Read in
+# one piece: a library of 10 MB has tens of thousands of symbols.
+_SYMBOL = np.dtype(
+    [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("value", "<u8"),
+     ("size", "<u8")]
+)  # fmt: skip
+_FUNCTION_TYPES = (2, 10)
+
+
 def _functions(elf: Any) -> Iterable[tuple[int, int, str]]:
     for name in (".symtab", ".dynsym"):
         section = elf.get_section_by_name(name)
-        if section is None:
+        if section is None or not section["sh_size"]:
             continue
-        for symbol in section.iter_symbols():
-            kind = symbol["st_info"]["type"]
-            if kind in ("STT_FUNC", "STT_LOOS") and symbol["st_value"]:
-                yield symbol["st_value"], symbol["st_size"], symbol.name
+        names: bytes = elf.get_section(section["sh_link"]).data()
+        symbols = np.frombuffer(section.data(), _SYMBOL)
+        wanted = np.isin(symbols["info"] & 0xF, _FUNCTION_TYPES) & (symbols["value"] != 0)
+        for start, size, at in symbols[wanted][["value", "size", "name"]].tolist():
+            yield start, size, names[at : names.index(b"\0", at)].decode(errors="replace")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
