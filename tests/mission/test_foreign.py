@@ -61,17 +61,18 @@ def test_a_goal_must_be_named(fly_short, free_port):
 
 @pytest.fixture
 def hurried(monkeypatch):
-    """Ten seconds of patience are for people; 0.3 s will do for a test."""
+    """Seconds of patience are for people; 0.3 s will do for a test."""
     monkeypatch.setattr(flight, "LOST_S", 0.3)
+
+
+@pytest.fixture
+def soon_given_up(monkeypatch):
+    """Nobody is waited for longer than 0.3 s."""
     settings = flight.SessionSettings
-
-    def shorter(**options):
-        return settings(connect_timeout_s=0.3, **options)
-
-    monkeypatch.setattr(flight, "SessionSettings", shorter)
+    monkeypatch.setattr(flight, "SessionSettings", lambda **o: settings(connect_timeout_s=0.3, **o))
 
 
-def test_nobody_there(fly_short, free_port, hurried):
+def test_nobody_there(fly_short, free_port, soon_given_up):
     assert SessionSettings().connect_timeout_s == 10.0
     url = f"udpin:127.0.0.1:{free_port}"
     with pytest.raises(NoAutopilot, match=f"no autopilot at {url}: no heartbeat within"):
@@ -102,7 +103,7 @@ def test_an_autopilot_that_refuses_to_arm_says_why(autopilot_on_udp, fly_short):
 @pytest.mark.parametrize("autopilot", [FakePX4, FakeArduCopter])
 def test_a_flight_without_a_camera_ends_by_the_clock(autopilot, autopilot_on_udp, fly_short):
     _, url = autopilot_on_udp(autopilot())
-    run = load_run(fly_short(link=url, time_limit_s=3.0).path)
+    run = load_run(fly_short(link=url, time_limit_s=1.0).path)
     assert run.result["outcome"] == "timeout"
     assert run.result["images"]["received"] == 0
     assert run.result["quality_of_flight"]["distance_m"] < 0.5
@@ -178,7 +179,7 @@ def test_garbage_on_the_link_does_not_disturb_the_flight(autopilot_on_udp, fly_s
     assert result["outcome"] == "timeout"
 
 
-def test_the_link_opens_only_when_everything_is_loaded(fly_short, free_port, hurried, monkeypatch):
+def test_the_link_opens_only_when_everything_is_loaded(fly_short, free_port, soon_given_up, monkeypatch):
     """Seconds of old messages, then a gap where the buffer was full, looked like a lost link."""
     loaded = []
 

@@ -134,7 +134,8 @@ def test_a_flight_with_obstacles_replans_and_tells_where(troubled_flight):
     assert result["outcome"] == "success"
     assert result["pilot"]["collisions_foreseen"] >= 1
     assert result["pilot"]["replans"] >= 1
-    assert len(result["plans"]) == result["pilot"]["replans"] + 1 + result["pilot"]["plans_ignored"]
+    pilot = result["pilot"]
+    assert pilot["replans"] + 1 <= len(result["plans"]) <= pilot["plans_requested"]
     told = [event for event in result["events"] if event["kind"] == "replan"]
     assert told
     assert all(len(event["position_enu_m"]) == 3 for event in told)
