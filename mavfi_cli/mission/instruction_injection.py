@@ -149,7 +149,7 @@ def attack_text(written: Mapping[str, Any]) -> str:
         return f"fault in {where}: not injected ({written.get('not_injected_reason', '')})"
     corruption = written["corruption"]
     bits = ", ".join(map(str, corruption["bits"]))
-    what = corruption["operand"] or corruption["site"]
+    what = corruption["register"] or corruption["site"]
     activation = written["activation"]["activation"].replace("_", " ")
     return f"fault in {where}: bit {bits} of {corruption['role']} {what}, {activation}"
 

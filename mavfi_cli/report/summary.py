@@ -136,7 +136,7 @@ def _instruction_lines(fault: dict[str, Any]) -> list[str]:
     if fault["state"] == "not_injected":
         return [*lines, f"            not injected: {fault['reason']}"]
     bits = ", ".join(map(str, corruption["bits"]))
-    what = corruption["operand"] or corruption["site"]
+    what = corruption["register"] or corruption["site"]
     activation = fault["activation"]["activation"].replace("_", " ")
     return [
         *lines,
@@ -161,7 +161,10 @@ def _told(change: dict[str, Any], when: str) -> str:
         return {"0x7ff0000000000000": "inf", "0xfff0000000000000": "-inf"}.get(
             pattern, f"nan {pattern}"
         )
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    short = [f"{change[name]:.6g}" for name in ("before", "after") if change[name] is not None]
+    return repr(value) if len(short) == 2 and short[0] == short[1] else f"{value:.6g}"
 
 
 def difference_lines(run: Run, golden: Run) -> list[str]:
