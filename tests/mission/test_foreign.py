@@ -179,7 +179,9 @@ def test_garbage_on_the_link_does_not_disturb_the_flight(autopilot_on_udp, fly_s
     assert result["outcome"] == "timeout"
 
 
-def test_the_link_opens_only_when_everything_is_loaded(fly_short, free_port, soon_given_up, monkeypatch):
+def test_the_link_opens_only_when_everything_is_loaded(
+    fly_short, free_port, soon_given_up, monkeypatch
+):
     """Seconds of old messages, then a gap where the buffer was full, looked like a lost link."""
     loaded = []
 
