@@ -89,6 +89,7 @@ class NodeProcess:
             connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in the middle of a word
         self._answers: dict[int, _Answer] = {}
         self._count = 0
+        self._gone = False  # and reaped: its number may belong to another process by now
 
     @classmethod
     def fork(cls, runs: Mapping[str, Run]) -> NodeProcess:
@@ -164,6 +165,7 @@ class NodeProcess:
     def _end(self) -> str:
         """How the process ended, in words."""
         told = self._ending()
+        self._gone = True
         if told is not None:
             return told
         with contextlib.suppress(ChildProcessError):
@@ -176,6 +178,9 @@ class NodeProcess:
     def close(self, *, kill: bool = False) -> None:
         """End the process: it ends itself when the connection closes, unless it cannot hear."""
         self._socket.close()
+        if self._gone:
+            return
+        self._gone = True
         if kill:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._pid, signal.SIGKILL)
