@@ -13,9 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = {"benign": "#b9cfe4", "crash": "#e4572e", "hang": "#f2b134", "sdc": "#6a3d7c"}
+_COLOURS = {"sdc": "#8e5aa3", "crash": "#e4572e", "hang": "#f2b134", "benign": "#c3d4e6"}
 _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
-_LIGHT = ("benign", "hang")  # bars on which dark text is read
 
 
 def write_kernel_plot(summary: Mapping[str, Any], path: Path) -> None:
@@ -55,18 +54,18 @@ def _bar(axes: Axes, place: int, outcomes: Mapping[str, Any]) -> None:
         row = outcomes[name]
         share = 100.0 * (row["share"] or 0.0)
         axes.bar(place, share, bottom=base, width=0.66, color=colour)
-        if share >= 6.0:
-            colour = "#222831" if name in _LIGHT else "white"
+        if share >= 5.0:
             axes.text(
-                place - 0.12, base + share / 2, f"{share:.0f}", color=colour, fontsize=8,
+                place - 0.16, base + share / 2, f"{share:.0f}", color="#1d232b", fontsize=8.5,
                 ha="center", va="center",
             )  # fmt: skip
         low, high = (100.0 * edge for edge in row["wilson95"])
         if row["count"]:
-            top = base + share  # the interval of this share, drawn at its upper edge
+            top = name == "benign"  # the last one has its inner edge below
+            down, up = (high - share, share - low) if top else (share - low, high - share)
             axes.errorbar(
-                place + 0.1 + 0.06 * number, top, [[share - low], [high - share]],
-                color="#222831", elinewidth=0.9, capsize=2.0, clip_on=False,
+                place + 0.03 + 0.08 * number, base if top else base + share, [[down], [up]],
+                color="#1d232b", elinewidth=0.9, capsize=2.0,
             )  # fmt: skip
         base += share
 
@@ -77,7 +76,8 @@ def _tick(kernel: Mapping[str, Any]) -> str:
 
 
 def _caption(summary: Mapping[str, Any]) -> str:
+    model = summary["plan"]["model"]
     return (
-        f"one bit flip a run; sampling: {summary['sampling']}; whiskers: 95 % Wilson interval of "
-        "each share, at its upper edge"
+        f"{model['bits']} bit(s) flipped once a run; sampling: {summary['sampling']}\n"
+        "whiskers: 95 % Wilson interval of a share, at its inner edge"
     )

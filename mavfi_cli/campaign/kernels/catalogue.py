@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, tracking
+from mavfi_cli.autonomy.grid import segment_free
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.campaign.kernels.difference import Compare, Output, numbers, paths, voxels
 from mavfi_cli.campaign.kernels.inputs import KernelInputs
 from mavfi_cli.core.errors import UnknownName
-from mavfi_cli.mission.kernel_scope import KernelScope, kernel_scope
+from mavfi_cli.mission.kernel_scope import KernelScope, compiled_region, kernel_scope
 
 Call = Callable[[], Output]
 
@@ -28,6 +30,7 @@ class Kernel:
         compare: size of the difference of two outputs.
         repeatable: the call leaves no state behind, so it is warmed up by calling it.
         too_long: to be stepped as a whole; functions inside it are sampled.
+        inner: compiled functions that are sampled beside those of its scope.
     """
 
     name: str
@@ -36,10 +39,13 @@ class Kernel:
     compare: Compare = numbers
     repeatable: bool = True
     too_long: bool = False
+    inner: tuple[Any, ...] = ()
 
     def scope(self) -> KernelScope:
         """Its machine code that can be hit, in a process in which it has run."""
-        return kernel_scope(self.name)
+        found = kernel_scope(self.name)
+        more = tuple(compiled_region(function)[1] for function in self.inner)
+        return replace(found, inner=(*found.inner, *more))
 
 
 def _point_cloud(inputs: KernelInputs) -> Call:
@@ -127,7 +133,14 @@ KERNELS = {
         Kernel(
             name="rrtconnect", title="RRTConnect", prepare=_planner("rrtconnect"), compare=paths
         ),
-        Kernel(name="rrtstar", title="RRT*", prepare=_planner("rrtstar"), compare=paths),
+        Kernel(
+            name="rrtstar",
+            title="RRT*",
+            prepare=_planner("rrtstar"),
+            compare=paths,
+            too_long=True,
+            inner=(segment_free,),
+        ),
         Kernel(name="control", title="PID", prepare=_control),
     )
 }

@@ -102,11 +102,17 @@ def _nan(array: NDArray[np.generic]) -> NDArray[np.bool_]:
 
 
 def voxels(golden: Output, output: Output) -> Difference:
-    """How many voxels are occupied in one map only; relative to those of the golden map."""
+    """How many voxels are occupied in one map only, relative to those of the golden map.
+
+    Where the same voxels are occupied, the difference is in the number of the tree's nodes.
+    """
     ours, theirs = _occupied(golden), _occupied(output)
     count = len(ours ^ theirs)
     if not count:
-        return Difference(relative=0.0, absolute=0.0, unit="voxels", text="tree of another size")
+        nodes, other = int(golden["nodes"]), int(output["nodes"])
+        gap = abs(other - nodes)
+        text = f"{other - nodes:+d} nodes"
+        return Difference(relative=gap / nodes, absolute=float(gap), unit="nodes", text=text)
     text = f"{len(ours - theirs)} voxels missing, {len(theirs - ours)} added"
     return Difference(
         relative=count / max(1, len(ours)), absolute=float(count), unit="voxels", text=text

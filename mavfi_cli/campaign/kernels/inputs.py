@@ -64,9 +64,19 @@ def load_inputs(path: Path) -> tuple[KernelInputs, str]:
     """
     try:
         data = path.read_bytes()
-        inputs = pickle.loads(data)
+        inputs = inputs_of_bytes(data)
     except (OSError, pickle.UnpicklingError, AttributeError, EOFError, ImportError) as error:
         raise RecordError(f"{path}: not a file of kernel inputs ({error})") from None
-    if not isinstance(inputs, KernelInputs):
-        raise RecordError(f"{path}: not a file of kernel inputs")
     return inputs, hashlib.sha256(data).hexdigest()
+
+
+def inputs_of_bytes(data: bytes) -> KernelInputs:
+    """The inputs in the bytes of such a file.
+
+    Raises:
+        pickle.UnpicklingError: something else.
+    """
+    inputs = pickle.loads(data)
+    if not isinstance(inputs, KernelInputs):
+        raise pickle.UnpicklingError(f"a {type(inputs).__name__}")
+    return inputs

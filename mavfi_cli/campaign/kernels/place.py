@@ -10,12 +10,11 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mavfi_cli.campaign.kernels.template import ASK_SCOPE, LENGTH_BYTES, PID_BYTES, RUN, TIMES
-from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.campaign.kernels.template import ASK_SCOPE, GO, LENGTH_BYTES, PID_BYTES, RUN, TIMES
+from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.image import Image
@@ -31,6 +30,18 @@ _FIXED = {
     "OMP_NUM_THREADS": "1",
     "MALLOC_ARENA_MAX": "1",
 }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Template:
+    """How a template is started.
+
+    Command line, environment and folder are the same whoever starts it, wherever the inputs lie:
+    their lengths alone would move its stack and its heap.
+    """
+
+    arguments: tuple[str, ...]  # what follows `python`
+    data: bytes  # sent to it first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +68,7 @@ class Place:
     def __init__(
         self,
         kernel: str,
-        template: Iterable[str],
+        template: Template,
         *,
         layout: Layout | None = None,
         mechanism: Mechanism | None = None,
@@ -67,7 +78,7 @@ class Place:
 
         Args:
             kernel: its name.
-            template: module and first arguments of the template's command line.
+            template: how its process is started.
             layout: of another template of the same kernel; looking it up takes seconds.
             mechanism: how executions are counted.
             look_up: find the layout; without it nothing can be attacked.
@@ -83,15 +94,17 @@ class Place:
         environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
         with theirs, linux.fixed_addresses():
             self._process = subprocess.Popen(
-                [sys.executable, "-m", *template, str(theirs.fileno()), str(self._output)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
+                [sys.executable, *template.arguments],
+                stdin=theirs.fileno(),
+                stdout=self._output,
                 stderr=self._errors,
-                pass_fds=[theirs.fileno(), self._output],
                 env=environment | _FIXED,
+                cwd="/",
                 start_new_session=True,
             )
         try:
+            self._control.sendall(len(template.data).to_bytes(LENGTH_BYTES, "little"))
+            self._control.sendall(template.data)
             self._receive(1)
             if look_up:
                 self.layout = self._layout(layout)
@@ -134,7 +147,7 @@ class Place:
         if len(told) < PID_BYTES:
             raise FaultError(f"the process that loads {self.kernel} has died")
         tracee = Tracee.attach(int.from_bytes(told, "little"), mechanism=self._mechanism)
-        self._control.send(RUN)
+        self._control.send(GO)
         return tracee
 
     def told(self) -> Told | None:
@@ -155,12 +168,20 @@ class Place:
         os.close(self._output)
 
 
-def template_of(kernel: str, inputs: Path) -> tuple[str, ...]:
-    """The template of one of our own kernels."""
-    return ("mavfi_cli.campaign.kernels.template", kernel, str(inputs))
+def template_of(kernel: str, inputs: Path) -> Template:
+    """The template of one of our own kernels.
+
+    Raises:
+        RecordError: the inputs cannot be read.
+    """
+    try:
+        data = inputs.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{inputs}: {error.strerror}") from None
+    return Template(arguments=("-m", "mavfi_cli.campaign.kernels.template", kernel), data=data)
 
 
-def load(kernel: str, template: Iterable[str]) -> None:
+def load(kernel: str, template: Template) -> None:
     """Load a kernel once, so that all its compiled code is in the cache from now on."""
     Place(kernel, template, look_up=False).close()
 

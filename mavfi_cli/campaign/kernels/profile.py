@@ -8,6 +8,7 @@ instructions (executions x mean length). What executes outside of these function
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass
 
@@ -121,7 +122,9 @@ def _stratum(
     drawn = rng.choice(count, size=min(windows, count), replace=False)
     segments = tuple(_window(place, Stage(function, int(number) + 1)) for number in sorted(drawn))
     profile = Profile(segments=segments, windows_in_run=count, cost_s=time.perf_counter() - start)
-    return Stratum(function=function, symbol=_short(image.symbol(function)), profile=profile)
+    return Stratum(
+        function=function, symbol=_short(image.symbol(function) or function.object), profile=profile
+    )
 
 
 def _window(place: Place, stage: Stage) -> Segment:
@@ -152,19 +155,11 @@ def _code(place: Place) -> tuple[tuple[int, bytes], ...]:
 
 
 def _short(symbol: str) -> str:
-    """The name of a C++ function without its class, where it is mangled the usual way."""
-    name = symbol.partition("+")[0]
-    words, at = [], 0
-    while at < len(name):
-        digits = 0
-        while at + digits < len(name) and name[at + digits].isdigit():
-            digits += 1
-        size = int(name[at : at + digits] or 0)
-        if digits and at + digits + size <= len(name):
-            words.append(name[at + digits : at + digits + size])
-            at += digits + size
-            if at < len(name) and name[at] == "E":
-                break
-        else:
-            at += 1
-    return words[-1] if words else name or "its entry"
+    """The plain name of a function in a mangled one: the last part of its qualified name."""
+    mangled = symbol.partition("+")[0]
+    for size in re.finditer(r"\d+", mangled):
+        end = size.end() + int(size.group())
+        name = mangled[size.end() : end]
+        if name[:1].islower() and mangled[end : end + 1] in ("E", "I"):
+            return name
+    return mangled or "its entry"

@@ -1,13 +1,14 @@
 """A warm process with one kernel loaded and fed, that forks itself for every run.
 
-    python -m mavfi_cli.campaign.kernels.template KERNEL INPUTS CONTROL OUTPUT
+    python -m mavfi_cli.campaign.kernels.template KERNEL
 
-Protocol on the CONTROL socket: first comes one byte, when all is loaded. `ASK_SCOPE` is answered
-by the kernel's scope, as a pickle with its length (8 bytes, little endian) before it. For every
-`RUN` a child is forked; it sends its process id (4 bytes), waits for a byte, calls the kernel once,
-writes OUTPUT and ends. The next request must not come before the child has ended. OUTPUT holds CPU
-seconds and duration of the call (two float64), then the packed output, or the error's text where
-the exit code is `RAISED`.
+Standard input is a socket, standard output a file. On the socket the inputs of the kernel come
+in, with their length (8 bytes, little endian) before them; one byte goes out when all is loaded.
+`ASK_SCOPE` is answered by the kernel's scope, as a pickle with its length before it. For every
+`RUN` a child is forked; it sends its process id (4 bytes), waits for `GO`, calls the kernel
+once, writes its output to the file and ends. The next request must not come before the child has
+ended. The file holds CPU seconds and duration of the call (two float64), then the packed output,
+or the error's text where the exit code is `RAISED`.
 
 Every run starts from the same memory: no address randomisation, no garbage collection, and
 nothing is kept here from one fork to the next.
@@ -29,45 +30,68 @@ from pathlib import Path
 from mavfi_cli.campaign.kernels import catalogue
 from mavfi_cli.campaign.kernels.catalogue import Call
 from mavfi_cli.campaign.kernels.difference import pack
-from mavfi_cli.campaign.kernels.inputs import load_inputs
+from mavfi_cli.campaign.kernels.inputs import inputs_of_bytes
 
 RAISED = 3  # exit code of a child whose kernel raised an error
 TIMES = struct.Struct("<dd")
 PID_BYTES, LENGTH_BYTES = 4, 8
-RUN, ASK_SCOPE = b"r", b"s"
+RUN, GO, ASK_SCOPE = b"r", b"g", b"s"
+CONTROL, OUTPUT = 0, 1
 _EXTRA_MEMORY = 2 << 30  # a corrupted size must not take the machine down
 _LARGEST_FILE = 1 << 28
 
 
 def main(arguments: list[str]) -> None:
     """Get warm, then fork until the other end closes."""
-    name, inputs_path, control, output = arguments
-    serve(catalogue.find(name), Path(inputs_path), int(control), int(output))
+    kernel = catalogue.find(arguments[0])
+    serve(kernel, kernel.prepare(inputs_of_bytes(receive_inputs())))
 
 
-def serve(kernel: catalogue.Kernel, inputs_path: Path, control: int, output: int) -> None:
-    """The template's whole life."""
-    call = kernel.prepare(load_inputs(inputs_path)[0])
+def receive_inputs() -> bytes:
+    """What the other end sends first."""
+    size = int.from_bytes(_exactly(LENGTH_BYTES), "little")
+    return _exactly(size)
+
+
+def _exactly(size: int) -> bytes:
+    data = bytearray()
+    while len(data) < size:
+        piece = os.read(CONTROL, size - len(data))
+        if not piece:
+            raise EOFError
+        data += piece
+    return bytes(data)
+
+
+def serve(kernel: catalogue.Kernel, call: Call) -> None:
+    """Warm the call up, then do what the other end asks until it closes."""
     for _ in range(2 if kernel.repeatable else 0):
         pack(call())
     _limit()
     gc.collect()
     gc.freeze()
     gc.disable()
-    os.write(control, RUN)
-    while request := os.read(control, 1):
+    os.write(CONTROL, RUN)
+    while request := os.read(CONTROL, 1):
         if request == ASK_SCOPE:
-            _in_child(lambda: _tell_scope(kernel, call, control))
-        else:
-            _in_child(lambda: _run(call, control, output))
+            status = _in_child(lambda: _tell_scope(kernel, call))
+            if status:
+                _give_up(f"fails without a fault (wait status {status})")
+        elif request == RUN:  # not the GO of a child that was killed before it took it
+            _in_child(lambda: _run(call))
 
 
-def _in_child(work: Callable[[], int]) -> None:
-    """Do work in a fork of this process, and wait for its end."""
+def _give_up(why: str) -> None:
+    """End without the libraries' own last words, which would hide ours."""
+    os.write(2, f"{why}\n".encode())
+    os._exit(1)
+
+
+def _in_child(work: Callable[[], int]) -> int:
+    """Do work in a fork of this process, and wait for its end; its wait status."""
     child = os.fork()
     if child:
-        os.waitpid(child, 0)
-        return
+        return os.waitpid(child, 0)[1]
     code = 1
     try:
         code = work()
@@ -85,20 +109,20 @@ def _limit() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
 
 
-def _tell_scope(kernel: catalogue.Kernel, call: Call, control: int) -> int:
+def _tell_scope(kernel: catalogue.Kernel, call: Call) -> int:
     """Look up where the kernel's code is; in a child, as that leaves much in the memory."""
     call()
     data = pickle.dumps(kernel.scope())
     data = len(data).to_bytes(LENGTH_BYTES, "little") + data
     while data:
-        data = data[os.write(control, data) :]
+        data = data[os.write(CONTROL, data) :]
     return 0
 
 
-def _run(call: Call, control: int, output: int) -> int:
+def _run(call: Call) -> int:
     """One run of the kernel; the exit code."""
-    os.write(control, os.getpid().to_bytes(PID_BYTES, "little"))
-    if not os.read(control, 1):
+    os.write(CONTROL, os.getpid().to_bytes(PID_BYTES, "little"))
+    if not os.read(CONTROL, 1):
         return 0
     cpu_s, wall_s, code = time.process_time(), time.perf_counter(), 0
     try:
@@ -106,7 +130,7 @@ def _run(call: Call, control: int, output: int) -> int:
     except Exception as error:  # whatever the corrupted kernel raises is a result
         data, code = f"{type(error).__name__}: {error}".encode(), RAISED
     times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
-    os.pwrite(output, times + data, 0)
+    os.pwrite(OUTPUT, times + data, 0)
     return code
 
 

@@ -1,0 +1,123 @@
+"""Instruction-level injections in our own kernels: how many an hour, and where the time goes.
+
+    python benchmarks/kernel_injections.py [--runs 100] [--replays 50] [--kernel NAME ...]
+
+For each kernel: exact injections per hour and core (sum of the runs' durations, hangs included; and
+with the preparation spread over 5,000 runs), the share of a run that goes into process start, the
+counted executions and the golden computation, the stop time, the slow-down of a kernel by a null
+injection, and how many of the replays came out identical. Targets: 50,000 an hour for PID and point
+cloud, 5,000 for OctoMap and RRT*; stop median under 0.2 ms, 99th percentile under 1 ms; 1,000
+identical replays over all kernels; a null injection costs less than 1 % outside the counted window.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from mavfi_cli.campaign.kernels import catalogue
+from mavfi_cli.campaign.kernels.attack import without_flip
+from mavfi_cli.campaign.kernels.place import Place, template_of
+from mavfi_cli.campaign.kernels.recorder import inputs_of_flight
+from mavfi_cli.campaign.kernels.replay import replay_runs
+from mavfi_cli.campaign.kernels.runs import Plan, one_processor, run_kernels
+from mavfi_cli.fi import record
+from mavfi_cli.mission.config import MissionConfig
+
+
+def starts(place: Place, runs: int = 20) -> tuple[float, float]:
+    """Median time to have a run ready for its trigger, and CPU time of its undisturbed call."""
+    ready, call = [], []
+    for _ in range(runs):
+        begun = time.perf_counter()
+        tracee = place.start()
+        ready.append(time.perf_counter() - begun)
+        while tracee.ended is None:
+            tracee.resume()
+        call.append(place.told().cpu_s)
+    return float(np.median(ready)), float(np.median(call))
+
+
+def after_the_window(place: Place, fault, runs: int = 20) -> float:
+    """Median CPU time of a call whose null injection came at its first counted instruction."""
+    call = []
+    for _ in range(runs):
+        tracee = place.start()
+        first = fault.trigger[0]
+        if tracee.run_to(place.layout.image.address(first.location)):
+            while tracee.ended is None:
+                tracee.resume()
+        call.append(place.told().cpu_s)
+    return float(np.median(call))
+
+
+def measure(plan: Plan, folder: Path, replays: int) -> tuple[int, int]:
+    """Print the figures of one kernel; identical replays and all replays."""
+    (name,) = plan.kernels
+    (runs,) = run_kernels(plan, folder=folder)
+    records, prepared = runs.records, runs.prepared
+    run_s = np.array([entry["run_s"] for entry in records])
+    stops = [entry["injection"].get("stop_s") for entry in records]
+    stop_ms = 1e3 * np.array([stop for stop in stops if stop is not None])
+    with (
+        one_processor(),
+        closing(Place(name, template_of(name, plan.inputs), layout=prepared.layout)) as place,
+    ):
+        ready_s, call_s = starts(place)
+        fault = without_flip(record.fault_of(records[0]))
+        null_s = after_the_window(place, fault)
+    hangs = sum(entry["outcome"] == "hang" for entry in records)
+    mean_s = run_s.mean()
+    spread_s = mean_s + prepared.prepare_s / 5000
+    rest = max(0.0, 1.0 - (ready_s + call_s) / mean_s)
+    print(
+        f"{name}: {3600 / mean_s:,.0f} injections per hour and core ({3600 / spread_s:,.0f} with "
+        f"{prepared.prepare_s:.0f} s of preparation over 5,000 runs); {hangs} hangs"
+    )
+    print(
+        f"  a run takes {1e3 * mean_s:.1f} ms: process start {ready_s / mean_s:.0%}, golden "
+        f"computation {call_s / mean_s:.0%}, counting, following, hangs and the rest {rest:.0%}"
+    )
+    print(
+        f"  stop: median {np.median(stop_ms):.3f} ms, 99th percentile "
+        f"{np.percentile(stop_ms, 99):.3f} ms; CPU time of the call {1e3 * call_s:.2f} ms, stopped "
+        f"once at the entry {1e3 * null_s:.2f} ms ({null_s / call_s - 1:+.1%})"
+    )
+    print(f"  population: {prepared.profile.in_words()}")
+    found = list(replay_runs(folder, (name,), replays)) if replays else []
+    equal = sum(not replay.differs for replay in found)
+    for replay in found:
+        if replay.differs:
+            print(f"  run {replay.run} differs in {', '.join(replay.differs)}")
+    print(f"  replays: {equal} of {len(found)} identical", flush=True)
+    return equal, len(found)
+
+
+def main() -> None:
+    """Run all of it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--replays", type=int, default=50)
+    parser.add_argument("--kernel", action="append", default=[])
+    options = parser.parse_args()
+    equal = total = 0
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        path, flight, sha256 = inputs_of_flight(MissionConfig(), folder)
+        for kernel in catalogue.select(options.kernel):
+            plan = Plan(
+                kernels=(kernel.name,), runs=options.runs, seed=1, inputs=path,
+                inputs_sha256=sha256, flight=flight,
+            )  # fmt: skip
+            same, count = measure(plan, folder, options.replays)
+            equal, total = equal + same, total + count
+    print(f"all kernels: {equal} of {total} replays identical")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Inputs of the kernels, recorded once, and a campaign on them."""
+
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.campaign.kernels.inputs import load_inputs, save_inputs
+from mavfi_cli.campaign.kernels.recorder import record_inputs
+from mavfi_cli.campaign.kernels.runs import Plan, run_kernels
+from mavfi_cli.mission.config import MissionConfig
+
+
+@pytest.fixture(scope="session")
+def tracing():
+    """Skips where nothing can be traced."""
+    import platform
+
+    if platform.machine() != "x86_64":
+        pytest.skip("instruction-level injection does not know this processor")
+    from mavfi_cli.fi.native.doctor import check_tracing
+
+    problem = check_tracing().problem
+    if problem:
+        pytest.skip(problem)
+
+
+@pytest.fixture(scope="session")
+def kernel_inputs(tmp_path_factory) -> Path:
+    """A file of kernel inputs, from a flight round a row of boxes."""
+    folder = tmp_path_factory.mktemp("inputs")
+    world = folder / "posts.toml"
+    world.write_text(
+        'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
+        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
+        "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
+    )
+    path = folder / "inputs.pickle"
+    save_inputs(path, record_inputs(MissionConfig(world=str(world), seed=2)))
+    return path
+
+
+@pytest.fixture(scope="session")
+def attack(tracing, kernel_inputs):
+    """Function that runs a campaign on those inputs."""
+    inputs, sha256 = load_inputs(kernel_inputs)
+
+    def run(*kernels, runs=10, jobs=1, folder=None, **changes):
+        values = {"seed": 5, "inputs": kernel_inputs, "inputs_sha256": sha256}
+        plan = Plan(kernels=kernels, runs=runs, flight=inputs.flight, **(values | changes))
+        return plan, run_kernels(plan, jobs=jobs, folder=folder)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def control_campaign(attack):
+    """Thirty faults in the controller."""
+    return attack("control", runs=30)

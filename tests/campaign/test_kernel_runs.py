@@ -1,0 +1,175 @@
+"""Isolated campaigns on our own kernels: repeatable, resumable, tolerant, told in full."""
+
+import csv
+import io
+import json
+
+import pytest
+
+from mavfi_cli.campaign.kernels import catalogue
+from mavfi_cli.campaign.kernels.difference import pack
+from mavfi_cli.campaign.kernels.inputs import load_inputs
+from mavfi_cli.campaign.kernels.replay import replay_runs
+from mavfi_cli.campaign.kernels.summary import CSV_COLUMNS, csv_rows, summarise, table
+from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
+from mavfi_cli.fi.isolated.compare import digest
+from mavfi_cli.report.kernel_plot import write_kernel_plot
+
+OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
+
+
+def untimed(runs):
+    """Records without what only says how long things took."""
+    records = json.loads(json.dumps(runs.records))
+    for entry in records:
+        del entry["run_s"]
+        entry["injection"].pop("stop_s", None)
+    return records
+
+
+def test_the_number_of_workers_changes_nothing(attack):
+    _, alone = attack("control", "point_cloud", runs=12)
+    _, together = attack("control", "point_cloud", runs=12, jobs=2)
+    for one, two in zip(alone, together, strict=True):
+        assert untimed(one) == untimed(two)
+        assert {entry["outcome"] for entry in one.records} <= OUTCOMES
+        assert any(entry["injection"]["applied"] for entry in one.records)
+
+
+def test_the_golden_run_is_the_kernel_itself(control_campaign, kernel_inputs):
+    _, (runs,) = control_campaign
+    call = catalogue.find("control").prepare(load_inputs(kernel_inputs)[0])
+    assert runs.prepared.golden.sha256 == digest(pack(call()))
+
+
+def test_a_fault_depends_on_its_number_only(attack, control_campaign):
+    _, (many,) = control_campaign
+    _, (few,) = attack("control", runs=5)
+    assert untimed(few) == untimed(many)[:5]
+
+
+def test_other_seeds_draw_other_faults(attack, control_campaign):
+    _, (many,) = control_campaign
+    _, (other,) = attack("control", runs=5, seed=6)
+    assert [e["corruption"] for e in other.records] != [e["corruption"] for e in many.records[:5]]
+
+
+def test_a_campaign_that_was_cut_off_goes_on(attack, tmp_path):
+    _, (first,) = attack("control", runs=6, folder=tmp_path)
+    lines = (tmp_path / "runs.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "runs.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
+    _, (second,) = attack("control", runs=8, folder=tmp_path)
+    assert [entry["run"] for entry in second.records] == list(range(8))
+    assert untimed(second)[:6] == untimed(first)
+    took = [entry["run_s"] for entry in first.records]
+    assert [entry["run_s"] for entry in second.records[:3]] == took[:3]
+
+
+def test_another_campaign_is_not_mixed_in(attack, tmp_path):
+    attack("control", runs=1, folder=tmp_path)
+    with pytest.raises(ConfigError, match=r"another campaign; it differs in \['tolerance'\]"):
+        attack("control", runs=1, folder=tmp_path, tolerance=0.5)
+
+
+def test_recorded_runs_repeat(attack, kernel_inputs, tmp_path):
+    (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    attack("control", runs=10, folder=tmp_path)
+    replays = list(replay_runs(tmp_path, ("control",)))
+    assert [replay.differs for replay in replays] == [()] * 10
+    line = json.loads((tmp_path / "runs.jsonl").read_text().splitlines()[0])
+    line["output_sha256"] = "0"
+    (tmp_path / "runs.jsonl").write_text(json.dumps(line) + "\n")
+    (replay,) = replay_runs(tmp_path)
+    assert replay.differs == ("output_sha256",)
+
+
+def test_nothing_to_replay_is_an_error(tmp_path):
+    with pytest.raises(RecordError, match=r"plan\.json"):
+        list(replay_runs(tmp_path))
+
+
+def test_tolerance_makes_small_corruption_benign(attack, control_campaign):
+    _, (strict,) = control_campaign
+    _, (lenient,) = attack("control", runs=30, tolerance=1e300)
+    changed = 0
+    for before, after in zip(strict.records, lenient.records, strict=True):
+        size = before["magnitude"]["relative"] if before["outcome"] == "sdc" else None
+        if size is None:
+            assert after["outcome"] == before["outcome"]
+        else:
+            changed += 1
+            assert (after["outcome"], after["within_tolerance"]) == ("benign", True)
+            assert after["magnitude"]["relative"] == size > 0.0
+    assert changed
+
+
+def test_null_injections_are_benign(attack):
+    _, (runs,) = attack("point_cloud", runs=5, null=True)
+    assert {entry["outcome"] for entry in runs.records} == {"benign"}
+    assert {entry["injection"]["applied"] for entry in runs.records} == {False}
+
+
+def test_time_rules_say_what_they_missed(attack):
+    plan, (runs,) = attack("point_cloud", runs=6, rule="cpu-time")
+    for entry in runs.records:
+        assert (entry["outcome"] == "not_injected") == bool(entry["not_injected_reason"])
+    (kernel,) = summarise(plan, [runs])["kernels"]
+    assert kernel["complete"] is None
+
+
+def test_the_planner_is_attacked_in_its_own_library(attack):
+    _, (runs,) = attack("rrtconnect", runs=10)
+    assert {entry["object"] for entry in runs.records} <= {"libompl.so", "numba:segment_free"}
+    assert runs.prepared.profile.complete
+
+
+def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
+    plan, campaign = control_campaign
+    summary = summarise(plan, campaign)
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    (kernel,) = summary["kernels"]
+    assert set(kernel["outcomes"]) == OUTCOMES
+    assert sum(row["count"] for row in kernel["outcomes"].values()) == kernel["runs"] == 30
+    assert sum(kernel["crashes"].values()) == kernel["outcomes"]["crash"]["count"]
+    for row in kernel["outcomes"].values():
+        low, high = row["wilson95"]
+        assert 0.0 <= low <= row["share"] <= high <= 1.0
+    text = table(summary)
+    assert "sampling: instruction-uniform" in text
+    assert "PID: all" in text
+    rows = list(csv.reader(io.StringIO("\n".join(",".join(r[:4]) for r in csv_rows(campaign)))))
+    assert rows[0] == CSV_COLUMNS[:4]
+    assert len(rows) == 31
+    for name in ("one.svg", "two.svg"):
+        write_kernel_plot(summary, tmp_path / name)
+    assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
+    assert "PID" in (tmp_path / "one.svg").read_text()
+
+
+def test_an_unknown_kernel_names_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'octomap'"):
+        catalogue.select(["octomp"])
+
+
+def test_kernels_come_in_the_order_of_the_pipeline():
+    names = [kernel.name for kernel in catalogue.select(["control", "point_cloud"])]
+    assert names == ["point_cloud", "control"]
+    assert len(catalogue.select([])) == 7
+
+
+def test_inputs_of_something_else_are_refused(tmp_path):
+    path = tmp_path / "inputs.pickle"
+    path.write_bytes(b"nothing of the kind")
+    with pytest.raises(RecordError, match="not a file of kernel inputs"):
+        load_inputs(path)
+
+
+def test_the_command_line_refuses_what_makes_no_sense(mavfi):
+    asked = mavfi("kernels", "--kernel", "contrl", "--runs", "1")
+    assert asked.returncode == 1
+    assert asked.stderr.startswith("error: unknown kernel 'contrl': did you mean 'control'?")
+    assert mavfi("kernels", "--args", "5").returncode == 2
+    assert mavfi("kernels", "--program", "/bin/true", "--kernel", "rrt").returncode == 2
+    asked = mavfi("kernels", "--kernel", "control", "--sampling", "instruction")
+    assert asked.returncode == 1
+    assert "instruction-uniform" in asked.stderr
