@@ -19,6 +19,7 @@ from mavfi_cli.mission.config import MissionConfig
 
 FILE = "briefing.json"
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home
+FARTHEST_M = 200.0  # a goal farther away asks for obstacle grids beyond any memory
 MARGIN_M = 30.0  # round home and goal, where no world says how far it reaches
 
 
@@ -67,6 +68,27 @@ def of_config(config: MissionConfig) -> Briefing:
         bounds_enu_m=_flight_bounds([*low, *high]),
         camera_offset_flu_m=np.zeros(3),
     )
+
+
+def require_flyable(briefing: Briefing, config: MissionConfig) -> None:
+    """Refuse a goal that is no flight, or none that the planner's maps can hold.
+
+    Raises:
+        ConfigError: names what is wrong with the goal.
+    """
+    start, goal = briefing.start_enu_m, briefing.goal_enu_m
+    takeoff = np.add(start, (0.0, 0.0, config.takeoff_height_m))
+    problem = ""
+    if float(np.linalg.norm(goal - takeoff)) <= config.goal_tolerance_m:
+        problem = f"is within {config.goal_tolerance_m:g} m of the take-off point"
+    elif not LOWEST_M <= float(goal[2]) <= HIGHEST_M:
+        problem = (
+            f"is {goal[2]:g} m high, outside the flight levels {LOWEST_M:g} to {HIGHEST_M:g} m"
+        )
+    elif float(np.linalg.norm(goal[:2] - start[:2])) > FARTHEST_M:
+        problem = f"is farther than {FARTHEST_M:g} m away"
+    if problem:
+        raise ConfigError(f"the goal {problem}", key="goal")
 
 
 def _flight_bounds(bounds_enu_m: list[float]) -> FloatArray:

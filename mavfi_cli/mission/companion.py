@@ -161,7 +161,7 @@ class Companion:
                 goal_enu_m=request.goal_enu_m,
                 bounds_enu_m=self._bounds_enu_m,
                 sequence=smoothing.Sequence(
-                    trajectory_seq=request.trajectory_seq + 1,
+                    trajectory_seq=_next_int32(request.trajectory_seq),
                     future_collision_seq=request.future_collision_seq,
                 ),
                 seed=derive(self._config.seed, Stream.PLANNER, request.attempt),
@@ -308,6 +308,11 @@ class Companion:
     def goal_distance_m(self, state: VehicleState) -> float:
         """Distance to the goal, m."""
         return float(np.linalg.norm(state.position_enu_m - self.pilot.goal_enu_m))
+
+
+def _next_int32(value: int) -> int:
+    """The next number of a 32-bit counter, which a fault may have driven to its end."""
+    return (value + 1 + 2**31) % 2**32 - 2**31
 
 
 def response_times(reactions: list[Reaction]) -> dict[str, float | None]:

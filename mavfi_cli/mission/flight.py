@@ -18,7 +18,7 @@ import numpy as np
 
 from mavfi_cli.autonomy.pilot import Mode
 from mavfi_cli.autonomy.planners import Planner
-from mavfi_cli.core.errors import ConfigError, Interrupted, LinkLost, NoAutopilot
+from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Codec, Message, dialect
@@ -27,7 +27,7 @@ from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.tlog import TlogWriter
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission import quality
-from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.events import EventLog
@@ -119,12 +119,8 @@ class Flight:
 
     def brief(self, briefing: Briefing) -> None:
         """Tell where the goal is and how the camera is mounted; makes the companion ready."""
+        require_flyable(briefing, self._config)
         self._briefing = briefing
-        if self._shortest_flight_s(briefing) <= 0.0:
-            raise ConfigError(
-                f"the goal is within {self._config.goal_tolerance_m:g} m of the take-off point",
-                key="goal",
-            )
         fault = self._config.fault
         if fault is not None:
             self.injection = Injection(fault, self._shortest_flight_s(briefing))
