@@ -70,6 +70,8 @@ def step(
         time_s = time_to_collision(inputs.snapshot, inputs.trajectory, inputs.time_s, params)
     collision = math.isfinite(time_s)
     seq, on_seq = state.future_collision_seq, None
+    if inputs.trajectory is not None:  # a check that was restarted counts on from the plan's number
+        seq = max(seq, inputs.trajectory.future_collision_seq)
     if collision and inputs.trajectory is not None:
         on_seq = inputs.trajectory.trajectory_seq
         if state.foreseen_on_seq != on_seq:

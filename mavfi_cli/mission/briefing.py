@@ -82,9 +82,7 @@ def require_flyable(briefing: Briefing, config: MissionConfig) -> None:
     if float(np.linalg.norm(goal - takeoff)) <= config.goal_tolerance_m:
         problem = f"is within {config.goal_tolerance_m:g} m of the take-off point"
     elif not LOWEST_M <= float(goal[2]) <= HIGHEST_M:
-        problem = (
-            f"is {goal[2]:g} m high, outside the flight levels {LOWEST_M:g} to {HIGHEST_M:g} m"
-        )
+        problem = f"is {goal[2]:g} m high; flight levels are {LOWEST_M:g} to {HIGHEST_M:g} m"
     elif float(np.linalg.norm(goal[:2] - start[:2])) > FARTHEST_M:
         problem = f"is farther than {FARTHEST_M:g} m away"
     if problem:
