@@ -17,7 +17,7 @@ from mavfi_cli.mission import flight
 from mavfi_cli.mission import run as run_module
 from mavfi_cli.mission.run_folder import load_run
 
-SPEED = 5.0
+SPEED = 2.0
 
 
 @pytest.fixture

@@ -118,7 +118,7 @@ def test_unusable_places_say_why_in_one_line(arguments: dict[str, tuple[float]],
 @pytest.mark.parametrize(
     ("before", "after", "line", "message"),
     [
-        ("[20, 20, 5]", "[20, 20,, 5]", None, "line 4"),
+        ("[20, 20, 5]", "[20, 20,, 5]", 4, "Invalid value"),
         ("goal_enu_m", "gaol_enu_m", 4, "did you mean 'goal_enu_m'"),
         ("max_enu_m", "maximum", 8, "maximum"),
         ("[8, 9, 10]", "[8, 4, 10]", 6, r"box\[0\]\.max_enu_m: must be beyond"),
