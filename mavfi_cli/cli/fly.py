@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.config import MissionConfig
@@ -185,6 +186,7 @@ def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConf
     asked = {name: options.pop(name) for name in _FAULT_OPTIONS}
     native = {name: options.pop(name) for name in _INSTRUCTION_OPTIONS}
     target, seed, level = (options.pop(name) for name in ("inject", "fault_seed", "level"))
+    _refuse_unused(target, level)
     if target is None:
         if level == "instruction":
             raise FaultSpecError("--level instruction needs --inject NODE")
@@ -200,3 +202,19 @@ def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConf
     instruction.strategy()
     instruction.node()
     return None, instruction
+
+
+def _refuse_unused(target: str | None, level: str) -> None:
+    """An option that would do nothing is a mistake: exit code 2."""
+    source_only = set(_FAULT_OPTIONS) - {"bits", "field"}
+    if target is None:
+        unused, needs = {*_FAULT_OPTIONS, *_INSTRUCTION_OPTIONS, "fault_seed"}, "--inject"
+    elif level == "source":
+        unused, needs = set(_INSTRUCTION_OPTIONS), "--level instruction"
+    else:
+        unused, needs = source_only, "--level source"
+    context = click.get_current_context()
+    for option in context.command.params:
+        given = context.get_parameter_source(str(option.name))
+        if option.name in unused and given is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"{option.opts[0]} needs {needs}")

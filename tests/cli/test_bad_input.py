@@ -201,3 +201,17 @@ def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
     line = f"{sys.executable} -m mavfi_cli world list | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--bits", "3"], "--bits needs --inject"),
+        (["--inject", "planning", "--sampling", "cpu-time"], "--sampling needs --level"),
+        (["--level", "instruction", "--inject", "octomap", "--at", "tick=3"], "--at needs --level"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(command_line, arguments, said):
+    code, out, err = command_line("fly", *arguments)
+    assert (code, out) == (2, "")
+    assert said in err
