@@ -10,9 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,13 +29,13 @@ from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.events import EventLog
-from mavfi_cli.mission.executor import Node
 from mavfi_cli.mission.injection import Injection, NoInjection
 from mavfi_cli.mission.instruction_injection import InstructionInjection
 from mavfi_cli.mission.instruction_plan import Recorder
+from mavfi_cli.mission.narrator import Narrator
 from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.platform import PlatformProfile
-from mavfi_cli.mission.progress import Progress, Watcher
+from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.trace import Trace
 
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
@@ -65,7 +63,6 @@ class Flight:
         self._transport = transport
         self._platform = platform
         self._planner = planner
-        self._watcher = watcher
         self._interrupts = interrupts
         self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
         self._session = self._new_session()
@@ -73,18 +70,13 @@ class Flight:
         self._frames: list[ImageFrame] = []
         self._tlog: TlogWriter | None = None
         self._early: list[tuple[float, bytes]] = []  # packets from before the run folder
-        self._phase: Phase | None = None
-        self._texts = 0
-        self._losses = 0
-        self._mode: Mode | None = None
         self._camera_asked = False
-        self._next_progress_s = 0.0
         self._unheard_s = self._unspoken_s = 0.0
         self._on_clock = config.link is None
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
         self.injection: Injection | NoInjection = NoInjection()
-        self.log = EventLog(watcher)
+        self._narrator = Narrator(watcher)
         self.trace = Trace()
         self.wall = WallClock()
         self.stamp_s = 0.0
@@ -286,7 +278,10 @@ class Flight:
             self._send(self._session.tick(stamp_s))
         if companion is not None:
             companion.executor.compute()
-        self._tell(state)
+        if not self._camera_asked and self._nearly_up(state):
+            self._camera_asked = True
+            self._session.camera.start(1.0 / self._config.camera_rate_hz)
+        self._narrator.tell(stamp_s, self._session, companion, self.injection)
         return True
 
     def _take_clock(self, stamp_s: float) -> None:
@@ -380,64 +375,8 @@ class Flight:
         elif self.stamp_s - self.takeover_s >= self._config.time_limit_s:
             self.end(Outcome.TIMEOUT, f"{self._config.time_limit_s:g} s")
 
-    def _tell(self, state: VehicleState | None) -> None:
-        """Note what is new, and show progress once a second."""
-        session = self._session
-        if session.phase is not self._phase:
-            self._phase = session.phase
-            self._note("phase", session.phase.value)
-        for text in session.telemetry.texts.since(self._texts):
-            self._note("autopilot", text.text.strip())
-        self._texts = session.telemetry.texts.total
-        if not self._camera_asked and self._nearly_up(state):
-            self._camera_asked = True
-            session.camera.start(1.0 / self._config.camera_rate_hz)
-        for struck in self.injection.news():
-            self._note("fault", struck)
-        if self.companion is not None:
-            self._tell_losses(self.companion)
-        companion = self.companion
-        if companion is not None and companion.mode is not self._mode:
-            self._tell_mode(companion)
-        if state is not None and self.stamp_s >= self._next_progress_s:
-            self._next_progress_s = self.stamp_s + 1.0
-            self._watcher.on_progress(self._progress(state))
-
-    def _tell_losses(self, companion: Companion) -> None:
-        losses = companion.executor.losses
-        for loss in losses[self._losses :]:
-            self._note("node", f"node {loss.node} {'' if loss.hung else 'crashed: '}{loss.how}")
-        self._losses = len(losses)
-
-    def _tell_mode(self, companion: Companion) -> None:
-        mode, before = companion.mode, self._mode
-        self._mode = mode
-        if mode is Mode.SLOWING:
-            self._note("slow", "slows down before an obstacle")
-        elif mode is Mode.STOPPING:
-            self._note("stop", "stops before an obstacle")
-        elif mode is Mode.FLYING and before is not None:
-            again = companion.pilot.counters.replans > 0
-            self._note(
-                "replan" if again else "plan", "flies a new plan" if again else "flies a plan"
-            )
-
     def _note(self, kind: str, text: str) -> None:
-        state = self._session.state
-        place = None if state is None else tuple(round(float(c), 3) for c in state.position_enu_m)
-        self.log.add(round(self.stamp_s, 3), kind, text, place)  # type: ignore[arg-type]
-
-    def _progress(self, state: VehicleState) -> Progress:
-        companion = self.companion
-        return Progress(
-            stamp_s=self.stamp_s,
-            phase=self._session.phase.value
-            if companion is None or self._session.phase is not Phase.OFFBOARD
-            else companion.mode.value,
-            speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),
-            goal_distance_m=None if companion is None else companion.goal_distance_m(state),
-            replans=0 if companion is None else companion.pilot.counters.replans,
-        )
+        self._narrator.note(self.stamp_s, kind, text, self._session.state)
 
     # For the record -------------------------------------------------------------------------------
 
@@ -452,45 +391,12 @@ class Flight:
             return quality.QualityOfFlight()
         return quality.from_states(*self.trace.motion(), self.goal_enu_m)
 
-    def statistics(self) -> dict[str, Any]:
-        """Counters of pilot, kernels and camera link."""
-        companion = self.companion
-        if companion is None:
-            return {"pilot": None, "kernels": {}, "nodes": {}, "images": {}}
-        kernels = {
-            name: {
-                "invocations": node.invocations,
-                "dropped_inputs": node.dropped,
-                "busy_s": round(node.busy_s, 9),
-            }
-            for name, node in companion.executor.nodes.items()
-        }
-        return {
-            "pilot": asdict(companion.pilot.counters),
-            "kernels": kernels,
-            "nodes": {name: _ends(node) for name, node in companion.executor.nodes.items()},
-            "images": {"received": self._images.received, "lost": self._images.lost},
-        }
+    @property
+    def log(self) -> EventLog:
+        """Every event so far."""
+        return self._narrator.log
 
-    def plan_lines(self) -> list[dict[str, Any]]:
-        """The planned trajectories, thinned for drawing."""
-        if self.companion is None:
-            return []
-        return [
-            {
-                "stamp_s": plan.stamp_s,
-                "points_enu_m": np.round(plan.waypoints[:, 0:3], 3).tolist(),
-            }
-            for plan in self.companion.plans
-        ]
-
-
-def _ends(node: Node) -> dict[str, Any]:
-    """How often a node died, and of what."""
-    crashes = [
-        {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}
-        for loss in node.losses
-        if not loss.hung
-    ]
-    hangs = sum(loss.hung for loss in node.losses)
-    return {"crashes": crashes, "hangs": hangs, "restarts": node.restarts}
+    @property
+    def images(self) -> ImageReceiver:
+        """What came of the camera's frames."""
+        return self._images

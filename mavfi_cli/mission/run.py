@@ -36,6 +36,7 @@ from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run_folder import CRASH, RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.spawned_node import SpawnedNode
+from mavfi_cli.mission.statistics import mission_statistics, plan_lines
 from mavfi_cli.mission.trace import write_trace
 from mavfi_cli.mission.vehicle_process import VehicleProcess
 
@@ -257,10 +258,10 @@ def _write(
         "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
         "simulated_s": flight.end_s,
         "quality_of_flight": qof.to_dict(),
-        **flight.statistics(),
+        **mission_statistics(companion, flight.images),
         "response_time_s": response_times(companion.reactions if companion else []),
         "events": flight.log.to_list(),
-        "plans": flight.plan_lines(),
+        "plans": plan_lines(companion),
         "fault": flight.injection.finish(),
         "goal_enu_m": None if goal is None else goal.tolist(),
         "world": None if referee is None else referee["world"],

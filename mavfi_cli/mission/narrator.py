@@ -1,0 +1,107 @@
+"""Tells the flight's story: notes what is new after every tick, and shows progress."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mavfi_cli.autonomy.pilot import Mode
+from mavfi_cli.core.types import VehicleState
+from mavfi_cli.link.session import OffboardSession, Phase
+from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.events import EventLog
+from mavfi_cli.mission.injection import Injection, NoInjection
+from mavfi_cli.mission.progress import Progress, Watcher
+
+PROGRESS_EVERY_S = 1.0
+
+
+class Narrator:
+    """Compares each tick with the one before.
+
+    Attributes:
+        log: every event so far.
+    """
+
+    def __init__(self, watcher: Watcher) -> None:
+        self.log = EventLog(watcher)
+        self._watcher = watcher
+        self._phase: Phase | None = None
+        self._mode: Mode | None = None
+        self._texts = 0
+        self._losses = 0
+        self._next_progress_s = 0.0
+
+    def note(self, stamp_s: float, kind: str, text: str, state: VehicleState | None) -> None:
+        """Note one event where the vehicle is."""
+        place = None if state is None else tuple(round(float(c), 3) for c in state.position_enu_m)
+        self.log.add(round(stamp_s, 3), kind, text, place)  # type: ignore[arg-type]
+
+    def tell(
+        self,
+        stamp_s: float,
+        session: OffboardSession,
+        companion: Companion | None,
+        injection: Injection | NoInjection,
+    ) -> None:
+        """Note what is new at a tick; once a simulated second, show progress."""
+        state = session.state
+        for kind, text in self._news(session, companion, injection):
+            self.note(stamp_s, kind, text, state)
+        if state is not None and stamp_s >= self._next_progress_s:
+            self._next_progress_s = stamp_s + PROGRESS_EVERY_S
+            self._watcher.on_progress(_progress(stamp_s, state, session, companion))
+
+    def _news(
+        self,
+        session: OffboardSession,
+        companion: Companion | None,
+        injection: Injection | NoInjection,
+    ) -> list[tuple[str, str]]:
+        """Kind and text of what happened since the last tick."""
+        news: list[tuple[str, str]] = []
+        if session.phase is not self._phase:
+            self._phase = session.phase
+            news.append(("phase", session.phase.value))
+        news += [("autopilot", t.text.strip()) for t in session.telemetry.texts.since(self._texts)]
+        self._texts = session.telemetry.texts.total
+        news += [("fault", text) for text in injection.news()]
+        if companion is not None:
+            news += self._losses_since(companion)
+            news += self._mode_since(companion)
+        return news
+
+    def _losses_since(self, companion: Companion) -> list[tuple[str, str]]:
+        losses = companion.executor.losses
+        fresh = losses[self._losses :]
+        self._losses = len(losses)
+        return [
+            ("node", f"node {loss.node} {'' if loss.hung else 'crashed: '}{loss.how}")
+            for loss in fresh
+        ]
+
+    def _mode_since(self, companion: Companion) -> list[tuple[str, str]]:
+        mode, before = companion.mode, self._mode
+        self._mode = mode
+        if mode is before:
+            return []
+        if mode is Mode.SLOWING:
+            return [("slow", "slows down before an obstacle")]
+        if mode is Mode.STOPPING:
+            return [("stop", "stops before an obstacle")]
+        if mode is Mode.FLYING and before is not None:
+            again = companion.pilot.counters.replans > 0
+            return [("replan", "flies a new plan") if again else ("plan", "flies a plan")]
+        return []
+
+
+def _progress(
+    stamp_s: float, state: VehicleState, session: OffboardSession, companion: Companion | None
+) -> Progress:
+    offboard = companion is not None and session.phase is Phase.OFFBOARD
+    return Progress(
+        stamp_s=stamp_s,
+        phase=companion.mode.value if offboard and companion else session.phase.value,
+        speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),
+        goal_distance_m=None if companion is None else companion.goal_distance_m(state),
+        replans=0 if companion is None else companion.pilot.counters.replans,
+    )

@@ -1,0 +1,56 @@
+"""What a mission counted, as plain values for its record."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.link.images import ImageReceiver
+from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.executor import Node
+
+
+def mission_statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:
+    """Counters of pilot, kernels, nodes and camera link; empty where nothing was flown."""
+    if companion is None:
+        return {"pilot": None, "kernels": {}, "nodes": {}, "images": {}}
+    nodes = companion.executor.nodes
+    return {
+        "pilot": asdict(companion.pilot.counters),
+        "kernels": {name: _work(node) for name, node in nodes.items()},
+        "nodes": {name: _ends(node) for name, node in nodes.items()},
+        "images": {"received": images.received, "lost": images.lost},
+    }
+
+
+def plan_lines(companion: Companion | None) -> list[dict[str, Any]]:
+    """The planned trajectories: when each begins and its waypoints, to the millimetre."""
+    plans = [] if companion is None else companion.plans
+    return [
+        {
+            "stamp_s": plan.stamp_s,
+            "points_enu_m": np.round(plan.waypoints[:, 0:3], 3).tolist(),
+        }
+        for plan in plans
+    ]
+
+
+def _work(node: Node) -> dict[str, Any]:
+    return {
+        "invocations": node.invocations,
+        "dropped_inputs": node.dropped,
+        "busy_s": round(node.busy_s, 9),
+    }
+
+
+def _ends(node: Node) -> dict[str, Any]:
+    """How often a node died, and of what."""
+    crashes = [
+        {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}
+        for loss in node.losses
+        if not loss.hung
+    ]
+    hangs = sum(loss.hung for loss in node.losses)
+    return {"crashes": crashes, "hangs": hangs, "restarts": node.restarts}
