@@ -51,11 +51,6 @@ class Endpoint:
     baud: int = DEFAULT_BAUD
     fd: int = -1
 
-    @property
-    def listens(self) -> bool:
-        """Whether it waits for peers instead of calling one."""
-        return self.scheme in _LISTENING
-
 
 def parse_endpoint(url: str) -> Endpoint:
     """The endpoint of a URL, in the form `scheme:rest` or `scheme://rest`.

@@ -184,14 +184,6 @@ class OffboardSession:
         if self.phase not in (Phase.LANDING, Phase.DONE):
             self._enter(Phase.LANDING)
 
-    def start_camera(self, interval_s: float) -> Ticket:
-        """Ask the camera component for a frame every `interval_s`; see `CameraClient.start`."""
-        return self.camera.start(interval_s)
-
-    def stop_camera(self) -> Ticket:
-        """Ask the camera component for no more frames."""
-        return self.camera.stop()
-
     # Messages in --------------------------------------------------------------------------------
 
     def handle(self, message: Message) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,11 +114,6 @@ def _same(a: Any, b: Any) -> bool:
 def same_file(this: Path, other: Path) -> bool:
     """Whether two files have the same bytes."""
     return this.read_bytes() == other.read_bytes()
-
-
-def without_fault(config: MissionConfig) -> MissionConfig:
-    """The paired golden mission: same world, seed and noise."""
-    return dataclasses.replace(config, fault=None, instruction=None)
 
 
 def largest_deviation_m(this: Run, other: Run) -> float:

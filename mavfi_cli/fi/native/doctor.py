@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.fi.native.arch.decode import widest_vector
-from mavfi_cli.fi.native.breakpoints import Mechanism, perf_allowed
+from mavfi_cli.fi.native.breakpoints import perf_allowed
 from mavfi_cli.fi.native.spawn import Command, run_to_entry, spawn
 from mavfi_cli.fi.native.tracee import Tracee
 
@@ -64,8 +64,3 @@ def check_counting() -> Capability:
     return Capability(
         name="counted breakpoints", problem=problem, remedy="" if problem is None else _PERF_REMEDY
     )
-
-
-def mechanism_here() -> Mechanism:
-    """The mechanism that faults would use on this machine."""
-    return Mechanism.PERF if perf_allowed() is None else Mechanism.DEBUG

@@ -21,7 +21,6 @@ PEEKUSER, POKEUSER = 3, 6
 CONT, SINGLESTEP, DETACH = 7, 9, 17
 GETSIGINFO, GETREGSET, SETREGSET = 0x4202, 0x4204, 0x4205
 SEIZE, INTERRUPT, LISTEN = 0x4206, 0x4207, 0x4208
-GETEVENTMSG = 0x4201
 
 OPTION_EXITKILL = 1 << 20
 TRACE_OPTIONS = (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4)  # fork, vfork, clone, exec
@@ -107,13 +106,6 @@ def signal_info(tid: int) -> SignalInfo:
     buffer = (ctypes.c_int * 32)()
     request(GETSIGINFO, tid, 0, ctypes.addressof(buffer))
     return SignalInfo(buffer[0], buffer[2])
-
-
-def event_message(tid: int) -> int:
-    """The message of an event stop (for a clone: the new thread id)."""
-    message = ctypes.c_ulong()
-    request(GETEVENTMSG, tid, 0, ctypes.addressof(message))
-    return int(message.value)
 
 
 @contextmanager
