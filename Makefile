@@ -7,7 +7,7 @@ SOURCES := mavfi_cli sitl tests benchmarks
 .PHONY: fly test install install-dev lint clean
 
 fly: install
-	$(BIN)/mavfi fly --world dense
+	$(BIN)/mavfi fly --world dense --inject planning
 
 test: install-dev lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal

@@ -135,25 +135,32 @@ class Pilot:
         self._look_started_s: float | None = None
 
     @np.errstate(over="ignore", invalid="ignore")
-    def on_report(self, report: CollisionReport) -> None:
-        """Take the verdict of the collision check.
+    def on_report(self, report: CollisionReport) -> bool:
+        """Take the verdict of the collision check; whether its time to the collision mattered.
 
         A report whose future_collision_seq is older than the newest known is ignored.
         """
         if report.future_collision_seq < self._collision_seq:
             self.counters.reports_ignored += 1
-            return
+            return False
         if not report.collision or self.trajectory is None:
-            return
+            return False
         if report.future_collision_seq > self._collision_seq:
             self.counters.collisions_foreseen += 1
         self._collision_seq = report.future_collision_seq
         if self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.WAITING):
-            return
+            return False
         self._next = None
         if not self._awaiting_plan:
             self._wanted = True
         self._react(report)
+        return True
+
+    def holds(self, trajectory: object) -> bool:
+        """Whether a trajectory is flown, or about to be."""
+        return trajectory is not None and (
+            trajectory is self.trajectory or trajectory is self._next
+        )
 
     def _react(self, report: CollisionReport) -> None:
         """Go on, slow down or stop: whichever the time to the collision still allows."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,15 +20,18 @@ from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFa
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.trajectory import waypoint_index
 from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.states import of_stage
 from mavfi_cli.core.types import (
     CollisionReport,
     Command,
     DepthFrame,
     PointCloud,
+    Stage,
     Trajectory,
     VehicleState,
 )
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.fi.source.activation import Follower
 from mavfi_cli.fi.source.injector import Moment
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
@@ -38,6 +42,11 @@ from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
 # a shorter delay is below what the simulation resolves.
 SAME_TICK_S = 0.004
+VERDICT_STATES = {state.name for state in of_stage(Stage.PERCEPTION)}
+FOLLOWED_STATES = {s.name for s in of_stage(Stage.PLANNING) if s.name.startswith("waypoint_")}
+PLAN_STATES = {s.name for s in of_stage(Stage.PLANNING)} - FOLLOWED_STATES
+CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
+COMMAND_STATES = {state.name for state in of_stage(Stage.CONTROL)}
 BRAKE_SHARE = 0.6  # of a_max that stopping counts on, as planned motion does
 
 
@@ -109,6 +118,8 @@ class Companion:
         add("collision_check", self._run_collision_check, self._take_report)
         add("planner", self._run_planner, self._take_plan)
         self._control = add("control", self._run_control, lambda _output, _stamp_s: None)
+        if injection.follower is not None:
+            self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
         self._checked: Trajectory | None = None
         self._commands: deque[tuple[float, Command]] = deque()  # (due stamp, command)
@@ -196,13 +207,23 @@ class Companion:
     def _take_report(self, checked: tuple[CollisionReport, float], stamp_s: float) -> None:
         report, self._fresh_frame_s = checked
         self.report = self._injection.pass_on(report, self._moment(stamp_s))
-        self.pilot.on_report(self.report)
+        timely = self.pilot.on_report(self.report)
+        if self._injection.follower is not None:
+            states = VERDICT_STATES if timely else VERDICT_STATES - {"time_to_collision"}
+            self._injection.follower.read(self.report, "mission logic", stamp_s, states)
 
     def _take_plan(self, result: Trajectory | PlanFailure, stamp_s: float) -> None:
         if isinstance(result, Trajectory):
             result = self._injection.pass_on(result, self._moment(stamp_s))
             self.plans.append(result)
+            if self._injection.follower is not None:
+                self._injection.follower.read(result, "mission logic", stamp_s, PLAN_STATES)
         self.pilot.on_plan(result)
+
+    def _on_start(self, node: str, value: Any, start_s: float) -> None:
+        """A node begins to work on its input: it has read it."""
+        if node == "collision_check" and self._injection.follower is not None:
+            self._injection.follower.read(value.trajectory, node, start_s, CHECKED_STATES)
 
     def _check(self) -> None:
         """Have the present trajectory checked against the newest map."""
@@ -233,9 +254,7 @@ class Companion:
             return None
         self._ticks += 1
         if self.pilot.trajectory is not None:
-            self.pilot.trajectory = self._injection.strike_latched(
-                self.pilot.trajectory, self._moment(stamp_s), self._waypoint()
-            )
+            self._strike_latched(self.pilot.trajectory, stamp_s)
         directive = self.directive = self.pilot.update(stamp_s, state)
         if directive.plan is not None:
             assert self._snapshot is not None
@@ -243,12 +262,31 @@ class Companion:
         if directive.trajectory is not None and directive.trajectory is not self._checked:
             self._check()
         delay_s = self._control_delay_s()
+        if self._injection.follower is not None:
+            self._follow(self._injection.follower, stamp_s, directive)
         command = self._track(stamp_s, state, directive)
         if command is not None:  # else the last one stays in force: the node is down
             self._commands.append((stamp_s + delay_s, command))
         while self._commands and self._commands[0][0] <= stamp_s:
             self._take_command(stamp_s, self._commands.popleft()[1])
         return self.command
+
+    def _strike_latched(self, flown: Trajectory, stamp_s: float) -> None:
+        """A fault in the memory of the flown trajectory; nobody is told, so no check follows."""
+        struck = self._injection.strike_latched(flown, self._moment(stamp_s), self._waypoint())
+        self.pilot.trajectory = struck
+        if self._checked is flown:
+            self._checked = struck
+
+    def _follow(self, follower: Follower, stamp_s: float, directive: Directive) -> None:
+        """Control is about to read the followed waypoint, and the yaw it turns to."""
+        if not follower.waits:
+            return
+        if directive.trajectory is not None:
+            at = max(0, waypoint_index(directive.trajectory, directive.time_s))
+            follower.read(directive.trajectory, "control", stamp_s, FOLLOWED_STATES, at)
+            follower.read(directive.trajectory, "control", stamp_s, {"waypoint_yaw"}, at + 1)
+        follower.settle(lambda message: message is self.report or self.pilot.holds(message))
 
     def _track(self, stamp_s: float, state: VehicleState, directive: Directive) -> Command | None:
         inputs = tracking.TrackingInputs(
@@ -272,6 +310,8 @@ class Companion:
 
     def _take_command(self, stamp_s: float, command: Command) -> None:
         self.command = self._injection.pass_on(command, self._moment(stamp_s))
+        if self._injection.follower is not None:
+            self._injection.follower.read(self.command, "setpoint", stamp_s, COMMAND_STATES)
         if self._fresh_frame_s is not None:
             self.reactions.append(
                 Reaction(frame_stamp_s=self._fresh_frame_s, setpoint_stamp_s=stamp_s)

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
+from mavfi_cli.fi.source.activation import Follower
 from mavfi_cli.fi.source.fault import SourceFault
 from mavfi_cli.fi.source.injector import Moment, SourceInjector, Strike
 from mavfi_cli.mission.fault_config import FaultConfig
@@ -18,7 +19,13 @@ SCHEMA = 1
 
 
 class NoInjection:
-    """The null object: every message goes on as it is."""
+    """The null object: every message goes on as it is.
+
+    Attributes:
+        follower: hears who works with which message.
+    """
+
+    follower: Follower | None = None
 
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
         """The message itself."""
@@ -60,8 +67,22 @@ class Injection:
         self._path: Path | None = None
         self._state = "planned"
         self._news: list[str] = []
-        self.pass_on = self._injector.pass_on
-        self.strike_latched = self._injector.strike_latched
+        self._strike: Strike | None = None
+        self.follower = Follower()
+
+    def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
+        """A message as its receiver gets it."""
+        return self._followed(message, self._injector.pass_on(message, moment, index))
+
+    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
+        """The trajectory that is being flown, as it is from this tick on."""
+        struck = self._injector.strike_latched(trajectory, moment, index)
+        return self._followed(trajectory, struck)
+
+    def _followed(self, message: M, sent: M) -> M:
+        if sent is not message and self._strike is not None:
+            self.follower.struck(sent, self._strike)
+        return sent
 
     def begin(self, path: Path) -> None:
         """Write down what is going to happen, before the flight."""
@@ -75,6 +96,7 @@ class Injection:
 
     def _on_strike(self, strike: Strike) -> None:
         """The first strike reaches the disk before its message goes on."""
+        self._strike = strike
         if self._state == "planned":
             self._news.append(strike_text(strike))
             self._state = "applied"
@@ -110,6 +132,8 @@ class Injection:
             },
             "strikes": [asdict(strike) for strike in self._injector.strikes],
             "strike_count": self._injector.count,
+            "activation": self.follower.activation.value,
+            "first_reader": asdict(self.follower.reader) if self.follower.reader else None,
         }
 
 

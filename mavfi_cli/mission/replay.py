@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,11 +57,14 @@ def differing_results(this: dict[str, Any], other: dict[str, Any]) -> list[str]:
     return [key for key in keys if this.get(key) != other.get(key)]
 
 
-def first_difference(this: Run, other: Run, *, truth: bool = False) -> Parting | None:
+def first_difference(
+    this: Run, other: Run, *, truth: bool = False, leave_out: Collection[str] = ()
+) -> Parting | None:
     """Where the traces of two runs first differ; None where they never do.
 
     Within one tick the columns are compared in the order of the pipeline: perception, planning,
-    control, then the vehicle. The referee's truth is left out unless asked for.
+    control, then the vehicle. The referee's truth is left out unless asked for, and so are the
+    columns of `leave_out`.
 
     Raises:
         RecordError: one of them has no trace.
@@ -73,6 +77,7 @@ def first_difference(this: Run, other: Run, *, truth: bool = False) -> Parting |
     columns += [c for c in this.trace.column_names if c not in BY_NAME and c != "stamp_s"]
     if not truth:
         columns = [c for c in columns if not c.startswith(("truth_", "power_"))]
+    columns = [c for c in columns if c not in leave_out]
     rows = min(this.trace.num_rows, other.trace.num_rows)
     first: tuple[int, str] | None = None
     for column in columns:

@@ -118,7 +118,21 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
         lines += [_change_line(strike["stamp_s"], change) for change in strike["changes"]]
     if fault["strike_count"] > 3:
         lines.append(f"            and {fault['strike_count'] - 3} more strikes")
+    if fault["state"] == "applied":
+        lines.append(f"            {_activation(fault)}")
     return lines
+
+
+def _activation(fault: dict[str, Any]) -> str:
+    """Whether anybody worked with the corrupted value."""
+    reader = fault["first_reader"]
+    if reader is not None:
+        return f"first read by {reader['name']} at {reader['stamp_s']:.2f} s ({reader['state']})"
+    return {
+        "overwritten": "overwritten before anybody read it",
+        "not_read": "never read: the mission ended before",
+        "unchanged": "changed nothing: the value was that already",
+    }[fault["activation"]]
 
 
 def _instruction_lines(fault: dict[str, Any]) -> list[str]:
@@ -170,11 +184,13 @@ def _told(change: dict[str, Any], when: str) -> str:
 def difference_lines(run: Run, golden: Run) -> list[str]:
     """What a run did otherwise than its golden pair: first difference, and what became of it."""
     parting = first_difference(run, golden)
-    if parting is None:
-        return ["Effect      none: no state ever differs from the golden flight (masked)"]
+    fault = run.result["fault"] or {}
+    if parting is None or first_difference(run, golden, leave_out=fault.get("states", ())) is None:
+        why = _no_effect(fault) if fault else "none"
+        return [f"Effect      {why}: nothing else ever differs from the golden flight"]
     lines = [
         f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
-        f"{_value(parting.this)} instead of {_value(parting.other)}",
+        f"{_pair(parting.this, parting.other)}",
         f"            at most {largest_deviation_m(run, golden):.2f} m off the golden path",
     ]
     ours, theirs = run.result["quality_of_flight"], golden.result["quality_of_flight"]
@@ -185,6 +201,24 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
             f"{theirs['flight_time_s']:.1f} s and {golden.result['outcome']} ({change:+.1f} %)"
         )
     return lines
+
+
+def _no_effect(fault: dict[str, Any]) -> str:
+    """Why a fault did nothing: it was not there, nobody read it, or whoever did was not moved."""
+    if fault["state"] == "not_injected":
+        return "none, not injected"
+    activation = fault["activation"]
+    if isinstance(activation, dict):  # instruction level
+        activation = activation["activation"]
+    return "masked" if activation == "read" else f"none, {activation.replace('_', ' ')}"
+
+
+def _pair(this: Any, other: Any) -> str:
+    """Two values that differ, with as many digits as that takes."""
+    short = [_value(this), _value(other)]
+    if short[0] == short[1]:
+        short = [repr(this), repr(other)]
+    return " instead of ".join(short)
 
 
 def _value(value: Any) -> str:

@@ -178,7 +178,7 @@ class SourceInjector:
         self.count += 1
         if len(self.strikes) < MAX_LISTED_STRIKES:
             self.strikes.append(strike)
-            self._listener(strike)
+        self._listener(strike)
         result: M = changed
         return result
 

@@ -1,0 +1,86 @@
+"""Source-level faults in whole missions: equal up to the strike, recorded, read, repeatable."""
+
+import json
+
+import pytest
+
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.golden import paired_golden
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.replay import config_of, differing_results, first_difference, same_file
+from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.report.summary import difference_lines
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def struck(fly_short):
+    def fly(target, **asked):
+        return load_run(fly_short(fault=FaultConfig(target=target, **asked)).path)
+
+    return fly
+
+
+@pytest.fixture(scope="module")
+def sideways(struck):
+    """A velocity command with its sign flipped, 3 s into the flight."""
+    return struck("command_vx", at="time=3", exact_bits=(63,))
+
+
+def test_golden_and_faulty_flight_part_at_the_strike(sideways):
+    fault = sideways.result["fault"]
+    (strike,) = fault["strikes"]
+    (change,) = strike["changes"]
+    assert change["after"] == -change["before"] != 0.0
+    parting = first_difference(sideways, paired_golden(sideways))
+    assert (parting.column, parting.stamp_s) == ("command_vx", strike["stamp_s"])
+    assert (parting.this, parting.other) == (change["after"], change["before"])
+    assert fault["activation"] == "read"
+    assert fault["first_reader"] == {
+        "name": "setpoint", "stamp_s": strike["stamp_s"], "state": "command_vx",
+    }  # fmt: skip
+    assert json.loads(sideways.folder.fault.read_text()) == fault
+
+
+def test_a_fault_repeats_to_the_byte(sideways, tmp_path):
+    again = load_run(fly_mission(config_of(sideways), tmp_path, Watcher()).path)
+    assert same_file(again.folder.trace, sideways.folder.trace)
+    assert same_file(again.folder.tlog, sideways.folder.tlog)
+    assert not differing_results(again.result, sideways.result)
+
+
+def test_a_flip_that_is_read_and_moves_nothing_is_masked(struck):
+    run = struck("future_collision_seq", at="time=3", exact_bits=(3,))
+    assert run.result["fault"]["activation"] == "read"
+    (line,) = difference_lines(run, paired_golden(run))
+    assert "masked" in line
+
+
+def test_a_time_to_no_collision_is_overwritten_unread(struck):
+    run = struck("time_to_collision", at="time=3", exact_bits=(61,))
+    assert run.result["fault"]["activation"] == "overwritten"
+    (line,) = difference_lines(run, paired_golden(run))
+    assert "masked" not in line
+    assert "overwritten" in line
+
+
+def test_the_geometry_of_a_plan_is_first_read_by_the_collision_check(struck):
+    run = struck("waypoint_x", at="time=3", exact_bits=(62,))
+    assert run.result["fault"]["first_reader"]["name"] == "collision_check"
+
+
+def test_a_flip_in_a_flown_plan_causes_no_check_by_itself(struck):
+    run = struck("waypoint_x", at="time=3", exact_bits=(0,))
+    golden = paired_golden(run)
+    assert run.result["fault"]["activation"] == "read"
+    assert run.result["nodes"] == golden.result["nodes"]
+    assert run.result["kernels"] == golden.result["kernels"]
+    assert run.result["response_time_s"] == golden.result["response_time_s"]
+
+
+def test_a_trigger_that_never_comes_is_not_injected(struck):
+    fault = struck("planning", at="time=1000").result["fault"]
+    assert (fault["state"], fault["activation"]) == ("not_injected", "not_injected")
+    assert fault["reason"]
