@@ -98,6 +98,7 @@ class Counters:
     plans_requested: int = 0
     plans_failed: int = 0
     plans_ignored: int = 0  # stale, late, or out of order
+    plans_rejected: int = 0  # withheld by the detector gate
     replans: int = 0  # plans adopted after the first
     collisions_foreseen: int = 0
     reports_ignored: int = 0  # stale future_collision_seq
@@ -229,6 +230,26 @@ class Pilot:
         self._collision_seq = max(self._collision_seq, result.future_collision_seq)
         self._next = result
 
+    def expects(self, result: Trajectory | PlanFailure) -> bool:
+        """Whether a result answers a request that still stands."""
+        return self._awaiting_plan and result.stamp_s not in self._abandoned
+
+    def reject_plan(self) -> None:
+        """The plan that is awaited has come and cannot be trusted: ask for another."""
+        self.counters.plans_rejected += 1
+        self._awaiting_plan = False
+        self._wanted = True
+
+    def want_plan(self) -> None:
+        """Ask for a new plan from where the vehicle will be, unless one is on its way."""
+        if not self._awaiting_plan and self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
+            self._wanted = True
+
+    def replace_trajectory(self, flown: Trajectory, other: Trajectory) -> None:
+        """Fly `other` from the same point on, if `flown` is what is flown now."""
+        if self.trajectory is flown:
+            self.trajectory = other
+
     def _plan_failed(self) -> None:
         self.counters.plans_failed += 1
         self._failures += 1
@@ -312,12 +333,18 @@ class Pilot:
         reference = self._reference_position()
         error_m = float(np.linalg.norm(state.position_enu_m - reference))
         if not error_m <= self.params.tracking_error_max_m:
-            self._hold_here(state)
-            self._stand()
-            self._next = None
-            self._plan_anew()
-            self.mode = Mode.WAITING
-            self.counters.stops += 1
+            self.abandon(state)
+
+    def abandon(self, state: VehicleState) -> None:
+        """Give up the trajectory: hover here, and plan anew from here."""
+        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
+            return
+        self._hold_here(state)
+        self._stand()
+        self._next = None
+        self._plan_anew()
+        self.mode = Mode.WAITING
+        self.counters.stops += 1
 
     def _stop_here(self) -> None:
         """The trajectory is over, or its clock stands: hover there and want a plan."""

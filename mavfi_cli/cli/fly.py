@@ -11,6 +11,7 @@ from click.core import ParameterSource
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.mission.detector_config import DetectorConfig
     from mavfi_cli.mission.fault_config import FaultConfig
     from mavfi_cli.mission.instruction_config import InstructionConfig
 
@@ -19,6 +20,7 @@ _FAULT_OPTIONS = (
     "together",
 )  # fmt: skip
 _INSTRUCTION_OPTIONS = ("sampling", "sites", "roles", "compat", "null")
+_DETECTOR_OPTIONS = ("protect", "threshold", "model", "alarms_max")
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
@@ -118,6 +120,19 @@ class _Size(click.ParamType[Any]):
 @click.option("--compat", help="Instruction level: registers and bits as rosfi-2021 chose them.")
 @click.option("--null-injection", "null", is_flag=True,
               help="Instruction level: do everything but the flip.")  # fmt: skip
+@click.option("--detector", metavar="NAME",
+              help="Watch the states and recover: gad, aad, range, l2, or a plug-in's name "
+                   "[none].")  # fmt: skip
+@click.option("--protect", default="perception,planning,control", show_default=True,
+              metavar="STAGE,...", help="Which stages the detector watches.")  # fmt: skip
+@click.option("--threshold", type=float,
+              help="Of the detector: alarm above this score; for gad the number of sigmas "
+                   "[the model's own].")  # fmt: skip
+@click.option("--model", type=click.Path(exists=True, dir_okay=False),
+              help="A model file of the detector's  [the one that comes with it].")  # fmt: skip
+@click.option("--alarms-max", default=5, show_default=True,
+              help="The alarm in a row of one stage at which the vehicle holds and plans "
+                   "anew.")  # fmt: skip
 @click.option("--isolate", multiple=True, metavar="NODE",
               help="Let a node work in its own process: point_cloud, octomap, collision_check, "
                    "planner, control. May be repeated; the record stays the same.")  # fmt: skip
@@ -165,6 +180,7 @@ def _config(options: dict[str, Any]) -> MissionConfig:
     from mavfi_cli.mission.config import MissionConfig
 
     fault, instruction = _fault(options)
+    detector = _detector(options)
     columns, rows = options.pop("camera")
     land = options.pop("land")
     return MissionConfig(
@@ -172,6 +188,7 @@ def _config(options: dict[str, Any]) -> MissionConfig:
         camera_rows=rows,
         fault=fault,
         instruction=instruction,
+        detector=detector,
         land=options["link"] is not None if land is None else land,
         **options,
     )
@@ -204,6 +221,22 @@ def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConf
     return None, instruction
 
 
+def _detector(options: dict[str, Any]) -> DetectorConfig | None:
+    """The detector that is asked for, taken out of the options; says now what is wrong with it."""
+    from mavfi_cli.detect.registry import find
+    from mavfi_cli.mission.detector_config import DetectorConfig
+
+    name = options.pop("detector")
+    asked = {option: options.pop(option) for option in _DETECTOR_OPTIONS}
+    if name is None or name == "none":
+        _refuse_given(set(_DETECTOR_OPTIONS), "--detector NAME")
+        return None
+    stages = tuple(part.strip() for part in asked.pop("protect").split(",") if part.strip())
+    detector = DetectorConfig(name=name, protect=stages, **asked)
+    find(name, model=detector.model_path, threshold=detector.threshold)
+    return detector
+
+
 def _refuse_unused(target: str | None, level: str) -> None:
     """An option that would do nothing is a mistake: exit code 2."""
     source_only = set(_FAULT_OPTIONS) - {"bits", "field"}
@@ -213,6 +246,10 @@ def _refuse_unused(target: str | None, level: str) -> None:
         unused, needs = set(_INSTRUCTION_OPTIONS), "--level instruction"
     else:
         unused, needs = source_only, "--level source"
+    _refuse_given(unused, needs)
+
+
+def _refuse_given(unused: set[str], needs: str) -> None:
     context = click.get_current_context()
     for option in context.command.params:
         given = context.get_parameter_source(str(option.name))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mavfi_cli.mission.config import MissionConfig
 
 _PLAIN_EVERY_S = 10.0
-_TOLD = ("phase", "autopilot", "plan", "stop", "fault", "node", "outcome")
+_TOLD = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")
 
 
 class _Plain(Watcher):

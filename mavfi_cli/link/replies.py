@@ -1,10 +1,11 @@
-"""What every MAVLink node owes the others: a HEARTBEAT, and answers to TIMESYNC and PING."""
+"""What a MAVLink node tells the others: HEARTBEAT, answers to TIMESYNC and PING, STATUSTEXT."""
 
 from __future__ import annotations
 
 import math
 
 from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.texts import text_messages
 
 HEARTBEAT_INTERVAL_S = 1.0
 _MAX_ANSWERS = 64  # to requests of one tick; more are not answered
@@ -16,6 +17,7 @@ class Replies:
     def __init__(self) -> None:
         self._answers: list[Message] = []
         self._next_heartbeat_s = -math.inf
+        self._texts = 0
 
     def handle(self, message: Message, now_s: float) -> None:
         """Take a message; an answer to one of ours is not answered again."""
@@ -30,8 +32,13 @@ class Replies:
                 dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
             )
 
+    def announce(self, severity: int, text: str) -> None:
+        """Tell everybody who listens, people at ground stations above all."""
+        self._texts = self._texts % 0xFFFF + 1
+        self._answers += text_messages(severity, text.encode("ascii", "replace"), self._texts)
+
     def take(self, stamp_s: float) -> list[Message]:
-        """The answers so far, and our own HEARTBEAT once a second."""
+        """The answers and texts so far, and our own HEARTBEAT once a second."""
         out, self._answers = self._answers, []
         if stamp_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = stamp_s + HEARTBEAT_INTERVAL_S

@@ -179,6 +179,10 @@ class OffboardSession:
         """Stand still and keep the heading from the next tick on."""
         self._target = Target()
 
+    def announce(self, text: str) -> None:
+        """Tell ground stations, as a STATUSTEXT of the severity of a warning."""
+        self._replies.announce(_WARNING, text)
+
     def request_land(self) -> None:
         """Land where it is and disarm; before arming, end at once."""
         if self.phase not in (Phase.LANDING, Phase.DONE):

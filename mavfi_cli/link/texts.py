@@ -7,15 +7,36 @@ comes in chunks with a common id; the last one is shorter than 50 characters.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
-from mavfi_cli.link.codec import Message
+from mavfi_cli.link.codec import Message, dialect
 
 CHUNK_LENGTH = 50
 _MAX_OPEN = 16
 _MAX_TEXTS = 1000
 _PATIENCE_S = 1.0  # how long a text waits for its missing chunks
 _GAP = "[...]"
+
+
+def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Any]:
+    """The STATUSTEXT messages of one text.
+
+    A text that fits into one message has id 0. A longer one goes in chunks with `text_id`, and
+    the chunk that ends it is shorter than CHUNK_LENGTH bytes.
+
+    Args:
+        severity: MAV_SEVERITY, 0 emergency .. 7 debug.
+        data: the text in ASCII.
+        text_id: 1 .. 65535.
+    """
+    if len(data) <= CHUNK_LENGTH:
+        yield dialect.MAVLink_statustext_message(severity, data)
+        return
+    for number, start in enumerate(range(0, len(data) + 1, CHUNK_LENGTH)):
+        chunk = data[start : start + CHUNK_LENGTH]
+        yield dialect.MAVLink_statustext_message(severity, chunk, text_id, number)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

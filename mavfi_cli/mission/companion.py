@@ -10,16 +10,15 @@ Every message that one kernel hands to the next passes through one of the `_take
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
-from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFailure, PlanRequest
+from mavfi_cli.autonomy import occupancy, tracking
+from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFailure
 from mavfi_cli.autonomy.planners import Planner
-from mavfi_cli.autonomy.trajectory import waypoint_index
-from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.autonomy.trajectory import waypoint_index, without_waypoint
 from mavfi_cli.core.states import of_stage
 from mavfi_cli.core.types import (
     CollisionReport,
@@ -37,7 +36,10 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor
 from mavfi_cli.mission.injection import Injection, NoInjection
+from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels
 from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
+from mavfi_cli.mission.protection import NoProtection, Protection, Response
+from mavfi_cli.mission.response import Reaction
 
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
 # a shorter delay is below what the simulation resolves.
@@ -51,18 +53,13 @@ BRAKE_SHARE = 0.6  # of a_max that stopping counts on, as planned motion does
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reaction:
-    """How long a depth frame took to reach a setpoint: the pipeline's response time."""
+class _Setpoint:
+    """A command on its way, and what it was computed from."""
 
-    frame_stamp_s: float
-    setpoint_stamp_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _CheckInput:
-    snapshot: occupancy.MapSnapshot
-    trajectory: Trajectory | None
-    time_s: float
+    due_s: float
+    command: Command
+    directive: Directive
+    waypoint: int
 
 
 class Companion:
@@ -78,8 +75,10 @@ class Companion:
         injection: Injection | NoInjection,
     ) -> None:
         self._config = config
-        self._planner = planner
         self._injection = injection
+        self.protection = NoProtection()
+        if config.detector is not None:
+            self.protection = Protection(config.detector, wall)
         v_max, a_max = config.v_max_mps, config.a_max_mps2
         self.pilot = Pilot(
             PilotParams(
@@ -90,20 +89,6 @@ class Companion:
             ),
             briefing.goal_enu_m,
         )
-        self._cloud_params = point_cloud.PointCloudParams(max_range_m=config.map_range_m)
-        self._map = occupancy.OccupancyMap(
-            occupancy.OccupancyParams(
-                resolution_m=config.map_resolution_m, max_range_m=config.map_range_m
-            )
-        )
-        self._collision_params = collision.CollisionParams()
-        self._collision_state = collision.CollisionState()
-        self._planning_params = planning.StageParams(
-            smoothing=smoothing.SmoothingParams(v_max_mps=v_max, a_max_mps2=a_max)
-        )
-        self._bounds_enu_m = briefing.bounds_enu_m
-        self._tracking_params = tracking.TrackingParams(v_max_mps=v_max, a_max_mps2=a_max)
-        self._tracking_state: tracking.TrackingState | None = None
         self._latency = LatencyModel(platform, config.seed)
         self.executor = Executor(
             draw_latency_s=self._latency.draw_s,
@@ -112,17 +97,20 @@ class Companion:
             restart_s=config.node_restart_s,
             watchdog_s=config.node_watchdog_s,
         )
+        kernels = Kernels(config, planner, briefing)
         add = self.executor.add
-        add("point_cloud", self._run_point_cloud, self._take_cloud)
-        add("octomap", self._run_octomap, self._take_snapshot)
-        add("collision_check", self._run_collision_check, self._take_report)
-        add("planner", self._run_planner, self._take_plan)
-        self._control = add("control", self._run_control, lambda _output, _stamp_s: None)
+        add("point_cloud", kernels.point_cloud, self._take_cloud)
+        add("octomap", kernels.octomap, self._take_snapshot)
+        add("collision_check", kernels.collision_check, self._take_report)
+        add("planner", kernels.planner, self._take_plan)
+        self._control = add("control", kernels.control, lambda _output, _stamp_s: None)
         if injection.follower is not None:
             self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
         self._checked: Trajectory | None = None
-        self._commands: deque[tuple[float, Command]] = deque()  # (due stamp, command)
+        self._commands: deque[_Setpoint] = deque()
+        self._frame: DepthFrame | None = None
+        self._state: VehicleState | None = None
         self.report: CollisionReport | None = None
         self.command: Command | None = None
         self.directive: Directive | None = None
@@ -132,69 +120,11 @@ class Companion:
         self._takeover_s: float | None = None
         self._ticks = 0
 
-    # Kernels as nodes run them: (input, start stamp) -> output
-
-    def _run_point_cloud(self, frame: DepthFrame, _stamp_s: float) -> PointCloud:
-        return point_cloud.generate(frame, self._cloud_params)
-
-    def _run_octomap(self, cloud: PointCloud, _stamp_s: float) -> occupancy.MapSnapshot:
-        self._map.insert(cloud)
-        return self._map.snapshot()
-
-    def _run_collision_check(
-        self, check: _CheckInput, stamp_s: float
-    ) -> tuple[CollisionReport, float]:
-        inputs = collision.CollisionInputs(
-            stamp_s=stamp_s,
-            snapshot=check.snapshot,
-            trajectory=check.trajectory,
-            time_s=check.time_s,
-        )
-        self._collision_state, report = collision.step(
-            self._collision_state, inputs, self._collision_params
-        )
-        return report, check.snapshot.stamp_s
-
-    def _run_planner(
-        self, job: tuple[PlanRequest, occupancy.MapSnapshot], stamp_s: float
-    ) -> Trajectory | PlanFailure:
-        request, snapshot = job
-        found = planning.plan(
-            self._planner,
-            planning.StageInputs(
-                snapshot=snapshot,
-                position_enu_m=request.position_enu_m,
-                departure=smoothing.Departure(
-                    stamp_s=request.stamp_s,
-                    velocity_enu_mps=request.velocity_enu_mps,
-                    yaw_rad=request.yaw_rad,
-                ),
-                goal_enu_m=request.goal_enu_m,
-                bounds_enu_m=self._bounds_enu_m,
-                sequence=smoothing.Sequence(
-                    trajectory_seq=_next_int32(request.trajectory_seq),
-                    future_collision_seq=request.future_collision_seq,
-                ),
-                seed=derive(self._config.seed, Stream.PLANNER, request.attempt),
-            ),
-            self._planning_params,
-        )
-        if found.trajectory is None:
-            return PlanFailure(stamp_s=request.stamp_s, reason=found.reason)
-        return found.trajectory
-
-    def _run_control(self, job: tuple[tracking.TrackingInputs, float], _stamp_s: float) -> Command:
-        inputs, yaw_rad = job
-        state = self._tracking_state
-        if state is None:
-            state = tracking.TrackingState(yaw_rad=yaw_rad, stamp_s=inputs.stamp_s)
-        self._tracking_state, command = tracking.step(state, inputs, self._tracking_params)
-        return command
-
     # Messages as they take effect
 
     def take_frame(self, frame: DepthFrame) -> None:
         """A new depth image has arrived."""
+        self._frame = frame
         self.executor.submit("point_cloud", frame)
 
     def _take_cloud(self, cloud: PointCloud, _stamp_s: float) -> None:
@@ -206,19 +136,64 @@ class Companion:
 
     def _take_report(self, checked: tuple[CollisionReport, float], stamp_s: float) -> None:
         report, self._fresh_frame_s = checked
-        self.report = self._injection.pass_on(report, self._moment(stamp_s))
-        timely = self.pilot.on_report(self.report)
+        report = self._injection.pass_on(report, self._moment(stamp_s))
+        response = self.protection.report(report, stamp_s)
+        if response in (Response.RECOMPUTE, Response.HOLD):
+            self._recompute_perception()
+            if response is Response.HOLD:
+                self._hold()
+            return
+        self.report = report
+        timely = self.pilot.on_report(report)
         if self._injection.follower is not None:
             states = VERDICT_STATES if timely else VERDICT_STATES - {"time_to_collision"}
-            self._injection.follower.read(self.report, "mission logic", stamp_s, states)
+            self._injection.follower.read(report, "mission logic", stamp_s, states)
 
     def _take_plan(self, result: Trajectory | PlanFailure, stamp_s: float) -> None:
         if isinstance(result, Trajectory):
             result = self._injection.pass_on(result, self._moment(stamp_s))
+            if self.pilot.expects(result):
+                response = self.protection.plan(result, stamp_s)
+                if response in (Response.RECOMPUTE, Response.HOLD):
+                    self.pilot.reject_plan()
+                    if response is Response.HOLD:
+                        self._hold()
+                    return
             self.plans.append(result)
             if self._injection.follower is not None:
                 self._injection.follower.read(result, "mission logic", stamp_s, PLAN_STATES)
         self.pilot.on_plan(result)
+
+    # What the gate has computed again
+
+    def _recompute_perception(self) -> None:
+        """From the newest frame on: point cloud, OctoMap, collision check."""
+        if self._frame is not None:
+            self.executor.submit("point_cloud", self._frame)
+
+    def _hold(self) -> None:
+        """Hover, and plan anew from there."""
+        if self._state is not None:
+            self.pilot.abandon(self._state)
+
+    def _drop_waypoint(self, setpoint: _Setpoint) -> Directive:
+        """The directive of a command without the waypoint that it followed."""
+        flown = setpoint.directive.trajectory
+        if flown is None:
+            return setpoint.directive
+        bridged = without_waypoint(flown, setpoint.waypoint)
+        self.pilot.replace_trajectory(flown, bridged)
+        return replace(setpoint.directive, trajectory=bridged)
+
+    def _recompute_control(self, stamp_s: float, setpoint: _Setpoint) -> _Setpoint | None:
+        """Take the next waypoint, and compute again from the last command that went out."""
+        assert self._state is not None
+        fresh = None
+        if self.command is not None:
+            last = self.command
+            fresh = tracking.TrackingState(yaw_rad=last.yaw_rad, stamp_s=last.stamp_s)
+        directive = self._drop_waypoint(setpoint)
+        return self._track(stamp_s, self._state, directive, fresh)
 
     def _on_start(self, node: str, value: Any, start_s: float) -> None:
         """A node begins to work on its input: it has read it."""
@@ -233,7 +208,7 @@ class Companion:
         self._checked = trajectory
         self.executor.submit(
             "collision_check",
-            _CheckInput(snapshot=self._snapshot, trajectory=trajectory, time_s=self.pilot.time_s),
+            CheckInput(snapshot=self._snapshot, trajectory=trajectory, time_s=self.pilot.time_s),
         )
 
     # The control tick
@@ -255,20 +230,20 @@ class Companion:
         self._ticks += 1
         if self.pilot.trajectory is not None:
             self._strike_latched(self.pilot.trajectory, stamp_s)
+        self._state = state
         directive = self.directive = self.pilot.update(stamp_s, state)
         if directive.plan is not None:
             assert self._snapshot is not None
             self.executor.submit("planner", (directive.plan, self._snapshot))
         if directive.trajectory is not None and directive.trajectory is not self._checked:
             self._check()
-        delay_s = self._control_delay_s()
         if self._injection.follower is not None:
             self._follow(self._injection.follower, stamp_s, directive)
-        command = self._track(stamp_s, state, directive)
-        if command is not None:  # else the last one stays in force: the node is down
-            self._commands.append((stamp_s + delay_s, command))
-        while self._commands and self._commands[0][0] <= stamp_s:
-            self._take_command(stamp_s, self._commands.popleft()[1])
+        setpoint = self._track(stamp_s, state, directive)
+        if setpoint is not None:  # else the last one stays in force: the node is down
+            self._commands.append(setpoint)
+        while self._commands and self._commands[0].due_s <= stamp_s:
+            self._take_command(stamp_s, self._commands.popleft())
         return self.command
 
     def _strike_latched(self, flown: Trajectory, stamp_s: float) -> None:
@@ -288,7 +263,14 @@ class Companion:
             follower.read(directive.trajectory, "control", stamp_s, {"waypoint_yaw"}, at + 1)
         follower.settle(lambda message: message is self.report or self.pilot.holds(message))
 
-    def _track(self, stamp_s: float, state: VehicleState, directive: Directive) -> Command | None:
+    def _track(
+        self,
+        stamp_s: float,
+        state: VehicleState,
+        directive: Directive,
+        fresh: tracking.TrackingState | None = None,
+    ) -> _Setpoint | None:
+        """Have control compute a command, due when its latency has passed."""
         inputs = tracking.TrackingInputs(
             stamp_s=stamp_s,
             position_enu_m=state.position_enu_m,
@@ -300,18 +282,44 @@ class Companion:
             hold_enu_m=directive.hold_enu_m,
             hold_yaw_rad=directive.hold_yaw_rad,
         )
-        command: Command | None = self.executor.call("control", (inputs, state.yaw_rad), stamp_s)
-        return command
+        due_s = stamp_s + self._control_delay_s()
+        job = ControlInput(inputs=inputs, fresh=fresh, yaw_rad=state.yaw_rad)
+        command: Command | None = self.executor.call("control", job, stamp_s)
+        if command is None:
+            return None
+        flown = directive.trajectory
+        waypoint = 0 if flown is None else max(0, waypoint_index(flown, directive.time_s))
+        return _Setpoint(due_s=due_s, command=command, directive=directive, waypoint=waypoint)
 
     def _control_delay_s(self) -> float:
         latency_s = self._latency.draw_s("control")
         self._control.busy_s += latency_s
         return latency_s if latency_s >= SAME_TICK_S else 0.0
 
-    def _take_command(self, stamp_s: float, command: Command) -> None:
-        self.command = self._injection.pass_on(command, self._moment(stamp_s))
+    def _take_command(self, stamp_s: float, setpoint: _Setpoint, *, again: bool = False) -> None:
+        """A command is due: through the gate, and out.
+
+        One that is withheld is computed again, at once where the platform is fast enough; what
+        raises an alarm once more leaves the last command in force until the next tick.
+        """
+        command = self._injection.pass_on(setpoint.command, self._moment(stamp_s))
+        flown = setpoint.directive.trajectory
+        response, stage = self.protection.tick(flown, setpoint.waypoint, command, stamp_s)
+        if response is Response.HOLD:
+            self._hold()
+            return
+        if response is Response.RECOMPUTE:
+            if stage is Stage.PLANNING:
+                self.pilot.want_plan()
+            renewed = None if again else self._recompute_control(stamp_s, setpoint)
+            if renewed is not None and renewed.due_s <= stamp_s:
+                self._take_command(stamp_s, renewed, again=True)
+            elif renewed is not None:
+                self._commands.append(renewed)
+            return
+        self.command = command
         if self._injection.follower is not None:
-            self._injection.follower.read(self.command, "setpoint", stamp_s, COMMAND_STATES)
+            self._injection.follower.read(command, "setpoint", stamp_s, COMMAND_STATES)
         if self._fresh_frame_s is not None:
             self.reactions.append(
                 Reaction(frame_stamp_s=self._fresh_frame_s, setpoint_stamp_s=stamp_s)
@@ -348,23 +356,3 @@ class Companion:
     def goal_distance_m(self, state: VehicleState) -> float:
         """Distance to the goal, m."""
         return float(np.linalg.norm(state.position_enu_m - self.pilot.goal_enu_m))
-
-
-def _next_int32(value: int) -> int:
-    """The next number of a 32-bit counter, which a fault may have driven to its end."""
-    return (value + 1 + 2**31) % 2**32 - 2**31
-
-
-def response_times(reactions: list[Reaction]) -> dict[str, float | None]:
-    """Median and 95th percentile of the time from a depth frame to a setpoint, s."""
-    if not reactions:
-        return {"median": None, "p95": None, "count": 0}
-    times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])
-    times = times[np.isfinite(times)]
-    if not len(times):
-        return {"median": None, "p95": None, "count": 0}
-    return {
-        "median": round(float(np.median(times)), 9),
-        "p95": round(float(np.percentile(times, 95.0)), 9),
-        "count": len(times),
-    }

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 
@@ -27,6 +28,7 @@ class MissionConfig:
         land: land and disarm after the goal was reached.
         fault: a source-level fault to inject; None for a golden flight.
         instruction: an instruction-level fault to inject instead.
+        detector: what watches the states before they take effect; None for nothing.
         node_restart_s: from the death of a node until its successor works, simulated.
         node_watchdog_s: a node that works for so long hangs and is killed, simulated.
         isolate: nodes that work in processes of their own; changes nothing in the record.
@@ -56,6 +58,7 @@ class MissionConfig:
     node_watchdog_s: float = 5.0
     fault: FaultConfig | None = None
     instruction: InstructionConfig | None = None
+    detector: DetectorConfig | None = None
     isolate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

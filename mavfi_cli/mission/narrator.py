@@ -66,6 +66,10 @@ class Narrator:
         self._texts = session.telemetry.texts.total
         news += [("fault", text) for text in injection.news()]
         if companion is not None:
+            alarms = companion.protection.news()
+            news += [("alarm", text) for text in alarms]
+            for text in alarms:
+                session.announce(text)
             news += self._losses_since(companion)
             news += self._mode_since(companion)
         return news

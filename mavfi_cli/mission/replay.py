@@ -28,7 +28,10 @@ class Parting:
 
 
 def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
-    """The mission that a run flew, ready to be flown again.
+    """The mission that a run flew, ready to be flown again; its golden pair without the fault.
+
+    The golden pair has no detector either: it is what both the fault and its detection are held
+    against.
 
     Raises:
         RecordError: it flew a foreign autopilot, which nothing here can repeat.
@@ -37,7 +40,7 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
     if values.get("link") is not None:
         raise RecordError(f"{run.folder.path}: a flight of a foreign autopilot does not repeat")
     if not with_fault:
-        values["fault"] = values["instruction"] = None
+        values["fault"] = values["instruction"] = values["detector"] = None
     return structure(values, MissionConfig, path=run.folder.result)
 
 

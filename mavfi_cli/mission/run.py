@@ -26,7 +26,6 @@ from mavfi_cli.core.errors import MavfiError, NodeCrashed
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.mission import briefing, quality
-from mavfi_cli.mission.companion import response_times
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction_config import InstructionConfig
@@ -34,6 +33,7 @@ from mavfi_cli.mission.instruction_injection import InstructionInjection, requir
 from mavfi_cli.mission.instruction_plan import PlannedFault, Recorder, plan_fault, planned_of
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.response import response_times
 from mavfi_cli.mission.run_folder import CRASH, RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.spawned_node import SpawnedNode
 from mavfi_cli.mission.statistics import mission_statistics, plan_lines
@@ -263,6 +263,7 @@ def _write(
         "events": flight.log.to_list(),
         "plans": plan_lines(companion),
         "fault": flight.injection.finish(),
+        "detection": companion.protection.summary() if companion else None,
         "goal_enu_m": None if goal is None else goal.tolist(),
         "world": None if referee is None else referee["world"],
         "referee": None if referee is None else {k: v for k, v in referee.items() if k != "world"},

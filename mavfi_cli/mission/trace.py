@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _STATE_COLUMNS = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps", "yaw_rad")
+_SOURCE_COLUMNS = {
+    "report_stamp_s": "float64", "trajectory_stamp_s": "float64", "waypoint_index": "int32",
+}  # fmt: skip
 _TRUTH_COLUMNS = {
     "position_enu_m": ("truth_x_m", "truth_y_m", "truth_z_m"),
     "velocity_enu_mps": ("truth_vx_mps", "truth_vy_mps", "truth_vz_mps"),
@@ -35,6 +38,7 @@ class Trace:
         self._stamps: list[float] = []
         self._phases: list[str] = []
         self._vehicle: list[tuple[float, ...]] = []
+        self._sources: list[tuple[float | None, float | None, int | None]] = []
         self._messages: dict[type, list[tuple[Message, int] | None]] = {k: [] for k in _GROUPS}
 
     def add(
@@ -59,6 +63,13 @@ class Trace:
         self._messages[CollisionReport].append(None if report is None else (report, 0))
         self._messages[Trajectory].append(trajectory)
         self._messages[Command].append(None if command is None else (command, 0))
+        self._sources.append(
+            (
+                None if report is None else report.stamp_s,
+                None if trajectory is None else trajectory[0].stamp_s,
+                None if trajectory is None else trajectory[1],
+            )
+        )
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -71,7 +82,8 @@ class Trace:
     def table(self, truth: dict[str, np.ndarray] | None) -> pa.Table:
         """The columns: stamp, phase, vehicle, every monitored state, and the referee's truth.
 
-        A state that no message carried yet is null. Truth is joined by stamp.
+        Also from which messages the states are: stamps of report and trajectory, index of the
+        waypoint. A state that no message carried yet is null. Truth is joined by stamp.
         """
         import pyarrow as pa
 
@@ -89,6 +101,8 @@ class Trace:
                 for entry in self._messages[state.message]
             ]
             columns[name] = pa.array(values, kinds[state.dtype])
+        for place, (name, kind) in enumerate(_SOURCE_COLUMNS.items()):
+            columns[name] = pa.array([row[place] for row in self._sources], getattr(pa, kind)())
         if truth is not None:
             columns.update(self._truth_columns(truth))
         return pa.table(columns)

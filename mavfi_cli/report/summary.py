@@ -54,6 +54,7 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
     ]
     lines += fault_lines(result)
     lines += node_lines(result)
+    lines += detection_lines(result)
     response = result.get("response_time_s") or {}
     if response.get("median") is not None:
         lines.append(
@@ -80,6 +81,42 @@ def node_lines(result: dict[str, Any]) -> list[str]:
             ends.append(f"hung {node['hangs']} times" if node["hangs"] > 1 else "hung once")
         if ends:
             lines.append(f"Node        {name}: {'; '.join(ends)}; restarted {node['restarts']}x")
+    return lines
+
+
+def detection_lines(result: dict[str, Any]) -> list[str]:
+    """What the detector saw, what was computed again, and what its checks cost on this machine."""
+    detection = result.get("detection")
+    if not detection:
+        return []
+    checks, responses = detection["checks"], detection["responses"]
+    lines = [
+        f"Detector    {detection['detector']} on {', '.join(detection['protect'])}: "
+        f"{sum(checks.values())} checks, {detection['alarm_count']} alarms"
+    ]
+    for alarm in detection["alarms"][:3]:
+        where = ", ".join(alarm["states"][:2]) or "all states together"
+        lines.append(
+            f"            at {alarm['stamp_s']:.2f} s: {alarm['stage']}, {where}: "
+            f"{alarm['response']}"
+        )
+    if detection["alarm_count"]:
+        recovered = [
+            f"{stage} {entry['count']}x, {entry['total_s'] * 1e3:.1f} ms"
+            for stage, entry in detection["recoveries"].items()
+            if entry["count"]
+        ]
+        lines.append(
+            f"            recovered {'; '.join(recovered)}; {responses['hold']} holds, "
+            f"{responses['accept']} accepted after all"
+        )
+    gate_s = result["host"]["stage_wall_s"].get("gate")
+    if gate_s and sum(checks.values()):
+        each_us = 1e6 * gate_s / sum(checks.values())
+        share = (
+            100.0 * gate_s / (result["quality_of_flight"]["flight_time_s"] or result["simulated_s"])
+        )
+        lines.append(f"            {each_us:.1f} us a check here, {share:.4f} % of the flight time")
     return lines
 
 

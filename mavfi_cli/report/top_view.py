@@ -27,7 +27,14 @@ _MARKS: dict[str, dict[str, Any]] = {
     "stop": {"marker": "s", "s": 26, "facecolors": "#e4572e", "edgecolors": "#222831"},
 }
 _MARKS["fault"] = {"marker": "*", "s": 130, "facecolors": "#c22f2f", "edgecolors": "white"}
-_LABELS = {"fault": "fault", "replan": "new plan", "slow": "slows down", "stop": "stops"}
+_MARKS["alarm"] = {"marker": "D", "s": 34, "facecolors": "#5b8def", "edgecolors": "white"}
+_LABELS = {
+    "fault": "fault",
+    "alarm": "alarm",
+    "replan": "new plan",
+    "slow": "slows down",
+    "stop": "stops",
+}
 
 
 def write_top_view(run: Run, path: Path) -> None:

@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from enum import IntEnum
 from typing import Any
 
-from mavfi_cli.link.codec import dialect
-
-_CHUNK = 50
+from mavfi_cli.link import texts
 
 
 class Severity(IntEnum):
@@ -23,14 +21,6 @@ class Severity(IntEnum):
 def text_messages(severity: int, text: str, text_id: int) -> Iterator[Any]:
     """The STATUSTEXT messages of one text.
 
-    A text that fits into one message has id 0. A longer one goes in chunks with `text_id`, and
-    the chunk that ends it is shorter than 50 bytes. The TAB tells clients which also take the
-    events interface that the same words come there.
+    The TAB tells clients which also take the events interface that the same words come there.
     """
-    data = text.encode("ascii", "replace") + b"\t"
-    if len(data) <= _CHUNK:
-        yield dialect.MAVLink_statustext_message(severity, data)
-        return
-    for number, start in enumerate(range(0, len(data) + 1, _CHUNK)):
-        chunk = data[start : start + _CHUNK]
-        yield dialect.MAVLink_statustext_message(severity, chunk, text_id, number)
+    yield from texts.text_messages(severity, text.encode("ascii", "replace") + b"\t", text_id)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable
 from typing import Any
 
 from mavfi_cli.link.codec import Codec, dialect
@@ -20,11 +22,18 @@ _FRAMES = (
 )
 
 
+_OVERHEARD = 100  # texts kept at most, the newest
+
+
 class Client:
     """Turns bytes of one connection into calls of the simulation, and its messages into bytes.
 
     Depth frames go to the clients that started the capture; everybody gets the camera's
     heartbeat.
+
+    Attributes:
+        overheard: frames of STATUSTEXTs that came, for the other clients: as an autopilot
+            forwards what its companion says to the ground station, unchanged.
     """
 
     def __init__(
@@ -43,6 +52,7 @@ class Client:
         self._camera_codec = Codec(system, CAMERA, signing=signing)
         self._camera_answers: list[Any] = []
         self._wants_frames = False
+        self.overheard: deque[bytes] = deque(maxlen=_OVERHEARD)
 
     def close(self) -> None:
         """Leave the autopilot and release the connection."""
@@ -75,6 +85,8 @@ class Client:
             for message in messages:
                 if message.get_msgId() in _COMMANDS:
                     self._offer_camera(message)
+                elif message.get_msgId() == dialect.MAVLINK_MSG_ID_STATUSTEXT:
+                    self.overheard.append(bytes(message.get_msgbuf()))
                 self._simulation.autopilot.handle(message, self._link)
         return messages
 
@@ -101,6 +113,10 @@ class Client:
         self._camera_answers.clear()
         answers = self._simulation.autopilot.take_outbox(self._link)
         self._send(frames + [self._codec.encode(message) for message in answers])
+
+    def forward(self, frames: Iterable[bytes]) -> None:
+        """Send frames of other clients as they are."""
+        self._send(list(frames))
 
     def _send(self, frames: list[bytes]) -> None:
         if frames:

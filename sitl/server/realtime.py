@@ -59,9 +59,23 @@ class Realtime:
             self._wait(max(self._pace.remaining_s(), 0.0))
             self._welcome()
             self._each(_drain)
+            self._forward()
             self._each(Client.send_answers)
             if self._pace.remaining_s() <= 0.0 or stopped() or self._over:
                 return
+
+    def _forward(self) -> None:
+        """What one client tells people goes to all others."""
+        for speaker, _ in list(self._clients):
+            while speaker.overheard:
+                self._tell_others(speaker, speaker.overheard.popleft())
+
+    def _tell_others(self, speaker: Client, frame: bytes) -> None:
+        def forward(client: Client) -> None:
+            if client is not speaker:
+                client.forward([frame])
+
+        self._each(forward)
 
     def _wait(self, timeout_s: float) -> None:
         poller = select.poll()

@@ -14,8 +14,8 @@ from mavfi_cli.core.files import plain, write_atomically, write_json, write_text
 from mavfi_cli.core.states import STATES
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory, VehicleState
 from mavfi_cli.mission import briefing, quality
-from mavfi_cli.mission.companion import Reaction, response_times
 from mavfi_cli.mission.config import ISOLATABLE, MissionConfig
+from mavfi_cli.mission.response import Reaction, response_times
 from mavfi_cli.mission.run_folder import load_run, new_run_folder
 from mavfi_cli.mission.trace import Trace, read_trace, write_trace
 

@@ -118,6 +118,21 @@ def test_several_clients_each_with_own_streams_and_answers(serve, dial):
     interrupt(process)
 
 
+def test_what_one_client_tells_people_goes_to_all_others_as_it_is(serve, dial):
+    tcp = free_port(socket.SOCK_STREAM)
+    process = serve("--link", f"tcpin:127.0.0.1:{tcp}")
+    companion, ground = dial(tcp, system=1), dial(tcp, system=255)
+    for client in (companion, ground):
+        client.wait_for("HEARTBEAT")
+    companion.send(dialect.MAVLink_statustext_message(4, b"aad alarm in control"))
+    heard = ground.wait_for("STATUSTEXT", lambda m: "alarm" in m.text)
+    assert (heard.get_srcSystem(), heard.get_srcComponent()) == (1, 190)
+    assert (heard.severity, heard.text) == (4, "aad alarm in control")
+    companion.wait_for("HEARTBEAT")
+    assert not [m for m in companion.messages if m.get_type() == "STATUSTEXT" and "alarm" in m.text]
+    interrupt(process)
+
+
 def test_hostile_bytes_do_not_stop_it(serve, dial):
     tcp, udp = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
     process = serve("--link", f"tcpin:127.0.0.1:{tcp}", "--link", f"udpin:127.0.0.1:{udp}")

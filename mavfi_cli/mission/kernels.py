@@ -1,0 +1,121 @@
+"""The kernels as the mission's nodes run them, each with the state that it keeps.
+
+A node may live in a process of its own: then its part of the state lives there, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
+from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
+from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.types import CollisionReport, Command, DepthFrame, PointCloud, Trajectory
+from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.config import MissionConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckInput:
+    """What the collision check works on."""
+
+    snapshot: occupancy.MapSnapshot
+    trajectory: Trajectory | None
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlInput:
+    """What the controller works on."""
+
+    inputs: tracking.TrackingInputs
+    fresh: tracking.TrackingState | None  # compute from this state instead of one's own
+    yaw_rad: float  # the vehicle's, for a controller that begins
+
+
+class Kernels:
+    """Every method is what one node does: (input, start stamp) -> output."""
+
+    def __init__(self, config: MissionConfig, planner: Planner, briefing: Briefing) -> None:
+        self._seed = config.seed
+        self._planner = planner
+        v_max, a_max = config.v_max_mps, config.a_max_mps2
+        self._cloud_params = point_cloud.PointCloudParams(max_range_m=config.map_range_m)
+        self._map = occupancy.OccupancyMap(
+            occupancy.OccupancyParams(
+                resolution_m=config.map_resolution_m, max_range_m=config.map_range_m
+            )
+        )
+        self._collision_params = collision.CollisionParams()
+        self._collision_state = collision.CollisionState()
+        self._planning_params = planning.StageParams(
+            smoothing=smoothing.SmoothingParams(v_max_mps=v_max, a_max_mps2=a_max)
+        )
+        self._bounds_enu_m = briefing.bounds_enu_m
+        self._tracking_params = tracking.TrackingParams(v_max_mps=v_max, a_max_mps2=a_max)
+        self._tracking_state: tracking.TrackingState | None = None
+
+    def point_cloud(self, frame: DepthFrame, _stamp_s: float) -> PointCloud:
+        """A depth frame's points in the world."""
+        return point_cloud.generate(frame, self._cloud_params)
+
+    def octomap(self, cloud: PointCloud, _stamp_s: float) -> occupancy.MapSnapshot:
+        """The map with one more cloud in it."""
+        self._map.insert(cloud)
+        return self._map.snapshot()
+
+    def collision_check(self, check: CheckInput, stamp_s: float) -> tuple[CollisionReport, float]:
+        """The verdict on a trajectory, and the stamp of the frame that its map is of."""
+        inputs = collision.CollisionInputs(
+            stamp_s=stamp_s,
+            snapshot=check.snapshot,
+            trajectory=check.trajectory,
+            time_s=check.time_s,
+        )
+        self._collision_state, report = collision.step(
+            self._collision_state, inputs, self._collision_params
+        )
+        return report, check.snapshot.stamp_s
+
+    def planner(
+        self, job: tuple[PlanRequest, occupancy.MapSnapshot], _stamp_s: float
+    ) -> Trajectory | PlanFailure:
+        """A trajectory that answers a request, or the reason why there is none."""
+        request, snapshot = job
+        found = planning.plan(
+            self._planner,
+            planning.StageInputs(
+                snapshot=snapshot,
+                position_enu_m=request.position_enu_m,
+                departure=smoothing.Departure(
+                    stamp_s=request.stamp_s,
+                    velocity_enu_mps=request.velocity_enu_mps,
+                    yaw_rad=request.yaw_rad,
+                ),
+                goal_enu_m=request.goal_enu_m,
+                bounds_enu_m=self._bounds_enu_m,
+                sequence=smoothing.Sequence(
+                    trajectory_seq=_next_int32(request.trajectory_seq),
+                    future_collision_seq=request.future_collision_seq,
+                ),
+                seed=derive(self._seed, Stream.PLANNER, request.attempt),
+            ),
+            self._planning_params,
+        )
+        if found.trajectory is None:
+            return PlanFailure(stamp_s=request.stamp_s, reason=found.reason)
+        return found.trajectory
+
+    def control(self, job: ControlInput, _stamp_s: float) -> Command:
+        """One control tick."""
+        state = job.fresh or self._tracking_state
+        if state is None:
+            state = tracking.TrackingState(yaw_rad=job.yaw_rad, stamp_s=job.inputs.stamp_s)
+        self._tracking_state, command = tracking.step(state, job.inputs, self._tracking_params)
+        return command
+
+
+def _next_int32(value: int) -> int:
+    """The next number of a 32-bit counter, which a fault may have driven to its end."""
+    return (value + 1 + 2**31) % 2**32 - 2**31

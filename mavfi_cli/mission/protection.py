@@ -1,0 +1,214 @@
+"""The detector gate in a mission: what is withheld, what is computed again, and when that ends.
+
+A message that raises an alarm is withheld and its stage computes again (paper, section V-E). That
+is bounded: the `alarms_max`-th alarm of a stage in a row makes the vehicle hold and plan anew, and
+what comes after it passes, because so many computations agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
+from mavfi_cli.core.wall import WallClock
+from mavfi_cli.detect.gate import Alarm, Gate
+from mavfi_cli.detect.registry import find
+from mavfi_cli.mission.detector_config import DetectorConfig
+
+MAX_LISTED_ALARMS = 100
+TOLD_EVERY_S = 1.0  # alarms of one stage are told to people no more often
+
+
+class Response(Enum):
+    """What happens with a message at the gate."""
+
+    PASS = "pass"
+    RECOMPUTE = "recompute"  # withheld, its stage computes again
+    HOLD = "hold"  # withheld, the vehicle holds and plans anew
+    ACCEPT = "accept"  # passes in spite of the alarm: recomputing confirmed it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmRecord:
+    """One alarm as the record of the run tells it."""
+
+    stamp_s: float
+    message: str  # report, plan, tick
+    stage: str
+    score: float
+    states: tuple[str, ...]
+    response: str
+
+
+@dataclass(slots=True)
+class _Recovery:
+    """How often and how long a stage was without an accepted message after an alarm."""
+
+    count: int = 0
+    total_s: float = 0.0
+    since_s: float | None = None
+    in_a_row: int = 0
+
+
+class NoProtection:
+    """The null object: everything passes."""
+
+    gate: Gate | None = None
+
+    def report(self, report: CollisionReport, stamp_s: float) -> Response:
+        """Passes."""
+        return Response.PASS
+
+    def plan(self, plan: Trajectory, stamp_s: float) -> Response:
+        """Passes."""
+        return Response.PASS
+
+    def tick(
+        self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
+    ) -> tuple[Response, Stage]:
+        """Passes."""
+        return Response.PASS, Stage.CONTROL
+
+    def news(self) -> list[str]:
+        """Nothing to tell."""
+        return []
+
+    def summary(self) -> dict[str, Any] | None:
+        """No record."""
+        return None
+
+
+class Protection(NoProtection):
+    """A gate with its counters.
+
+    Args:
+        config: which detector, which stages.
+        wall: gets the host time of all checks, under "gate".
+    """
+
+    def __init__(self, config: DetectorConfig, wall: WallClock) -> None:
+        self._config = config
+        self._wall = wall
+        stages = frozenset(Stage(name) for name in config.protect)
+        detector = find(config.name, model=config.model_path, threshold=config.threshold)
+        self.gate: Gate = Gate(detector, stages)
+        self._threshold = self.gate.threshold
+        self._checks = dict.fromkeys(("report", "plan", "tick"), 0)
+        self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
+        self._recoveries = {stage: _Recovery() for stage in Stage}
+        self._alarms: list[AlarmRecord] = []
+        self._news: list[str] = []
+        self._told_s: dict[Stage, float] = {}
+
+    def report(self, report: CollisionReport, stamp_s: float) -> Response:
+        """Judge perception's message on its arrival."""
+        alarm = self._judge("report", lambda: self.gate.judge_report(report))
+        if alarm is None:
+            self._recovered(Stage.PERCEPTION, stamp_s)
+            return Response.PASS
+        response = self._respond(alarm, "report", Stage.PERCEPTION, stamp_s)
+        if response is Response.ACCEPT:
+            self.gate.accept_report()
+        return response
+
+    def plan(self, plan: Trajectory, stamp_s: float) -> Response:
+        """Judge a plan on its arrival."""
+        alarm = self._judge("plan", lambda: self.gate.judge_plan(plan))
+        if alarm is None:
+            self._recovered(Stage.PLANNING, stamp_s)
+            return Response.PASS
+        return self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
+
+    def tick(
+        self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
+    ) -> tuple[Response, Stage]:
+        """Judge the followed waypoint and the command that would go out; and who is to blame."""
+        if trajectory is None:
+            self.gate.forget(Stage.PLANNING)
+        alarm = self._judge("tick", lambda: self.gate.judge_tick(trajectory, index, command))
+        if alarm is None:
+            self._recovered(Stage.CONTROL, stamp_s)
+            if Stage.PLANNING in self.gate.fresh:
+                self._recoveries[Stage.PLANNING].in_a_row = 0
+            return Response.PASS, Stage.CONTROL
+        response = self._respond(alarm, "tick", alarm.stage, stamp_s)
+        if response is Response.ACCEPT:
+            self.gate.accept_tick()
+        return response, alarm.stage
+
+    def _judge(self, kind: str, check: Callable[[], Alarm | None]) -> Alarm | None:
+        self._checks[kind] += 1
+        with self._wall.measure("gate"):
+            return check()
+
+    def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Response:
+        recovery = self._recoveries[stage]
+        recovery.in_a_row += 1
+        if recovery.in_a_row < self._config.alarms_max:
+            response = Response.RECOMPUTE
+        elif recovery.in_a_row == self._config.alarms_max:
+            response = Response.HOLD
+        else:
+            response = Response.ACCEPT
+        self._responses[response.value] += 1
+        if recovery.since_s is None:
+            recovery.since_s = stamp_s
+            recovery.count += 1
+        if response is Response.ACCEPT:
+            self._close(recovery, stamp_s)
+        if len(self._alarms) < MAX_LISTED_ALARMS:
+            self._alarms.append(
+                AlarmRecord(
+                    stamp_s=round(stamp_s, 9),
+                    message=message,
+                    stage=stage.value,
+                    score=alarm.score,
+                    states=alarm.states,
+                    response=response.value,
+                )
+            )
+        self._tell(alarm, stage, response, stamp_s)
+        return response
+
+    def _tell(self, alarm: Alarm, stage: Stage, response: Response, stamp_s: float) -> None:
+        last_s = self._told_s.get(stage)
+        if response is not Response.HOLD and last_s is not None and stamp_s - last_s < TOLD_EVERY_S:
+            return
+        self._told_s[stage] = stamp_s
+        where = ", ".join(alarm.states[:2]) or "all states together"
+        self._news.append(f"{alarm.detector} alarm in {stage.value}: {where}; {response.value}")
+
+    def _recovered(self, stage: Stage, stamp_s: float) -> None:
+        recovery = self._recoveries[stage]
+        recovery.in_a_row = 0
+        if recovery.since_s is not None:
+            self._close(recovery, stamp_s)
+
+    def _close(self, recovery: _Recovery, stamp_s: float) -> None:
+        if recovery.since_s is not None:
+            recovery.total_s += stamp_s - recovery.since_s
+            recovery.since_s = None
+
+    def news(self) -> list[str]:
+        """What was noticed since the last call, a line each."""
+        told, self._news = self._news, []
+        return told
+
+    def summary(self) -> dict[str, Any]:
+        """Checks, alarms and recoveries, as plain values."""
+        return {
+            "detector": self._config.name,
+            "protect": list(self._config.protect),
+            "threshold": self._threshold,
+            "checks": self._checks,
+            "alarm_count": sum(self._responses.values()),
+            "responses": self._responses,
+            "alarms": [asdict(alarm) for alarm in self._alarms],
+            "recoveries": {
+                stage.value: {"count": entry.count, "total_s": round(entry.total_s, 9)}
+                for stage, entry in self._recoveries.items()
+            },
+        }
