@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shutil
-import signal
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +21,8 @@ from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.slots import TASK, Ended, Slots
 from mavfi_cli.campaign.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
-from mavfi_cli.mission.run import installed_versions
+from mavfi_cli.mission.replay import version_differences
+from mavfi_cli.mission.run import installed_versions, interruptible
 
 WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # so often a mission is begun that something outside ends
@@ -124,19 +124,14 @@ def require_versions(ledger: Ledger) -> None:
     if stored is None:
         ledger.set_meta({"versions": canonical(versions)})
     elif stored != canonical(versions):
-        was = json.loads(stored)
-        differing = [
-            f"{name} was {was.get(name, 'absent')}, is {versions.get(name, 'absent')}"
-            for name in sorted({*was, *versions})
-            if was.get(name) != versions.get(name)
-        ]
+        differing = version_differences(json.loads(stored), versions)
         raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
 
 
 def fly_missing(ledger: Ledger, options: Options, spectator: Spectator) -> None:
     """Fly every mission without a result; see `run_campaign`."""
     run = _Run(ledger, options, spectator)
-    with _prepared(ledger.folder), _interruptible() as asked:
+    with _prepared(ledger.folder), interruptible() as asked:
         run.fly(asked)
 
 
@@ -154,21 +149,6 @@ def _prepared(folder: Path) -> Iterator[None]:
         yield
     finally:
         shutil.rmtree(work, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM as a request; only the main thread can ask for this."""
-    asked: list[int] = []
-    previous: dict[signal.Signals, Any] = {}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        with contextlib.suppress(ValueError):  # not the main thread
-            previous[number] = signal.signal(number, lambda n, _frame: asked.append(n))
-    try:
-        yield asked
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 class _Run:
