@@ -37,7 +37,7 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     from mavfi_cli.report.summary import difference_lines, outcome_line
 
     recorded = load_run(run)
-    for text in version_differences(recorded, installed_versions()):
+    for text in version_differences(recorded.result["versions"], installed_versions()):
         click.echo(f"warning: another build: {text}", err=True)
     config = config_of(recorded, with_fault=not without_fault)
     repeat = read(recorded.folder.fault) if config.instruction is not None else None

@@ -15,10 +15,13 @@ from mavfi_cli.core.errors import RecordError
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Write a file beside its place, make it durable, then move it there.
 
+    Several processes may write the same file: each writes beside it under a name of its own, and
+    the last one stays.
+
     Raises:
         RecordError: the file could not be written (disk full, no permission); the old one stays.
     """
-    temporary = path.with_name(f".{path.name}.partial")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with temporary.open("wb") as file:
             write(file)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,9 +44,8 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
     return structure(values, MissionConfig, path=run.folder.result)
 
 
-def version_differences(run: Run, versions: dict[str, str]) -> list[str]:
+def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]) -> list[str]:
     """Which libraries differ between a record and this installation, a phrase each."""
-    recorded = run.result["versions"]
     return [
         f"{name} was {recorded.get(name, 'absent')}, is {versions.get(name, 'absent')}"
         for name in sorted({*recorded, *versions})

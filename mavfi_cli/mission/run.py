@@ -74,7 +74,7 @@ def fly_mission(
     planner = planners.find(config.planner)
     with (
         _injection(config, out, repeat, for_debugger) as injection,
-        _interruptible() as interrupt,
+        interruptible() as interrupt,
         _vehicle(config) as (transport, truth_folder, process),
     ):
         flight = Flight(config, transport, platform, planner, watcher, interrupt)
@@ -192,8 +192,8 @@ def _failure(process: VehicleProcess) -> MavfiError | None:
 
 
 @contextlib.contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Turn Ctrl-C and SIGTERM into a request, so that the flight ends with a whole record.
+def interruptible() -> Iterator[list[int]]:
+    """Turn Ctrl-C and SIGTERM into a request, so that what runs ends with a whole record.
 
     Yields a list that is empty until then. Only the main thread can ask for this.
     """

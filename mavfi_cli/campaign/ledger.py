@@ -1,0 +1,335 @@
+"""The ledger of a campaign: SQLite in WAL mode, one writer, one transaction a mission.
+
+    meta      what the campaign is: schema, versions, name, spec
+    cells     the settings, by their labels
+    missions  the numbered list, written before the first mission flies
+    results   one short row a mission that is over
+    records   its whole result.json, compressed
+
+A mission is missing as long as it has no row in `results`; a kill at any moment leaves a mission
+with its whole row or with none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import sqlite3
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
+from mavfi_cli.campaign.outcome import Injected, MissionResult, State
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.core.files import plain
+
+SCHEMA = 1
+LEDGER, LOCK, RUNS = "ledger.sqlite", "ledger.lock", "runs"
+_TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE cells (cell INTEGER PRIMARY KEY, labels TEXT NOT NULL UNIQUE);
+CREATE TABLE missions (
+    number INTEGER PRIMARY KEY,
+    cell INTEGER NOT NULL REFERENCES cells,
+    pair TEXT NOT NULL,
+    changes TEXT NOT NULL
+);
+CREATE TABLE results (
+    number INTEGER PRIMARY KEY REFERENCES missions,
+    state TEXT NOT NULL,
+    outcome TEXT,
+    reason TEXT NOT NULL,
+    injected TEXT,
+    flight_time_s REAL,
+    distance_m REAL,
+    energy_regression_j REAL,
+    energy_propeller_j REAL,
+    min_clearance_m REAL,
+    replans INTEGER,
+    simulated_s REAL,
+    wall_s REAL NOT NULL,
+    attempts INTEGER NOT NULL,
+    path TEXT
+);
+CREATE TABLE records (number INTEGER PRIMARY KEY REFERENCES results, result BLOB NOT NULL);
+"""
+_QUALITY = (
+    "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
+)  # fmt: skip
+COLUMNS = ("outcome", "injected", *_QUALITY, "replans", "simulated_s", "wall_s")
+
+
+class Ledger:
+    """One campaign's missions and results.
+
+    A context manager that closes it. Any number may read while one writes.
+    """
+
+    def __init__(self, folder: Path, *, writing: bool = False) -> None:
+        """Open the ledger of a folder; a writer makes it where there is none.
+
+        Raises:
+            RecordError: there is none, it is damaged, or it cannot be opened.
+            ConfigError: another version of mavfi wrote it, or another process is its writer.
+        """
+        self.folder = folder
+        self._path = folder / LEDGER
+        self._lock: Any = None
+        self._writing = writing
+        if writing:
+            self._become_writer()
+        elif not self._path.is_file():
+            raise RecordError(f"{folder}: no campaign there (no {LEDGER})")
+        try:
+            self._db = self._connect()
+            try:
+                self._check()
+            except BaseException:
+                self._db.close()
+                raise
+        except sqlite3.Error as error:
+            self._unlock()
+            raise RecordError(f"{self._path}: {error}") from None
+        except BaseException:
+            self._unlock()
+            raise
+
+    def __enter__(self) -> Ledger:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close it; a writer makes room for the next."""
+        self._db.close()
+        self._unlock()
+
+    def _become_writer(self) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = (self.folder / LOCK).open("w")
+        except OSError as error:
+            raise RecordError(f"{self.folder}: {error.strerror or error}") from None
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._unlock()
+            raise ConfigError("another process runs this campaign", path=self.folder) from None
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _connect(self) -> sqlite3.Connection:
+        mode = "rwc" if self._writing else "rw"  # a reader of a WAL file writes its index
+        uri = f"{self._path.absolute().as_uri()}?mode={mode}"
+        connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30.0)
+        if self._writing:
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = FULL")  # a power cut costs no finished mission
+        else:
+            connection.execute("PRAGMA query_only = ON")
+        return connection
+
+    def _check(self) -> None:
+        tables = {row[0] for row in self._db.execute("SELECT name FROM sqlite_master")}
+        if not tables and self._writing:
+            with self._transaction():
+                for statement in _TABLES.split(";"):
+                    self._db.execute(statement)
+                self._db.execute("INSERT INTO meta VALUES ('schema', ?)", (str(SCHEMA),))
+            return
+        found = self.meta("schema") if "meta" in tables else None
+        if found != str(SCHEMA):
+            told = f"of version {found}" if found is not None else "of no version"
+            raise ConfigError(
+                f"a ledger {told}; this mavfi reads version {SCHEMA}", path=self._path
+            )
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        try:
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+            except BaseException:
+                self._db.execute("ROLLBACK")
+                raise
+            self._db.execute("COMMIT")
+        except sqlite3.Error as error:
+            if self._db.in_transaction:
+                with contextlib.suppress(sqlite3.Error):
+                    self._db.execute("ROLLBACK")
+            raise RecordError(f"{self._path}: {error}") from None
+
+    # What the campaign is -------------------------------------------------------------------------
+
+    def meta(self, key: str) -> str | None:
+        """A word about the campaign; None where it was never said."""
+        row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        return None if row is None else str(row[0])
+
+    def set_meta(self, values: Mapping[str, str]) -> None:
+        """Say words about the campaign, all or none."""
+        with self._transaction():
+            self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values.items())
+
+    def plan(self, missions: Iterable[PlannedMission]) -> int:
+        """Add missions at the end of the list; how many.
+
+        Raises:
+            RecordError: the disk is full, or something else kept it from being written.
+        """
+        first = self.planned()
+        known = {labels: cell for cell, labels in self._db.execute("SELECT * FROM cells")}
+        count = 0
+        with self._transaction():
+            for count, mission in enumerate(missions, start=1):
+                labels = canonical(dict(mission.labels))
+                if labels not in known:
+                    known[labels] = len(known)
+                    self._db.execute("INSERT INTO cells VALUES (?, ?)", (known[labels], labels))
+                changes = canonical(changes_of(mission.config))
+                row = (first + count - 1, known[labels], mission.pair, changes)
+                self._db.execute("INSERT INTO missions VALUES (?, ?, ?, ?)", row)
+        return count
+
+    def planned(self) -> int:
+        """How many missions the list has."""
+        return int(self._db.execute("SELECT count(*) FROM missions").fetchone()[0])
+
+    def cells(self) -> list[dict[str, Any]]:
+        """The settings, by number."""
+        rows = self._db.execute("SELECT labels FROM cells ORDER BY cell")
+        return [json.loads(labels) for (labels,) in rows]
+
+    def rows(self) -> Iterator[tuple[int, str, str, str]]:
+        """Number, labels, pair and changes of every mission, as they are stored."""
+        yield from self._db.execute(
+            "SELECT number, labels, pair, changes FROM missions JOIN cells USING (cell) "
+            "ORDER BY number"
+        )
+
+    # What is to be done ---------------------------------------------------------------------------
+
+    def missing(self, *, errors: bool = False) -> Iterator[tuple[int, int, dict[str, Any]]]:
+        """Number, cell and changes of every mission without a result, in the order of the list.
+
+        Read in portions, so that results may be added meanwhile.
+
+        Args:
+            errors: those that could not begin count as missing too.
+        """
+        over = "SELECT 1 FROM results WHERE results.number = missions.number"
+        over += " AND state <> 'error'" if errors else ""
+        last = -1
+        while True:
+            rows = self._db.execute(
+                "SELECT number, cell, changes FROM missions WHERE number > ? "
+                f"AND NOT EXISTS ({over}) ORDER BY number LIMIT 1000",
+                (last,),
+            ).fetchall()
+            for number, cell, changes in rows:
+                yield number, cell, json.loads(changes)
+                last = number
+            if not rows:
+                return
+
+    def over(self) -> int:
+        """How many missions have a row."""
+        return int(self._db.execute("SELECT count(*) FROM results").fetchone()[0])
+
+    def add(
+        self,
+        number: int,
+        *,
+        state: State,
+        result: Mapping[str, Any],
+        reason: str,
+        injected: Injected | None,
+        wall_s: float,
+        attempts: int,
+        path: str | None,
+    ) -> None:
+        """Put a mission's result in, in one transaction; a row that is there is replaced.
+
+        Raises:
+            RecordError: the disk is full, or something else kept it from being written.
+        """
+        quality = result.get("quality_of_flight") or {}
+        pilot = result.get("pilot") or {}
+        row = (
+            number,
+            state.value,
+            result.get("outcome"),
+            reason,
+            None if injected is None else injected.value,
+            *(quality.get(name) for name in _QUALITY),
+            pilot.get("replans"),
+            result.get("simulated_s"),
+            wall_s,
+            attempts,
+            path,
+        )
+        blob = zlib.compress(canonical(plain(dict(result))).encode())
+        marks = ", ".join("?" * len(row))
+        with self._transaction():
+            self._db.execute(f"REPLACE INTO results VALUES ({marks})", row)
+            self._db.execute("REPLACE INTO records VALUES (?, ?)", (number, blob))
+
+    # What came of it ------------------------------------------------------------------------------
+
+    def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
+        """What is over, in the order of the list.
+
+        Args:
+            numbers: only these missions.
+        """
+        chosen = "" if numbers is None else "WHERE number IN (SELECT value FROM json_each(?)) "
+        rows = self._db.execute(
+            "SELECT number, labels, pair, changes, state, outcome, reason, injected, wall_s, "
+            "attempts, path, result FROM results JOIN missions USING (number) "
+            f"JOIN cells USING (cell) JOIN records USING (number) {chosen}ORDER BY number",
+            () if numbers is None else (json.dumps(list(numbers)),),
+        )
+        for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
+            wall_s, attempts, path, blob = rest
+            yield MissionResult(
+                number=number,
+                mission=PlannedMission(
+                    config=config_from(json.loads(changes)), labels=json.loads(labels), pair=pair
+                ),
+                state=State(state),
+                outcome=outcome,
+                reason=reason,
+                result=json.loads(zlib.decompress(blob)),
+                injected=None if injected is None else Injected(injected),
+                wall_s=wall_s,
+                attempts=attempts,
+                path=None if path is None else self.folder.absolute() / path,
+            )
+
+    def table(self) -> Iterator[tuple[Any, ...]]:
+        """Number, cell, pair and `COLUMNS` of every flown mission, in the order of the list."""
+        names = ", ".join(COLUMNS)
+        yield from self._db.execute(
+            f"SELECT number, cell, pair, {names} FROM results JOIN missions USING (number) "
+            "WHERE state = 'flown' ORDER BY number"
+        )
+
+    def counts(self) -> list[tuple[int, str, str | None, str | None, int]]:
+        """How many missions there are by cell, state, outcome and fate of the fault."""
+        return self._db.execute(
+            "SELECT cell, state, outcome, injected, count(*) FROM results "
+            "JOIN missions USING (number) GROUP BY 1, 2, 3, 4 ORDER BY 1, 2, 3, 4"
+        ).fetchall()
+
+    def planned_by_cell(self) -> list[int]:
+        """How many missions each cell has."""
+        rows = self._db.execute("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
+        return [count for (count,) in rows]

@@ -1,0 +1,76 @@
+"""The missions of a campaign: a numbered list, each complete enough to be flown by itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+from mavfi_cli.core.config import structure
+from mavfi_cli.mission.config import MissionConfig
+
+Label = str | int | float | bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedMission:
+    """One mission of a campaign; its number is its place in the list, from 0.
+
+    Attributes:
+        config: what is flown.
+        labels: the setting that the mission belongs to; missions of equal labels are counted
+            together.
+        pair: missions of equal pairs share world, start and noise; empty: by `pair_of`.
+    """
+
+    config: MissionConfig
+    labels: Mapping[str, Label] = field(default_factory=dict)
+    pair: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.pair:
+            object.__setattr__(self, "pair", pair_of(self.config))
+
+
+def _plain(config: MissionConfig) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads(json.dumps(asdict(config)))
+    return values
+
+
+_BASE = _plain(MissionConfig())
+# What a golden flight has not: faults, and later what protects it from them.
+_TREATMENT = ("fault", "instruction", "isolate", "detector", "protect")
+
+
+def canonical(value: Any) -> str:
+    """JSON of a value, one text for equal values."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def changes_of(config: MissionConfig) -> dict[str, Any]:
+    """What a mission has other than by default, as plain values."""
+    return {name: value for name, value in _plain(config).items() if value != _BASE[name]}
+
+
+def config_from(changes: Mapping[str, Any]) -> MissionConfig:
+    """The mission of `changes_of`.
+
+    Raises:
+        ConfigError: a key or a value that this version of mavfi does not have.
+    """
+    return structure(changes, MissionConfig)
+
+
+def golden_of(config: MissionConfig) -> MissionConfig:
+    """The same mission without fault and without protection."""
+    known = {each.name: each.default for each in fields(MissionConfig)}
+    bare: dict[str, Any] = {name: known[name] for name in _TREATMENT if name in known}
+    return replace(config, **bare)
+
+
+def pair_of(config: MissionConfig) -> str:
+    """A name for all that golden, faulty and protected flights of a pair share."""
+    text = canonical(changes_of(golden_of(config)))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,81 @@
+"""What a mission of a campaign came to, as the ledger keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.missions import PlannedMission
+
+
+class State(Enum):
+    """Whether a mission has a result."""
+
+    FLOWN = "flown"  # it ended, well or badly: `outcome` says how
+    ERROR = "error"  # it could not begin: no result, and counted nowhere
+
+
+class Injected(Enum):
+    """What became of the fault of a flown mission."""
+
+    GOLDEN = "golden"  # none was asked for
+    ACTIVE = "active"  # it struck, and what it struck was read afterwards
+    UNREAD = "unread"  # it struck, and nothing read it as long as it was followed
+    NOT_ACTIVATED = "not_activated"  # it struck what nothing read before it was overwritten
+    NOT_INJECTED = "not_injected"  # the mission ended, or the run parted, before the trigger
+    NULL = "null"  # everything but the flip, as was asked for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionResult:
+    """One row of the ledger.
+
+    Attributes:
+        number: of the mission, its place in the list.
+        result: its result.json, the same as of `mavfi fly`; of a mission that crashed or hung
+            before it could write one, what is known of it. Empty for an error.
+        injected: what became of its fault; None for an error.
+        reason: what the record says about the outcome, or why the mission could not begin.
+        wall_s: host seconds of the attempt that counts.
+        attempts: how often it was begun; more than once where something killed it from outside.
+        path: of the run folder that was kept, absolute; None where none was.
+    """
+
+    number: int
+    mission: PlannedMission
+    state: State
+    outcome: str | None
+    reason: str
+    result: Mapping[str, Any]
+    injected: Injected | None
+    wall_s: float
+    attempts: int
+    path: Path | None
+
+
+_WITHOUT_EFFECT = {
+    "overwritten": Injected.NOT_ACTIVATED,
+    "ended_before_read": Injected.NOT_ACTIVATED,
+    "not_read_in_window": Injected.UNREAD,
+}
+
+
+def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
+    """What became of the fault, from the record of the mission.
+
+    Args:
+        result: result.json.
+        asked: whether the mission was to have a fault.
+    """
+    fault = result.get("fault")
+    if not asked:
+        return Injected.GOLDEN
+    if fault is None or fault["state"] in ("planned", "not_injected"):
+        return Injected.NOT_INJECTED
+    if fault["state"] == "null":
+        return Injected.NULL
+    activation = fault.get("activation") or {}
+    return _WITHOUT_EFFECT.get(activation.get("activation", ""), Injected.ACTIVE)

@@ -1,0 +1,58 @@
+"""How far a campaign is, for whoever watches it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """A campaign at one moment of host time.
+
+    Attributes:
+        total: missions of the list.
+        before: of them over before this run began.
+        over: over now, those of before included.
+        running: in flight.
+        again: attempts that something outside ended, so that they were begun again.
+        elapsed_s: of this run, host time.
+        inside_s: of it within missions, summed over the slots.
+        outcomes: of the missions that this run flew.
+    """
+
+    total: int
+    before: int
+    over: int
+    running: int
+    again: int
+    elapsed_s: float
+    inside_s: float
+    outcomes: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def rate_per_h(self) -> float:
+        """Missions an hour of this run so far; 0 before the first is over."""
+        return 3600.0 * (self.over - self.before) / self.elapsed_s if self.elapsed_s > 0.0 else 0.0
+
+    @property
+    def eta_s(self) -> float | None:
+        """Time until the last mission is over at this rate; None before the first is."""
+        rate = self.rate_per_h
+        return 3600.0 * (self.total - self.over) / rate if rate > 0.0 else None
+
+    @property
+    def success_rate(self) -> float | None:
+        """Share of successes among the missions that this run flew; None before the first."""
+        flown = sum(self.outcomes.values())
+        return self.outcomes["success"] / flown if flown else None
+
+
+class Spectator:
+    """Watches a campaign. This one looks away."""
+
+    def on_progress(self, progress: Progress) -> None:
+        """A mission is over, or a second has passed."""
+
+    def on_note(self, text: str) -> None:
+        """Something that is worth a line."""

@@ -1,0 +1,273 @@
+"""Run a campaign on this machine: every mission of the list that has no result yet."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.keep import Keep, put_away
+from mavfi_cli.campaign.ledger import RUNS, Ledger
+from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
+from mavfi_cli.campaign.outcome import State, injected_of
+from mavfi_cli.campaign.progress import Progress, Spectator
+from mavfi_cli.campaign.slots import TASK, Ended, Slots
+from mavfi_cli.campaign.verdict import CampaignStopped, Verdict, judge
+from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
+from mavfi_cli.mission.replay import version_differences
+from mavfi_cli.mission.run import installed_versions, interruptible
+
+WORK, PROFILES = "work", "profiles"
+ATTEMPTS = 3  # so often a mission is begun that something outside ends
+LIMIT_S = 900.0  # wall time of one mission; the slowest takes some twenty seconds
+_GIVE_UP = 5  # so many missions that cannot begin, and none that can, end a campaign
+_LOOK_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """How missions are run; changes no result.
+
+    Attributes:
+        jobs: missions at the same time.
+        limit_s: wall time of one mission; one that takes longer hangs.
+        task: module that does the work.
+        errors: fly those again that could not begin.
+    """
+
+    jobs: int = 0  # as many as there are cores
+    keep: Keep = Keep.FAILURES
+    limit_s: float = LIMIT_S
+    task: str = TASK
+    errors: bool = False
+
+
+def run_campaign(
+    missions: Sequence[PlannedMission],
+    folder: Path,
+    options: Options | None = None,
+    spectator: Spectator | None = None,
+    *,
+    append: bool = False,
+) -> Ledger:
+    """Fly a list of missions into a folder; what is there already is not flown again.
+
+    Args:
+        missions: the list.
+        folder: of the campaign: ledger.sqlite, and runs/ with the run folders that are kept.
+        options: how to run them.
+        spectator: hears of progress.
+        append: missions that the folder does not know are added to its list.
+
+    Returns:
+        The ledger, open for reading; `results()` come in the order of the list.
+
+    Raises:
+        ConfigError: the folder holds another list, or another process works on it.
+        CampaignStopped: the machine keeps missions from being flown.
+        RecordError: the ledger cannot be written.
+        Interrupted: Ctrl-C; a second one kills the missions that are flying.
+    """
+    with Ledger(folder, writing=True) as ledger:
+        store_plan(ledger, missions, append=append)
+        fly_missing(ledger, options or Options(), spectator or Spectator())
+    return Ledger(folder)
+
+
+def store_plan(ledger: Ledger, missions: Sequence[PlannedMission], *, append: bool = False) -> None:
+    """Write the list down before anything flies, or compare it with the one that is there.
+
+    Raises:
+        ConfigError: it is another list; says the first difference.
+    """
+    require_versions(ledger)
+    stored = {row[1:]: row[0] for row in ledger.rows()}
+    if not stored:
+        ledger.plan(missions)
+        return
+    new = [mission for mission in missions if _row(mission) not in stored]
+    if not append and (new or len(missions) != len(stored)):
+        raise ConfigError(_difference(missions, new, len(stored)), path=ledger.folder)
+    if append:
+        ledger.plan(new)
+
+
+def _row(mission: PlannedMission) -> tuple[str, str, str]:
+    return canonical(dict(mission.labels)), mission.pair, canonical(changes_of(mission.config))
+
+
+def _difference(
+    missions: Sequence[PlannedMission], new: Sequence[PlannedMission], stored: int
+) -> str:
+    parts = [f"holds another campaign: {stored} missions, now there are {len(missions)}"]
+    if new:
+        labels, _, changes = _row(new[0])
+        parts.append(f"{len(new)} are not among them, the first is {labels} {changes}")
+    return "; ".join([*parts, "--append adds what is new, another folder starts anew"])
+
+
+def require_versions(ledger: Ledger) -> None:
+    """Have one campaign flown by one version of everything that results depend on.
+
+    Raises:
+        ConfigError: it was begun with others; names them.
+    """
+    versions = installed_versions()
+    stored = ledger.meta("versions")
+    if stored is None:
+        ledger.set_meta({"versions": canonical(versions)})
+    elif stored != canonical(versions):
+        differing = version_differences(json.loads(stored), versions)
+        raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
+
+
+def fly_missing(ledger: Ledger, options: Options, spectator: Spectator) -> None:
+    """Fly every mission without a result; see `run_campaign`."""
+    run = _Run(ledger, options, spectator)
+    with _prepared(ledger.folder), interruptible() as asked:
+        run.fly(asked)
+
+
+@contextlib.contextmanager
+def _prepared(folder: Path) -> Iterator[None]:
+    """A clean place for the attempts; what a killed run left in it is gone."""
+    work = folder / WORK
+    try:
+        shutil.rmtree(work, ignore_errors=True)
+        for path in (work, folder / PROFILES):
+            path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{work}: {error.strerror or error}") from None
+    try:
+        yield
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+class _Run:
+    """One go at what is missing."""
+
+    def __init__(self, ledger: Ledger, options: Options, spectator: Spectator) -> None:
+        self._ledger = ledger
+        self._options = options
+        self._spectator = spectator
+        self._folder = ledger.folder.absolute()
+        self._missing = ledger.missing(errors=options.errors)
+        self._again: list[tuple[int, dict[str, Any]]] = []
+        self._flying: dict[int, dict[str, Any]] = {}
+        self._attempts: Counter[int] = Counter()
+        self._given_up: dict[int, str] = {}
+        self._outcomes: Counter[str] = Counter()
+        self._errors = self._repeated = 0
+        self._inside_s = 0.0
+        self._total, self._before = ledger.planned(), ledger.over()
+        self._over = self._before
+        self._begun = time.monotonic()
+
+    def fly(self, asked: Sequence[int]) -> None:
+        """Until nothing is missing, or somebody asks to stop."""
+        jobs = self._options.jobs or len(os.sched_getaffinity(0))
+        with Slots(jobs, self._options.task) as slots:
+            while len(asked) < 2:
+                while slots.free and not asked and (order := self._next()) is not None:
+                    self._start(slots, *order)
+                if not self._flying:
+                    break
+                for ended in slots.wait(_LOOK_S):
+                    self._take(ended)
+                self._spectator.on_progress(self._progress())
+        if asked:
+            raise Interrupted("interrupted; run again to go on")
+        if self._given_up:
+            number, reason = next(iter(sorted(self._given_up.items())))
+            raise CampaignStopped(
+                f"{len(self._given_up)} missions were ended from outside {ATTEMPTS} times, the "
+                f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
+            )
+
+    def _next(self) -> tuple[int, dict[str, Any]] | None:
+        if self._again:
+            return self._again.pop()
+        entry = next(self._missing, None)
+        return None if entry is None else (entry[0], entry[2])
+
+    def _start(self, slots: Slots, number: int, changes: dict[str, Any]) -> None:
+        self._attempts[number] += 1
+        out = self._out(number)
+        try:
+            out.mkdir()
+            (out / ".profiles").symlink_to(self._folder / PROFILES)
+        except OSError as error:
+            raise RecordError(f"{out}: {error.strerror or error}") from None
+        slots.start(number, changes, str(out), self._options.limit_s)
+        self._flying[number] = changes
+
+    def _out(self, number: int) -> Path:
+        return self._folder / WORK / f"{number}-{self._attempts[number]}"
+
+    def _take(self, ended: Ended) -> None:
+        """Settle one attempt that is over."""
+        number = ended.number
+        changes = self._flying.pop(number)
+        self._inside_s += ended.wall_s
+        config = config_from(changes).to_dict()
+        out = self._out(number)
+        verdict = judge(ended, out, config, self._options.limit_s)
+        last = self._attempts[number] >= ATTEMPTS
+        if (verdict.state is None or verdict.doubtful) and not last:
+            self._repeated += 1
+            self._spectator.on_note(f"mission {number}: {verdict.reason}; begun again")
+            self._again.append((number, changes))
+        elif verdict.state is None:
+            self._given_up[number] = verdict.reason
+        else:
+            self._settle(ended, verdict, config)
+        shutil.rmtree(out, ignore_errors=True)
+
+    def _settle(self, ended: Ended, verdict: Verdict, config: Mapping[str, Any]) -> None:
+        """A mission is over: its run folder first, then its row."""
+        assert verdict.state is not None
+        number, result = ended.number, verdict.result
+        path = None
+        if verdict.run is not None and self._options.keep.wants(number, result.get("outcome")):
+            place = put_away(verdict.run, self._folder / RUNS, number)
+            path = str(place.relative_to(self._folder))
+        flown = verdict.state is State.FLOWN
+        asked = bool(config.get("fault") or config.get("instruction"))
+        self._ledger.add(
+            number,
+            state=verdict.state,
+            result=result,
+            reason=verdict.reason,
+            injected=injected_of(result, asked=asked) if flown else None,
+            wall_s=ended.wall_s,
+            attempts=self._attempts.pop(number),
+            path=path,
+        )
+        self._over += 1
+        if flown:
+            self._outcomes[str(result["outcome"])] += 1
+            return
+        self._errors += 1
+        self._spectator.on_note(f"mission {number} could not be flown: {verdict.reason}")
+        if self._errors >= _GIVE_UP and not self._outcomes:
+            raise CampaignStopped(f"no mission can be flown; the last: {verdict.reason}")
+
+    def _progress(self) -> Progress:
+        return Progress(
+            total=self._total,
+            before=self._before,
+            over=self._over,
+            running=len(self._flying),
+            again=self._repeated,
+            elapsed_s=time.monotonic() - self._begun,
+            inside_s=self._inside_s,
+            outcomes=self._outcomes,
+        )

@@ -1,0 +1,134 @@
+"""What the end of a mission's process means: a result, an error, or nothing that counts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.outcome import State
+from mavfi_cli.campaign.slot import ERRORS, SCRATCH
+from mavfi_cli.campaign.slots import Ended
+from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.types import Outcome
+from mavfi_cli.mission.run_folder import RunFolder
+
+FULL_BYTES = 16 << 20  # with less free space a disk counts as full
+# A fault can make a process kill itself by other signals than these; these come from outside.
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
+_OUTSIDE_WORDS = tuple(f"killed by {number.name}" for number in _FROM_OUTSIDE)
+# Errors that the machine can have made, so that another attempt may do better.
+_BY_CHANCE = ("VehicleProcessError", "LinkLost", "NoAutopilot", "TargetError")
+# Errors that every other mission would have too.
+_OF_THE_MACHINE = ("RecordError", "TracingForbidden", "BuildMismatch")
+
+
+class CampaignStopped(MavfiError):
+    """Something that is wrong with the machine, and not with one mission."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What an attempt came to.
+
+    Attributes:
+        state: None where it does not count: something outside ended it.
+        result: the mission's record; empty where there is none.
+        reason: in words.
+        run: the run folder that it left; None where it left none.
+        doubtful: there is a record, but something outside had a hand in it.
+    """
+
+    state: State | None
+    result: Mapping[str, Any]
+    reason: str
+    run: Path | None = None
+    doubtful: bool = False
+
+
+def judge(ended: Ended, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
+    """What the end of an attempt means.
+
+    Args:
+        ended: how it ended.
+        out: the folder that was its own.
+        config: of the mission, as records carry it.
+        limit_s: of wall time that it had.
+
+    Raises:
+        CampaignStopped: the machine keeps missions from being flown (a full disk ...).
+    """
+    report = ended.report or {}
+    if ended.exit == 0 and "folder" in report:
+        return _recorded(out / report["folder"], config)
+    _require_space(out)
+    if "error" in report:
+        return _refused(report["error"], report["text"])
+    if ended.timeout:
+        reason = f"no end within {limit_s:g} s of wall time"
+        return _cut_off(Outcome.HANG, reason, out, config)
+    if ended.signal is None and ended.exit is None:
+        return Verdict(state=None, result={}, reason="its slot was killed")
+    if ended.signal is not None:
+        name = signal.Signals(ended.signal).name
+        if ended.signal in _FROM_OUTSIDE:
+            return Verdict(state=None, result={}, reason=f"killed by {name}")
+        return _cut_off(Outcome.CRASH, f"the companion was killed by {name}", out, config)
+    if "traceback" in report:  # a defect of ours; who reads the ledger sees where
+        return Verdict(state=State.ERROR, result={}, reason=report["traceback"].rstrip())
+    return _cut_off(Outcome.CRASH, f"the companion ended with code {ended.exit}", out, config)
+
+
+def _require_space(out: Path) -> None:
+    if shutil.disk_usage(out if out.is_dir() else out.parent).free < FULL_BYTES:
+        raise CampaignStopped(f"{out.parent}: the disk is full; run again when there is room")
+
+
+def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
+    """A mission that wrote its record."""
+    try:
+        result = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RecordError(f"{run}: {error}") from None
+    outcome, reason = result["outcome"], result["reason"]
+    if outcome == Outcome.INTERRUPTED.value:
+        return Verdict(state=None, result={}, reason="interrupted")
+    crashes = [
+        crash["how"] for node in result.get("nodes", {}).values() for crash in node["crashes"]
+    ]
+    vehicle = outcome == Outcome.LINK_LOST.value and config.get("link") is None
+    doubts = [how for how in [*crashes, reason if vehicle else ""] if how.endswith(_OUTSIDE_WORDS)]
+    return Verdict(state=State.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts))
+
+
+def _refused(kind: str, text: str) -> Verdict:
+    """A mission that could not begin, or not write its record."""
+    if kind in _OF_THE_MACHINE:
+        raise CampaignStopped(text)
+    return Verdict(state=State.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
+
+
+def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]) -> Verdict:
+    """A mission whose process ended before its record: what is known of it."""
+    runs = [path for path in out.glob("[!.]*/") if path.name != SCRATCH]
+    run = runs[0] if len(runs) == 1 else None
+    fault = None
+    if run is not None and (written := RunFolder(run).fault).is_file():
+        fault = json.loads(written.read_text(encoding="utf-8"))
+    if run is not None and (errors := out / ERRORS).is_file() and errors.stat().st_size:
+        errors.replace(run / ERRORS)
+    asked = config.get("fault") or config.get("instruction")
+    result = {
+        "schema": 1,
+        "outcome": outcome.value,
+        "reason": reason,
+        "config": config,
+        "seeds": {"root": config["seed"], "fault": asked["seed"] if asked else None},
+        "quality_of_flight": {},
+        "fault": fault,
+    }
+    return Verdict(state=State.FLOWN, result=result, reason=reason, run=run)

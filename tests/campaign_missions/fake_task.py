@@ -1,0 +1,68 @@
+"""Missions without a flight: the world's name says what becomes of them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+from mavfi_cli.core.errors import RecordError, VehicleProcessError, WorldError
+from mavfi_cli.core.seeds import Stream, generator
+
+
+def prepare():
+    pass
+
+
+def perform(changes, out):
+    world, _, value = changes.get("world", "fly").partition(":")
+    seed = changes.get("seed", 3)
+    run = out / f"{world}-{seed}-001"
+    run.mkdir()
+    (run / "fault.json").write_text(json.dumps({"schema": 1, "state": "applied", "seed": seed}))
+    if world == "sleep":
+        time.sleep(float(value))
+    elif world == "orphan":  # a child in a session of its own, that outlives its parent
+        line = [sys.executable, "-c", "import time; time.sleep(600)"]
+        child = subprocess.Popen(line, start_new_session=True)
+        (out.parent.parent / "orphan.pid").write_text(str(child.pid))
+        os.kill(os.getpid(), signal.SIGSEGV)
+    elif world == "signal":
+        os.kill(os.getpid(), int(value))
+    elif world == "signal-once":
+        mark = out.parent.parent / f"been-{seed}"
+        if not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), int(value))
+    elif world == "exit":
+        os._exit(int(value))
+    elif world == "blocked":
+        raise WorldError("the start is blocked")
+    elif world == "full":
+        raise RecordError("result.json: No space left on device")
+    elif world == "vehicle":
+        raise VehicleProcessError("the vehicle process was killed by SIGKILL")
+    elif world == "defect":
+        raise ZeroDivisionError("a defect")
+    (run / "result.json").write_text(json.dumps(record(changes, seed, world, value)))
+    return run
+
+
+def record(changes, seed, world, value):
+    rng = generator(seed, Stream.MISSION)
+    outcome = value if world == "end" else "success"
+    return {
+        "schema": 1,
+        "outcome": outcome,
+        "reason": "the vehicle process was killed by SIGKILL" if outcome == "link_lost" else "",
+        "config": changes,
+        "nodes": {"octomap": {"crashes": [{"how": value}] if world == "node" else []}},
+        "quality_of_flight": {
+            "flight_time_s": 20.0 + float(rng.normal()),
+            "distance_m": 50.0 + float(rng.normal()),
+        },
+        "pilot": {"replans": int(rng.integers(5))},
+        "simulated_s": 30.0,
+        "fault": None,
+    }

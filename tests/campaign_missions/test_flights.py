@@ -1,0 +1,66 @@
+"""Real flights: a campaign's records are those of `mavfi fly`, faults of both levels included."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.run_folder import RunFolder
+
+pytestmark = pytest.mark.slow
+FAULT = FaultConfig(target="waypoint_position", at="time=1", together=True, field="mantissa")
+INSTRUCTION = InstructionConfig(target="control", seed=4)
+
+
+def record(folder):
+    result = json.loads(folder.result.read_text())
+    del result["host"]
+    return folder.trace.read_bytes(), folder.tlog.read_bytes(), result
+
+
+@pytest.fixture(scope="module")
+def flown(short_config, tmp_path_factory):
+    configs = [
+        short_config,
+        replace(short_config, fault=FAULT),
+        replace(short_config, instruction=INSTRUCTION),
+        replace(short_config, seed=6),
+    ]
+    folder = tmp_path_factory.mktemp("flown") / "campaign"
+    missions = [PlannedMission(config=config) for config in configs]
+    with run_campaign(missions, folder, Options(jobs=2, keep=Keep.ALL)) as ledger:
+        return list(ledger.results())
+
+
+@pytest.mark.parametrize(
+    ("number", "changes"),
+    [(0, {}), (1, {"fault": FAULT}), (2, {"instruction": INSTRUCTION}), (3, {"seed": 6})],
+)
+def test_records_are_identical_to_those_of_a_mission_by_itself(flown, fly_short, number, changes):
+    kept = RunFolder(flown[number].path)
+    assert record(kept) == record(fly_short(**changes))
+    assert flown[number].result == json.loads(kept.result.read_text())
+
+
+def test_a_pair_shares_everything_but_its_treatment(flown):
+    golden, source, instruction, other = (result.mission.pair for result in flown)
+    assert golden == source == instruction != other
+
+
+def test_what_became_of_the_faults(flown):
+    assert [result.injected for result in flown[:2]] == [Injected.GOLDEN, Injected.ACTIVE]
+    activation = flown[2].result["fault"]["activation"]["activation"]
+    expected = {"read": Injected.ACTIVE, "not_read_in_window": Injected.UNREAD}
+    assert flown[2].injected is expected.get(activation, Injected.NOT_ACTIVATED)
+
+
+def test_nothing_is_left_of_the_flights(flown):
+    campaign = flown[0].path.parents[1]
+    assert not (campaign / "work").exists()
+    assert not list(campaign.glob("runs/*/.*"))

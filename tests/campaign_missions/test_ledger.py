@@ -1,0 +1,164 @@
+"""The ledger: whole rows or none, one writer, and no other version's."""
+
+import contextlib
+import sqlite3
+
+import pytest
+from conftest import planned
+
+from mavfi_cli.campaign.ledger import LEDGER, Ledger
+from mavfi_cli.campaign.missions import (
+    PlannedMission,
+    changes_of,
+    config_from,
+    golden_of,
+    pair_of,
+)
+from mavfi_cli.campaign.outcome import Injected, State, injected_of
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+
+ROW = {
+    "state": State.FLOWN,
+    "result": {"outcome": "success", "quality_of_flight": {"flight_time_s": 20.0}},
+    "reason": "",
+    "injected": Injected.GOLDEN,
+    "wall_s": 1.0,
+    "attempts": 1,
+    "path": "runs/000000-farm",
+}
+CONFIGS = [
+    MissionConfig(),
+    MissionConfig(seed=9, start=(1.0, 2.0, 0.0), isolate=("octomap",)),
+    MissionConfig(fault=FaultConfig(target="waypoint_x", exact_bits=(1, 62), duration_s=2.0)),
+    MissionConfig(instruction=InstructionConfig(target="planner", sites=("general", "flags"))),
+]
+
+
+@contextlib.contextmanager
+def written(folder, count=3):
+    with Ledger(folder, writing=True) as ledger:
+        ledger.plan(planned(*["fly"] * count))
+        yield ledger
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_mission_comes_back_as_it_was(tmp_path, config):
+    mission = PlannedMission(config=config, labels={"bits": 3, "stage": None})
+    assert config_from(changes_of(config)) == config
+    with Ledger(tmp_path, writing=True) as ledger:
+        ledger.plan([mission])
+        ledger.add(0, **ROW)
+        (result,) = ledger.results()
+    assert result.mission == mission
+    assert result.result == ROW["result"]
+    assert result.path == tmp_path / "runs/000000-farm"
+
+
+@pytest.mark.parametrize("config", CONFIGS[2:])
+def test_a_pair_is_named_by_its_golden_flight(config):
+    assert pair_of(config) == pair_of(golden_of(config)) == pair_of(MissionConfig())
+    assert pair_of(MissionConfig(seed=4)) != pair_of(config)
+
+
+def test_what_has_no_row_is_missing(tmp_path):
+    with written(tmp_path, 2500) as ledger:
+        for number in (0, 3, 2400):
+            ledger.add(number, **ROW)
+        ledger.add(5, **{**ROW, "state": State.ERROR, "result": {}, "injected": None})
+        missing = [number for number, *_ in ledger.missing()]
+        assert missing == [n for n in range(2500) if n not in (0, 3, 5, 2400)]
+        assert [n for n, *_ in ledger.missing(errors=True)][2:5] == [4, 5, 6]
+        assert ledger.over() == 4
+        assert len(list(ledger.table())) == 3
+        assert ledger.counts() == [
+            (0, "error", None, None, 1),
+            (0, "flown", "success", "golden", 3),
+        ]
+
+
+def test_rows_added_while_the_missing_are_read_change_nothing(tmp_path):
+    with written(tmp_path, 10) as ledger:
+        seen = []
+        for number, *_ in ledger.missing():
+            ledger.add(number, **ROW)
+            seen.append(number)
+    assert seen == list(range(10))
+
+
+def test_it_is_read_while_it_is_written(tmp_path):
+    with written(tmp_path) as ledger, Ledger(tmp_path) as reader:
+        assert reader.over() == 0
+        ledger.add(1, **ROW)
+        assert reader.over() == 1
+
+
+def test_a_reader_changes_nothing(tmp_path):
+    with written(tmp_path):
+        pass
+    with Ledger(tmp_path) as reader, pytest.raises(RecordError, match="readonly"):
+        reader.add(0, **ROW)
+
+
+def test_a_full_disk_leaves_the_old_rows_and_half_of_none(tmp_path):
+    with written(tmp_path) as ledger:
+        ledger.add(0, **ROW)
+        pages = ledger._db.execute("PRAGMA page_count").fetchone()[0]
+        ledger._db.execute(f"PRAGMA max_page_count = {pages}")  # SQLite's own "disk is full"
+        noise = "".join(chr(33 + (i * i * 7919) % 90) for i in range(200_000))
+        with pytest.raises(RecordError, match="full"):
+            ledger.add(1, **{**ROW, "result": {"outcome": noise}})
+        ledger._db.execute("PRAGMA max_page_count = 1000000")
+        assert [result.number for result in ledger.results()] == [0]
+        ledger.add(1, **ROW)
+        assert [result.number for result in ledger.results()] == [0, 1]
+
+
+def test_another_version_is_refused(tmp_path):
+    with written(tmp_path) as ledger:
+        ledger.set_meta({"schema": "99"})
+    for writing in (False, True):
+        with pytest.raises(ConfigError, match="a ledger of version 99; this mavfi reads version 1"):
+            Ledger(tmp_path, writing=writing)
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "problem"),
+    [
+        (b"not a database" * 100, RecordError, "not a database"),
+        (None, RecordError, "no campaign there"),
+    ],
+)
+def test_what_is_no_ledger_is_refused(tmp_path, content, error, problem):
+    if content is not None:
+        (tmp_path / LEDGER).write_bytes(content)
+    with pytest.raises(error, match=problem):
+        Ledger(tmp_path)
+
+
+def test_a_database_of_somebody_else_is_refused(tmp_path):
+    with contextlib.closing(sqlite3.connect(tmp_path / LEDGER)) as other:
+        other.execute("CREATE TABLE songs (name TEXT)")
+        other.commit()
+    with pytest.raises(ConfigError, match="of no version"):
+        Ledger(tmp_path, writing=True)
+
+
+@pytest.mark.parametrize(
+    ("fault", "injected"),
+    [
+        (None, Injected.NOT_INJECTED),
+        ({"state": "planned"}, Injected.NOT_INJECTED),
+        ({"state": "not_injected", "activation": {"activation": "read"}}, Injected.NOT_INJECTED),
+        ({"state": "null"}, Injected.NULL),
+        ({"state": "applied"}, Injected.ACTIVE),
+        ({"state": "applied", "activation": {"activation": "read"}}, Injected.ACTIVE),
+        ({"state": "applied", "activation": {"activation": "overwritten"}}, Injected.NOT_ACTIVATED),
+        ({"state": "applied", "activation": {"activation": "not_read_in_window"}}, Injected.UNREAD),
+    ],
+)
+def test_what_became_of_a_fault(fault, injected):
+    assert injected_of({"fault": fault}, asked=True) is injected
+    assert injected_of({"fault": fault}, asked=False) is Injected.GOLDEN

@@ -1,0 +1,227 @@
+"""The runner: what becomes of missions that end well, badly, or are ended from outside."""
+
+import contextlib
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from conftest import planned
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.run import ATTEMPTS
+from mavfi_cli.campaign.verdict import CampaignStopped
+from mavfi_cli.core.errors import ConfigError, Interrupted
+
+
+def only(ledger):
+    with ledger:
+        (result,) = ledger.results()
+    return result
+
+
+def alive(pid):
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, 0)
+        return True
+    return False
+
+
+def test_results_come_in_the_order_of_the_list(campaign):
+    missions = planned("sleep:0.3", *["fly"] * 30)
+    with campaign.run(missions) as ledger:
+        results = list(ledger.results())
+    assert [result.number for result in results] == list(range(31))
+    assert [result.mission.config for result in results] == [m.config for m in missions]
+    assert [result.result["config"].get("seed", 3) for result in results] == list(range(31))
+    assert {result.outcome for result in results} == {"success"}
+    assert {result.injected for result in results} == {Injected.GOLDEN}
+    assert campaign.notes.last.over == 31
+    assert campaign.notes.last.outcomes == {"success": 31}
+
+
+def test_a_second_run_flies_nothing(campaign):
+    missions = planned("fly", "fly")
+    with campaign.run(missions) as ledger:
+        first = [(r.wall_s, r.attempts) for r in ledger.results()]
+    with campaign.run(missions) as ledger:
+        assert [(r.wall_s, r.attempts) for r in ledger.results()] == first
+
+
+@pytest.mark.parametrize(
+    ("world", "outcome", "reason"),
+    [
+        (f"signal:{int(signal.SIGSEGV)}", "crash", "the companion was killed by SIGSEGV"),
+        (f"signal:{int(signal.SIGABRT)}", "crash", "the companion was killed by SIGABRT"),
+        ("exit:3", "crash", "the companion ended with code 3"),
+        ("end:collision", "collision", ""),
+    ],
+)
+def test_a_mission_that_ends_badly_is_a_result(campaign, world, outcome, reason):
+    result = only(campaign.run(planned(world)))
+    assert (result.state, result.outcome, result.reason) == (State.FLOWN, outcome, reason)
+    assert result.attempts == 1
+
+
+def test_a_mission_without_an_end_hangs(campaign):
+    result = only(campaign.run(planned("sleep:600"), limit_s=3.0))
+    assert (result.outcome, result.reason) == ("hang", "no end within 3 s of wall time")
+    assert result.result["fault"] == {"schema": 1, "state": "applied", "seed": 0}
+
+
+def test_nothing_of_a_mission_is_left_when_it_is_over(campaign):
+    assert only(campaign.run(planned("orphan"))).outcome == "crash"
+    assert not alive(int((campaign.folder / "orphan.pid").read_text()))
+    assert not (campaign.folder / "work").exists()
+
+
+def test_a_mission_killed_from_outside_is_begun_again(campaign):
+    result = only(campaign.run(planned(f"signal-once:{int(signal.SIGKILL)}")))
+    assert (result.outcome, result.attempts) == ("success", 2)
+    assert campaign.notes.lines == ["mission 0: killed by SIGKILL; begun again"]
+
+
+def test_a_mission_killed_each_time_stays_missing(campaign):
+    with pytest.raises(CampaignStopped, match="1 missions were ended from outside 3 times"):
+        campaign.run(planned("fly", f"signal:{int(signal.SIGKILL)}"))
+    with Ledger(campaign.folder) as ledger:
+        assert [number for number, *_ in ledger.missing()] == [1]
+
+
+@pytest.mark.parametrize("world", ["end:link_lost", "node:killed by SIGKILL"])
+def test_a_record_that_something_outside_had_a_hand_in_is_doubted_first(campaign, world):
+    result = only(campaign.run(planned(world)))
+    assert (result.state, result.attempts) == (State.FLOWN, ATTEMPTS)
+
+
+@pytest.mark.parametrize(
+    ("world", "reason", "attempts"),
+    [
+        ("blocked", "the start is blocked", 1),
+        ("vehicle", "the vehicle process was killed by SIGKILL", ATTEMPTS),
+    ],
+)
+def test_a_mission_that_cannot_begin_has_no_outcome(campaign, world, reason, attempts):
+    result = only(campaign.run(planned(world)))
+    assert (result.state, result.outcome, result.reason) == (State.ERROR, None, reason)
+    assert result.injected is None
+    assert result.attempts == attempts
+
+
+def test_a_defect_is_an_error_with_its_traceback(campaign):
+    result = only(campaign.run(planned("defect")))
+    assert result.state is State.ERROR
+    assert result.reason.endswith("ZeroDivisionError: a defect")
+
+
+def test_errors_are_flown_again_when_asked_for(campaign):
+    missions = planned("blocked", "fly")
+    campaign.run(missions).close()
+    campaign.run(missions).close()
+    assert len(campaign.notes.lines) == 1
+    campaign.run(missions, errors=True).close()
+    assert len(campaign.notes.lines) == 2
+
+
+def test_no_mission_at_all_ends_the_campaign(campaign):
+    with pytest.raises(CampaignStopped, match=r"no mission can be flown; .* start is blocked"):
+        campaign.run(planned(*["blocked"] * 100))
+
+
+def test_a_full_disk_stops_the_campaign_and_costs_nothing(campaign):
+    missions = planned("fly", "fly", "full", "fly")
+    with pytest.raises(CampaignStopped, match="No space left"):
+        campaign.run(missions, jobs=1)
+    with Ledger(campaign.folder) as ledger:
+        assert [number for number, *_ in ledger.missing()] == [2, 3]
+
+
+@pytest.mark.parametrize(
+    ("keep", "kept"),
+    [
+        (Keep.NONE, []),
+        (Keep.FAILURES, ["000001-end-1"]),
+        (Keep.SAMPLED, ["000000-fly-0", "000001-end-1"]),
+        (Keep.ALL, ["000000-fly-0", "000001-end-1", "000002-fly-2"]),
+    ],
+)
+def test_run_folders_are_kept_by_policy(campaign, keep, kept):
+    with campaign.run(planned("fly", "end:collision", "fly"), keep=keep) as ledger:
+        paths = [result.path for result in ledger.results() if result.path is not None]
+    assert [path.name for path in paths] == kept
+    for path in paths:
+        assert json.loads((path / "result.json").read_text())["schema"] == 1
+    runs = campaign.folder / "runs"
+    assert (sorted(p.name for p in runs.iterdir()) if runs.is_dir() else []) == kept
+
+
+def test_the_folder_of_a_mission_that_was_cut_off_is_kept_with_its_last_words(campaign):
+    result = only(campaign.run(planned(f"signal:{int(signal.SIGSEGV)}"), keep=Keep.ALL))
+    assert result.path.name == "000000-cut-off"
+    assert "Segmentation fault" in (result.path / "stderr.txt").read_text()
+
+
+def test_another_list_is_refused_and_its_first_difference_shown(campaign):
+    campaign.run(planned("fly")).close()
+    with pytest.raises(ConfigError, match=r'1 missions, now there are 2; 1 are not.*"seed":1'):
+        campaign.run(planned("fly", "fly"))
+
+
+def test_append_adds_what_is_new(campaign):
+    campaign.run(planned("fly")).close()
+    with campaign.run(planned("fly", "end:crash"), append=True) as ledger:
+        assert [(r.number, r.outcome) for r in ledger.results()] == [(0, "success"), (1, "crash")]
+
+
+def test_only_one_process_runs_a_campaign(campaign):
+    with (
+        Ledger(campaign.folder, writing=True),
+        pytest.raises(ConfigError, match="another process runs this campaign"),
+    ):
+        campaign.run(planned("fly"))
+
+
+def interrupt(times, *, when):
+    """SIGINT for this process, so often, as soon as `when` holds."""
+
+    def work():
+        for _ in range(times):
+            while not when():
+                time.sleep(0.01)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread
+
+
+def test_ctrl_c_once_lets_missions_finish(campaign):
+    notes = campaign.notes
+    missions = planned("sleep:1.5", "sleep:1.5", "fly")
+    thread = interrupt(1, when=lambda: notes.last is not None and notes.last.running == 2)
+    with pytest.raises(Interrupted):
+        campaign.run(missions)
+    thread.join()
+    with Ledger(campaign.folder) as ledger:
+        assert [result.number for result in ledger.results()] == [0, 1]
+    with campaign.run(missions) as ledger:
+        assert [result.number for result in ledger.results()] == [0, 1, 2]
+
+
+def test_ctrl_c_twice_kills_them(campaign):
+    notes = campaign.notes
+    thread = interrupt(2, when=lambda: notes.last is not None and notes.last.running == 2)
+    begun = time.monotonic()
+    with pytest.raises(Interrupted):
+        campaign.run(planned("sleep:600", "sleep:600"))
+    assert time.monotonic() - begun < 60.0
+    thread.join()
+    with Ledger(campaign.folder) as ledger:
+        assert ledger.over() == 0
+    assert not Path(campaign.folder / "work").exists()
