@@ -64,6 +64,7 @@ def _float_type(name: str, mantissa: int, exponent: int) -> BitType:
 
 FLOAT64 = _float_type("float64", 52, 11)
 FLOAT32 = _float_type("float32", 23, 8)
+INT16 = BitType(name="int16", width=16, fields={Field.SIGN: range(15, 16), Field.ANY: range(16)})
 INT32 = BitType(name="int32", width=32, fields={Field.SIGN: range(31, 32), Field.ANY: range(32)})
 INT64 = BitType(name="int64", width=64, fields={Field.SIGN: range(63, 64), Field.ANY: range(64)})
 BOOL = BitType(name="bool", width=1, fields={Field.ANY: range(1)})
@@ -136,6 +137,7 @@ def _struct_coding(value_format: str, pattern_format: str) -> _Coding:
 _CODINGS = {
     FLOAT64.name: _struct_coding("<d", "<Q"),
     FLOAT32.name: _struct_coding("<f", "<I"),
+    INT16.name: _struct_coding("<h", "<H"),
     INT32.name: _struct_coding("<i", "<I"),
     INT64.name: _struct_coding("<q", "<Q"),
     BOOL.name: _Coding(int, bool),
@@ -169,6 +171,7 @@ def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
 NUMPY_TYPES: dict[str, BitType] = {
     "float64": FLOAT64,
     "float32": FLOAT32,
+    "int16": INT16,
     "int32": INT32,
     "int64": INT64,
     "bool": BOOL,

@@ -31,7 +31,7 @@ from mavfi_cli.core.types import (
 )
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.source.activation import Follower
-from mavfi_cli.fi.source.injector import Moment
+from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor

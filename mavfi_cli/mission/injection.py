@@ -10,7 +10,8 @@ from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
 from mavfi_cli.fi.source.activation import Follower
 from mavfi_cli.fi.source.fault import SourceFault
-from mavfi_cli.fi.source.injector import Moment, SourceInjector, Strike
+from mavfi_cli.fi.source.injector import SourceInjector, Strike
+from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.fault_config import FaultConfig
 
 M = TypeVar("M", CollisionReport, Trajectory, Command)

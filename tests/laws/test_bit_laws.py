@@ -9,7 +9,7 @@ from mavfi_cli.core.errors import BitOutsideWidth, FieldUnavailable
 from mavfi_cli.fi import bits as b
 from mavfi_cli.fi.bits import Field
 
-KINDS = [b.FLOAT64, b.FLOAT32, b.INT32, b.INT64, b.BOOL, *(b.raw(n) for n in (1, 2, 4, 8, 16, 64))]
+KINDS = [b.FLOAT64, b.FLOAT32, b.INT16, b.INT32, b.INT64, b.BOOL, *(b.raw(n) for n in (1, 2, 4, 8, 16, 64))]
 VALUES = {
     "float64": st.floats(),
     "float32": st.floats(width=32, allow_nan=False),
@@ -62,7 +62,7 @@ def test_fields_of_a_float_partition_its_bits(kind):
     assert (len(parts[0]), len(parts[1])) == (info.nmant, info.nexp)
 
 
-@given(st.sampled_from([b.FLOAT64, b.FLOAT32, b.INT32, b.INT64]), st.data())
+@given(st.sampled_from([b.FLOAT64, b.FLOAT32, b.INT16, b.INT32, b.INT64]), st.data())
 def test_patterns_are_numpys(kind, data):
     value = data.draw(VALUES[kind.name])
     array = np.array([value], dtype=kind.name)

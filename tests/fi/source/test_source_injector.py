@@ -12,7 +12,8 @@ from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field, pattern_of
 from mavfi_cli.fi.source.draw import GROUPS, draw_fault
 from mavfi_cli.fi.source.fault import Corruption, Effect, Persistence, Trigger, When
-from mavfi_cli.fi.source.injector import Moment, SourceInjector, Strike
+from mavfi_cli.fi.source.injector import SourceInjector, Strike
+from mavfi_cli.fi.source.schedule import Moment
 
 TRAJECTORY = Trajectory(
     stamp_s=0.0,

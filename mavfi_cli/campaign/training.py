@@ -1,0 +1,171 @@
+"""Training of detectors: error-free flights, the data set of their samples, the fitted models.
+
+The paper's training set (section VI): two obstacle densities times two obstacle sizes, 25 flights
+each, the world of every flight from a seed of its own.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.types import Outcome
+from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.dataset import Dataset, Flight
+from mavfi_cli.detect.fit import KINDS, fit
+from mavfi_cli.detect.model import Model
+from mavfi_cli.detect.offline import columns_of, flight_of
+from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.run_folder import load_run
+
+WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
+FLIGHTS = 25  # of each world
+FIRST_SEED = 10_000  # far from the seeds that people fly and evaluate with
+FLIGHTS_FOLDER, DATASET, LOSS = "flights", "dataset.parquet", "loss.svg"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingPlan:
+    """What is flown and fitted.
+
+    Attributes:
+        flights: of each world.
+        first_seed: seeds count up from here, over all worlds.
+        seed: of the split and of the first weights.
+        n_sigma: threshold of the Gaussian model; None takes its default.
+    """
+
+    worlds: tuple[str, ...] = WORLDS
+    flights: int = FLIGHTS
+    first_seed: int = FIRST_SEED
+    seed: int = 1
+    n_sigma: float | None = None
+    kinds: tuple[str, ...] = KINDS
+    base: MissionConfig = field(default_factory=MissionConfig)
+
+    def missions(self) -> list[PlannedMission]:
+        """The flights, world by world."""
+        return [
+            PlannedMission(
+                config=replace(
+                    self.base, world=world, seed=self.first_seed + place * self.flights + number
+                ),
+                labels={"world": world},
+            )
+            for place, world in enumerate(self.worlds)
+            for number in range(self.flights)
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trained:
+    """What came of it.
+
+    Attributes:
+        models: by detector, with the files that they were written to.
+        failed: flights that did not reach the goal, and so are no part of the data set.
+    """
+
+    dataset: Dataset
+    models: Mapping[str, tuple[Model, Path]]
+    failed: int
+
+
+def fly_training(
+    plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
+) -> tuple[Dataset, int]:
+    """Fly what is missing, and gather the samples of all flights that reached the goal.
+
+    Returns:
+        The data set, written to the folder as well, and how many flights are not in it.
+
+    Raises:
+        ModelError: no flight can be used.
+        ConfigError: the folder holds the flights of another plan.
+        RecordError: a file cannot be written.
+    """
+    missions = plan.missions()
+    ledger = run_campaign(
+        missions, folder / FLIGHTS_FOLDER, replace(options, keep=Keep.ALL), spectator
+    )
+    preprocess = PreprocessParams()
+    flights: list[Flight] = []
+    with ledger:
+        for entry in ledger.results():
+            config = missions[entry.number].config
+            if entry.outcome == Outcome.SUCCESS.value and entry.path is not None:
+                run = load_run(folder / FLIGHTS_FOLDER / entry.path)
+                assert run.trace is not None
+                columns = columns_of(run.trace)
+                flights.append(flight_of(columns, config.world, config.seed, preprocess))
+    if not flights:
+        raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
+    dataset = Dataset(flights=tuple(flights), preprocess=preprocess)
+    dataset.save(folder / DATASET)
+    return dataset, len(missions) - len(flights)
+
+
+def train(
+    plan: TrainingPlan,
+    folder: Path,
+    options: Options,
+    spectator: Spectator,
+    tell: Callable[[str], None],
+) -> Trained:
+    """Fly, gather, fit, and write the models with their provenance.
+
+    Args:
+        tell: hears what is done, a line each.
+
+    Raises:
+        ModelError: too few flights, or torch is missing.
+        ConfigError: the folder holds the flights of another plan.
+        RecordError: a file cannot be written.
+    """
+    dataset, failed = fly_training(plan, folder, options, spectator)
+    fitted = {}
+    for kind in plan.kinds:
+        tell(f"fitting {kind}")
+        fitted[kind] = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
+    models = {}
+    for kind, model in fitted.items():  # all of them, or none
+        path = folder / f"{kind}.json"
+        model_file.save(path, model)
+        models[kind] = (model, path)
+    if "aad" in fitted:
+        write_loss_curve(folder / LOSS, fitted["aad"].provenance["loss_curve"]["rows"])
+    return Trained(dataset=dataset, models=models, failed=failed)
+
+
+def write_loss_curve(path: Path, curve: Sequence[Sequence[float]]) -> None:
+    """Draw the autoencoder's training over its epochs, as SVG.
+
+    Args:
+        curve: rows of epoch, error on training and on validation flights.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    epochs, training, validation = zip(*curve, strict=True)
+    axes.plot(epochs, training, color="#1b4965", linewidth=1.4, label="training")
+    axes.plot(epochs, validation, color="#e4572e", linewidth=1.4, label="validation")
+    axes.set_yscale("log")
+    axes.set_xlabel("epoch")
+    axes.set_ylabel("mean squared error of scaled deltas")
+    axes.grid(visible=True, color="#edf0f4", linewidth=0.6)
+    axes.legend(frameon=False, fontsize=8)
+    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
+    write_atomically(path, lambda file: file.write(buffer.getvalue()))

@@ -1,0 +1,81 @@
+"""Progress of many missions on stderr: a live line on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import click
+
+from mavfi_cli.campaign.progress import Progress, Spectator
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+_PLAIN_EVERY_S = 10.0
+
+
+class _Plain(Spectator):
+    """A line every ten seconds, and one at the end."""
+
+    def __init__(self) -> None:
+        self._next_s = 0.0
+
+    def on_progress(self, progress: Progress) -> None:
+        if progress.elapsed_s >= self._next_s or progress.over == progress.total:
+            self._next_s = progress.elapsed_s + _PLAIN_EVERY_S
+            click.echo(progress_line(progress), err=True)
+
+    def on_note(self, text: str) -> None:
+        click.echo(text, err=True)
+
+
+class _Live(Spectator):
+    """One line that is rewritten, with notes scrolling above it."""
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+
+    def on_progress(self, progress: Progress) -> None:
+        self._live.update(progress_line(progress), refresh=True)
+
+    def on_note(self, text: str) -> None:
+        from rich.text import Text
+
+        self._live.console.print(Text(text))
+
+
+def progress_line(progress: Progress) -> str:
+    """How far it is: missions, rate, time left, success rate so far."""
+    parts = [f"{progress.over}/{progress.total} missions", f"{progress.rate_per_h:.0f} an hour"]
+    if progress.eta_s is not None and progress.over < progress.total:
+        parts.append(f"{_duration(progress.eta_s)} to go")
+    if progress.success_rate is not None:
+        parts.append(f"{100.0 * progress.success_rate:.1f} % success")
+    if progress.again:
+        parts.append(f"{progress.again} begun again")
+    return ", ".join(parts)
+
+
+def _duration(seconds: float) -> str:
+    minutes, left = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{left:02d} h" if hours else f"{minutes}:{left:02d} min"
+
+
+@contextmanager
+def missions_view(*, quiet: bool) -> Iterator[Spectator]:
+    """The spectator that suits stderr: none, plain lines, or a live line."""
+    if quiet:
+        yield Spectator()
+    elif not sys.stderr.isatty():
+        yield _Plain()
+    else:
+        from rich.console import Console
+        from rich.live import Live
+
+        console = Console(stderr=True)
+        with Live("starting", console=console, auto_refresh=False, transient=True) as live:
+            yield _Live(live)

@@ -1,0 +1,70 @@
+"""`mavfi train`: error-free flights, their data set, and the detectors' models."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
+              show_default=True, help="Where flights, data set and models go.")  # fmt: skip
+@click.option("--world", "worlds", multiple=True,
+              help="Where to fly; may be repeated  [the paper's four: two densities, two "
+                   "sizes].")  # fmt: skip
+@click.option("--flights", default=25, show_default=True, help="Of each world.")
+@click.option("--first-seed", default=10_000, show_default=True,
+              help="Of the flights; seeds count up from here.")  # fmt: skip
+@click.option("--kind", "kinds", multiple=True, help="gad, aad, range, l2  [all].")
+@click.option("--n-sigma", type=float, help="Threshold of the Gaussian model  [its default].")
+@click.option("--seed", default=1, show_default=True,
+              help="Of the split and of the autoencoder's first weights.")  # fmt: skip
+@click.option("--jobs", default=0, help="Missions at the same time  [one a core].")
+@click.option("--json", "as_json", is_flag=True, help="Print the models' provenance.")
+@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+def train(
+    out: Path,
+    worlds: tuple[str, ...],
+    flights: int,
+    first_seed: int,
+    kinds: tuple[str, ...],
+    n_sigma: float | None,
+    seed: int,
+    jobs: int,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Fly error-free missions and fit the detectors to them.
+
+    Interrupted, it goes on where it stopped when it is called again with the same folder. Fitting
+    the autoencoder needs torch: pip install 'mavfi[train]'.
+    """
+    from mavfi_cli.campaign.run import Options
+    from mavfi_cli.campaign.training import WORLDS, TrainingPlan
+    from mavfi_cli.campaign.training import train as run
+    from mavfi_cli.cli.missions_view import missions_view
+    from mavfi_cli.detect.fit import KINDS
+
+    plan = TrainingPlan(
+        worlds=worlds or WORLDS,
+        flights=flights,
+        first_seed=first_seed,
+        seed=seed,
+        n_sigma=n_sigma,
+        kinds=kinds or KINDS,
+    )
+    with missions_view(quiet=quiet) as view:
+        trained = run(plan, out, Options(jobs=jobs), view, view.on_note)
+    if as_json:
+        told = {kind: dict(model.provenance) for kind, (model, _) in trained.models.items()}
+        click.echo(json.dumps(told, indent=2))
+        return
+    samples = sum(len(flight.deltas) for flight in trained.dataset.flights)
+    click.echo(
+        f"Data set    {len(trained.dataset)} flights, {samples} samples"
+        + (f"; {trained.failed} flights failed and are left out" if trained.failed else "")
+    )
+    for kind, (model, path) in trained.models.items():
+        click.echo(f"{kind:<11} threshold {model.provenance['threshold']:.6g}  {path}")
