@@ -11,6 +11,7 @@ MavfiError                      one known error, one line, exit code 1
 │   ├── CommandRefused          the autopilot said no, in its own words
 │   └── LinkLost                the peer fell silent or closed the connection
 ├── VehicleProcessError         the simulated vehicle could not start or ended early
+├── ModelError                  a detector's model or data set that cannot be used or made
 ├── NodeCrashed                 a node of the companion died; the mission's outcome is `crash`
 ├── RecordError                 a run folder that cannot be written or read
 ├── FaultError                  a fault that cannot be described, placed or repeated
@@ -119,6 +120,13 @@ class LinkLost(LinkError):
 
 class VehicleProcessError(MavfiError):
     """The simulated vehicle could not start, or ended early."""
+
+
+class ModelError(MavfiError):
+    """A detector's model, or the data set to fit one, that cannot be used or made."""
+
+    def __init__(self, problem: str, *, path: Path | None = None) -> None:
+        super().__init__(problem if path is None else f"{path}: {problem}")
 
 
 class NodeCrashed(MavfiError):

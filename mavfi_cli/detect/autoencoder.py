@@ -1,0 +1,82 @@
+"""AAD: one autoencoder over all stages (paper, section V-D), run without torch.
+
+    13 inputs -> 6 tanh -> 3 tanh -> 13 linear outputs,    error = mean (out - in)^2.
+
+Deltas are divided by their scale on the way in, so the net sees and can put out numbers of either
+sign around 1. A score above the largest error of error-free runs is an alarm.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+from mavfi_cli.core.compiled import compiled
+from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.detect.fitted import FittedDetector, Shapes
+from mavfi_cli.detect.preprocess import COUNT, Codes
+
+HIDDEN, CODED = 6, 3
+WEIGHTS: Shapes = {
+    "hidden_weights": (HIDDEN, COUNT),
+    "hidden_biases": (HIDDEN,),
+    "coded_weights": (CODED, HIDDEN),
+    "coded_biases": (CODED,),
+    "output_weights": (COUNT, CODED),
+    "output_biases": (COUNT,),
+}
+
+# Places in the flat array.
+_SCALE = 1
+_W1 = _SCALE + COUNT
+_B1 = _W1 + HIDDEN * COUNT
+_W2 = _B1 + HIDDEN
+_B2 = _W2 + CODED * HIDDEN
+_W3 = _B2 + CODED
+_B3 = _W3 + COUNT * CODED
+_WORK = _B3 + COUNT
+
+
+class AutoencoderDetector(FittedDetector):
+    """Autoencoder-based anomaly detection.
+
+    Weights are (outputs, inputs).
+    """
+
+    name: ClassVar[str] = "aad"
+    per_stage = False
+    scratch: ClassVar[int] = COUNT + HIDDEN + CODED
+    shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,), **WEIGHTS}
+
+    def score(self, deltas: Codes, stage: Stage) -> float:
+        """Reconstruction error: mean square over the 13 scaled deltas."""
+        error: float = reconstruction_error(self._flat, deltas)
+        return error
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Nothing: the net is trained beforehand."""
+
+
+@compiled
+def reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
+    """Mean square of what the net fails to put out; from `_WORK` on is scratch."""
+    work = memory[_WORK:]
+    for place in range(COUNT):
+        work[place] = deltas[place] / memory[_SCALE + place]
+    for unit in range(HIDDEN):
+        total = memory[_B1 + unit]
+        for place in range(COUNT):
+            total += memory[_W1 + unit * COUNT + place] * work[place]
+        work[COUNT + unit] = math.tanh(total)
+    for unit in range(CODED):
+        total = memory[_B2 + unit]
+        for place in range(HIDDEN):
+            total += memory[_W2 + unit * HIDDEN + place] * work[COUNT + place]
+        work[COUNT + HIDDEN + unit] = math.tanh(total)
+    error = 0.0
+    for place in range(COUNT):
+        total = memory[_B3 + place]
+        for unit in range(CODED):
+            total += memory[_W3 + place * CODED + unit] * work[COUNT + HIDDEN + unit]
+        error += (total - work[place]) * (total - work[place])
+    return error / COUNT

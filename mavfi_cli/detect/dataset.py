@@ -1,0 +1,142 @@
+"""Samples as the gate sees them, grouped by flight: what models are fitted to.
+
+One row is one judged message: a collision report, or a control tick. Its deltas are those that a
+detector is shown; `new_waypoint` says whether the planning states had a new sample in that tick.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.detect.preprocess import COUNT, NAMES, Codes, PreprocessParams, states_digest
+
+SCHEMA = "1"
+_META = (b"mavfi_samples", b"mavfi_states", b"mavfi_preprocess")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flight:
+    """The samples of one error-free flight, oldest first."""
+
+    world: str
+    seed: int
+    stamps_s: FloatArray  # (n,)
+    reports: NDArray[np.bool_]  # (n,) a collision report, else a control tick
+    new_waypoint: NDArray[np.bool_]  # (n,)
+    deltas: Codes  # (n, COUNT)
+
+    def of_stage(self, stage: Stage) -> Codes:
+        """Deltas (m, COUNT) of the samples that bring something new of a stage."""
+        if stage is Stage.PERCEPTION:
+            return self.deltas[self.reports]
+        if stage is Stage.PLANNING:
+            return self.deltas[self.new_waypoint]
+        return self.deltas[~self.reports]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dataset:
+    """Flights, each of another world or seed."""
+
+    flights: tuple[Flight, ...]
+    preprocess: PreprocessParams
+
+    def __post_init__(self) -> None:
+        keys = [(flight.world, flight.seed) for flight in self.flights]
+        if len(set(keys)) != len(keys):
+            raise ModelError("a data set holds each flight (world and seed) once only")
+
+    def __len__(self) -> int:
+        return len(self.flights)
+
+    def save(self, path: Path) -> None:
+        """Write it as Parquet, atomically; equal data sets give equal bytes."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        flights = self.flights
+        lengths = [len(flight.stamps_s) for flight in flights]
+        columns: dict[str, pa.Array] = {
+            "world": pa.array(np.repeat([f.world for f in flights], lengths).tolist(), pa.string()),
+            "seed": pa.array(np.repeat([f.seed for f in flights], lengths), pa.int64()),
+            "stamp_s": pa.array(_joined([f.stamps_s for f in flights]), pa.float64()),
+            "report": pa.array(_joined([f.reports for f in flights]), pa.bool_()),
+            "new_waypoint": pa.array(_joined([f.new_waypoint for f in flights]), pa.bool_()),
+        }
+        deltas = np.concatenate([np.zeros((0, COUNT), np.int16), *(f.deltas for f in flights)])
+        for place, name in enumerate(NAMES):
+            columns[name] = pa.array(deltas[:, place], pa.int16())
+        table = pa.table(columns).replace_schema_metadata(
+            dict(zip(_META, self._signature(), strict=True))
+        )
+        write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
+
+    def _signature(self) -> tuple[bytes, ...]:
+        return SCHEMA.encode(), states_digest().encode(), self.preprocess.digest().encode()
+
+    @classmethod
+    def load(cls, path: Path, preprocess: PreprocessParams | None = None) -> Dataset:
+        """Read one back.
+
+        Args:
+            preprocess: what it must have been made with.
+
+        Raises:
+            ModelError: unreadable, no data set, or one of another table of states or
+                preprocessing.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        params = preprocess or PreprocessParams()
+        empty = cls(flights=(), preprocess=params)
+        try:
+            table = pq.read_table(path)
+        except (OSError, pa.ArrowException) as error:
+            raise ModelError(f"no readable data set: {_line(error)}", path=path) from None
+        metadata = table.schema.metadata or {}
+        found = tuple(metadata.get(key) for key in _META)
+        if found[0] is None:
+            raise ModelError("is no data set of mavfi", path=path)
+        if found != empty._signature():
+            raise ModelError(
+                "made for another version, table of states or preprocessing; fly it anew", path=path
+            )
+        return cls(flights=tuple(_flights(table)), preprocess=params)
+
+
+def _line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _joined(arrays: list[NDArray[np.generic]]) -> NDArray[np.generic]:
+    return np.concatenate(arrays) if arrays else np.zeros(0)
+
+
+def _flights(table: object) -> Iterable[Flight]:
+    columns = {name: table[name].to_numpy() for name in table.column_names}  # type: ignore[attr-defined,index]
+    worlds, seeds = columns["world"], columns["seed"]
+    rows = len(worlds)
+    if not rows:
+        return
+    changed = (worlds[1:] != worlds[:-1]) | (seeds[1:] != seeds[:-1])
+    edges = [0, *(np.flatnonzero(changed) + 1).tolist(), rows]
+    deltas = np.column_stack([columns[name] for name in NAMES]).astype(np.int16)
+    for start, end in itertools.pairwise(edges):
+        yield Flight(
+            world=str(worlds[start]),
+            seed=int(seeds[start]),
+            stamps_s=columns["stamp_s"][start:end],
+            reports=columns["report"][start:end].astype(np.bool_),
+            new_waypoint=columns["new_waypoint"][start:end].astype(np.bool_),
+            deltas=deltas[start:end],
+        )

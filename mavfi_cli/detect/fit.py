@@ -1,0 +1,216 @@
+"""Models from a data set of error-free flights.
+
+Flights are split by seed into three parts: `train` fits weights, means and scales, `validation`
+says when the autoencoder has learned enough, `threshold` sets the thresholds. No flight is in two.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.states import DType
+from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.detect import gaussian, span, train_autoencoder
+from mavfi_cli.detect.autoencoder import AutoencoderDetector
+from mavfi_cli.detect.base import Detector
+from mavfi_cli.detect.dataset import Dataset, Flight
+from mavfi_cli.detect.gaussian import GaussianDetector
+from mavfi_cli.detect.model import Model, checked_threshold
+from mavfi_cli.detect.norm import NormDetector
+from mavfi_cli.detect.preprocess import DETECTED, NAMES, Codes
+from mavfi_cli.detect.span import RangeDetector
+
+FLIGHTS_MIN = 10
+# Whose turn it is, over and over: of ten flights five train, one validates, four set thresholds.
+_TURNS = ("train", "threshold") * 4 + ("train", "validation")
+# Two reports can come between two ticks, so a sequence number may step by two.
+_LEAST_SCALE = np.array([2 if s.dtype is DType.INT32 else 1 for s in DETECTED])
+_X, _Y = ([NAMES.index(f"{prefix}{axis}") for prefix in ("waypoint_", "waypoint_v", "command_v")]
+          for axis in "xy")  # fmt: skip
+_YAW = [NAMES.index("waypoint_yaw"), NAMES.index("command_yaw")]
+KINDS = ("gad", "aad", "range", "l2")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Split:
+    """Places of the flights of a data set, by what they are for."""
+
+    train: tuple[int, ...]
+    validation: tuple[int, ...]
+    threshold: tuple[int, ...]
+
+
+def split(dataset: Dataset, seed: int) -> Split:
+    """Split by flight, alike in each world.
+
+    Raises:
+        ModelError: fewer than FLIGHTS_MIN flights.
+    """
+    if len(dataset) < FLIGHTS_MIN:
+        raise ModelError(f"{len(dataset)} flights are too few to fit to: {FLIGHTS_MIN} at least")
+    drawn = generator(seed, Stream.MISSION, "detector-split").permutation(len(dataset))
+    worlds = [dataset.flights[place].world for place in drawn]
+    ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
+    parts: dict[str, list[int]] = {"train": [], "validation": [], "threshold": []}
+    for number, place in enumerate(ordered):
+        parts[_TURNS[number % len(_TURNS)]].append(place)
+    return Split(**{name: tuple(sorted(places)) for name, places in parts.items()})
+
+
+def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = None) -> Model:
+    """Fit one kind of detector.
+
+    Args:
+        kind: gad, aad, range or l2.
+        seed: of the split and of the autoencoder's first weights.
+        n_sigma: threshold of the Gaussian model; None takes `gaussian.N_SIGMA`.
+
+    Raises:
+        ModelError: too few flights, an unknown kind, or torch is missing for aad.
+        ConfigError: n sigma out of range.
+    """
+    parts = split(dataset, seed)
+    flights = dataset.flights
+    train = [flights[place] for place in parts.train]
+    validation = [flights[place] for place in parts.validation]
+    held_out = [flights[place] for place in parts.threshold]
+    told: dict[str, Any] = {}
+    detector: Any
+    if kind == "gad":
+        n = gaussian.N_SIGMA if n_sigma is None else checked_threshold(n_sigma, "n sigma")
+        detector = warmed(GaussianDetector.cold(n), [*train, *validation])
+        told["largest_distance_sigma"] = _largest(detector, held_out)
+    elif kind == "range":
+        everything = mirrored(_all(list(flights)))
+        detector = RangeDetector(
+            {
+                "margin": np.array([span.MARGIN]),
+                "lowest": np.minimum(everything.min(axis=0), 0).astype(np.float64),
+                "highest": np.maximum(everything.max(axis=0), 0).astype(np.float64),
+            }
+        )
+    elif kind == "l2":
+        detector = NormDetector({"threshold": np.ones(1), "scale": scale_of(train)})
+        detector.memory["threshold"][0] = _largest(detector, held_out)
+    elif kind == "aad":
+        scale = scale_of(train)
+        trained = train_autoencoder.train(
+            mirrored(_all(train)) / scale, mirrored(_all(validation)) / scale, seed=seed
+        )
+        detector = AutoencoderDetector({"threshold": np.ones(1), "scale": scale, **trained.weights})
+        detector.memory["threshold"][0] = _largest(detector, held_out)
+        told.update(trained.told)
+    else:
+        raise ModelError(f"no way to fit a detector {kind!r}; known: {', '.join(KINDS)}")
+    arrays = {name: np.array(array) for name, array in detector.memory.items()}
+    return Model(
+        detector=kind,
+        arrays=arrays,
+        preprocess=dataset.preprocess,
+        provenance=_provenance(dataset, parts, seed, detector.threshold, told),
+    )
+
+
+def warmed(detector: GaussianDetector, flights: list[Flight]) -> GaussianDetector:
+    """The detector after it has learned from all samples of the flights."""
+    for flight in flights:
+        for stage in Stage:
+            for deltas in flight.of_stage(stage):
+                detector.learn(deltas, stage)
+    return detector
+
+
+def scale_of(flights: list[Flight]) -> FloatArray:
+    """Largest |delta| in each state's group (COUNT,), at least 1: inputs lie within about +-1.
+
+    The components of a vector share their scale: what one of them shows, another may.
+    """
+    rows = mirrored(_all(flights))
+    largest = np.maximum(np.abs(rows).max(axis=0), _LEAST_SCALE)
+    groups = np.array([state.group for state in DETECTED])
+    return np.array([largest[groups == group].max() for group in groups], np.float64)
+
+
+def mirrored(deltas: Codes) -> NDArray[np.int64]:
+    """All distinct rows (m, COUNT) of the deltas (n, COUNT) and of their mirror images.
+
+    The training worlds have their goals north-east of the start, but no direction is better than
+    another: east may be west, north may be south, and the two may be swapped. A mirrored velocity
+    or position has the negated code. Yaw is negated with north; under the other two its delta is
+    left as it is, an approximation.
+    """
+    rows = np.unique(deltas.astype(np.int64), axis=0)
+    images = []
+    for swapped in (False, True):
+        turned = rows.copy()
+        if swapped:
+            turned[:, _X], turned[:, _Y] = rows[:, _Y], rows[:, _X]
+        for east in (1, -1):
+            for north in (1, -1):
+                image = turned.copy()
+                image[:, _X] *= east
+                image[:, [*_Y, *_YAW]] *= north
+                images.append(image)
+    return np.unique(np.concatenate(images), axis=0)
+
+
+def scores(detector: Detector, flight: Flight) -> FloatArray:
+    """Score of every judged message (n,): the highest of the stages that it brings."""
+    found = np.zeros(len(flight.deltas))
+    for row, (deltas, report, new) in enumerate(
+        zip(flight.deltas, flight.reports.tolist(), flight.new_waypoint.tolist(), strict=True)
+    ):
+        if report:
+            found[row] = detector.score(deltas, Stage.PERCEPTION)
+        else:
+            found[row] = detector.score(deltas, Stage.CONTROL)
+            if new and detector.per_stage:
+                found[row] = max(found[row], detector.score(deltas, Stage.PLANNING))
+    return found
+
+
+def _all(flights: list[Flight]) -> Codes:
+    """Deltas (n, COUNT) of all samples of some flights."""
+    return np.concatenate([flight.deltas for flight in flights])
+
+
+def _largest(detector: Detector, flights: list[Flight]) -> float:
+    """Largest score of the flights; for one over all states also of their mirror images."""
+    if detector.per_stage:
+        return max(float(scores(detector, flight).max(initial=0.0)) for flight in flights)
+    rows = mirrored(_all(flights)).astype(np.int16)
+    return max(detector.score(deltas, Stage.CONTROL) for deltas in rows)
+
+
+def _provenance(
+    dataset: Dataset, parts: Split, seed: int, threshold: float, told: Mapping[str, Any]
+) -> dict[str, Any]:
+    def named(places: tuple[int, ...]) -> list[str]:
+        return [f"{dataset.flights[p].world}/{dataset.flights[p].seed}" for p in places]
+
+    return {
+        "flights": len(dataset),
+        "samples": sum(len(flight.deltas) for flight in dataset.flights),
+        "worlds": sorted({flight.world for flight in dataset.flights}),
+        "split": {
+            "train": named(parts.train),
+            "validation": named(parts.validation),
+            "threshold": named(parts.threshold),
+        },
+        "seed": seed,
+        "threshold": threshold,
+        "versions": {
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            **told.get("versions", {}),
+        },
+        **{name: value for name, value in told.items() if name != "versions"},
+    }

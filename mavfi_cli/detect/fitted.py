@@ -1,0 +1,69 @@
+"""What our own detectors share: they come from a model file, and remember in one flat array."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.detect import model as model_file
+
+Shapes = dict[str, tuple[int, ...]]
+
+
+class FittedDetector:
+    """A detector whose memory is one flat array, so that compiled code takes a single argument.
+
+    Attributes:
+        shapes: names and shapes of the pieces of the memory, in their order; the first one, a
+            single number, is the threshold.
+        scratch: numbers that compiled code wants for itself, after the pieces.
+    """
+
+    name: ClassVar[str]
+    shapes: ClassVar[Shapes]
+    scratch: ClassVar[int] = 0
+
+    def __init__(self, arrays: Mapping[str, FloatArray]) -> None:
+        pieces = [np.asarray(arrays[name], np.float64).ravel() for name in self.shapes]
+        self._flat: FloatArray = np.concatenate([*pieces, np.zeros(self.scratch)])
+        self._views()
+
+    def _views(self) -> None:
+        self._memory: dict[str, FloatArray] = {}
+        start = 0
+        for name, shape in self.shapes.items():
+            end = start + math.prod(shape)
+            self._memory[name] = self._flat[start:end].reshape(shape)
+            start = end
+
+    @property
+    def memory(self) -> Mapping[str, FloatArray]:
+        """Views of all that decides; a change takes effect with the next sample."""
+        return self._memory
+
+    @property
+    def threshold(self) -> float:
+        """A score above it is an alarm."""
+        threshold: float = self._flat.item(0)
+        return threshold
+
+    @classmethod
+    def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
+        """The detector of a model file; None takes the shipped one. See `base.Factory`."""
+        path = model_file.shipped(cls.name) if model is None else model
+        detector = cls(model_file.load(path, cls.name, cls.shapes).arrays)
+        if threshold is not None:
+            detector._flat[0] = model_file.checked_threshold(threshold)
+        return detector
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"flat": self._flat}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._flat = state["flat"]
+        self._views()

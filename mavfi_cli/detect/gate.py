@@ -1,0 +1,236 @@
+"""The gate: every message passes it before it takes effect, and the detector may raise an alarm.
+
+The gate knows messages and deltas, no clock and no mission. A message that raised an alarm is
+neither the next reference nor learned from: the caller withholds it and has the stage recompute.
+Where the caller lets it pass nevertheless, because recomputing confirmed it, it says so with
+`accept_report` or `accept_tick`: then the message becomes the reference.
+
+Per stage (`Detector.per_stage`) the alarm names the stage whose states were anomalous. A detector
+over all stages sees one vector: of a report on its arrival, and of each tick together with the
+report that arrived since the tick before. Its alarm always names control (paper, section V-D).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
+from mavfi_cli.detect.base import Detector
+from mavfi_cli.detect.preprocess import (
+    CODE,
+    COUNT,
+    DELTA,
+    NAMES,
+    PREVIOUS,
+    REFERENCE,
+    SPANS,
+    UNKNOWN,
+    Codes,
+    PreprocessParams,
+    plan_deltas,
+    take_report,
+    take_tick,
+    working_array,
+)
+
+_NO_WAYPOINTS = np.zeros((0, 10))
+ALL_STAGES = frozenset(Stage)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alarm:
+    """A message that looks wrong."""
+
+    stage: Stage  # that is to be recomputed
+    detector: str
+    score: float
+    threshold: float
+    states: tuple[str, ...]  # what looks wrong, worst first
+
+
+class Gate:
+    """One mission's gate.
+
+    Args:
+        detector: fresh, for this mission alone: it learns.
+        protect: the stages whose states are watched; others are as if they never changed.
+        params: how states become deltas; must be those the detector's model was made with.
+
+    Attributes:
+        fresh: stages of which the last judged message brought a new sample.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        protect: frozenset[Stage] = ALL_STAGES,
+        params: PreprocessParams | None = None,
+    ) -> None:
+        self.detector = detector
+        self.protect = protect
+        self.fresh: tuple[Stage, ...] = ()
+        self._per_stage = detector.per_stage
+        self._work = working_array(params or PreprocessParams())
+        self._deltas = self._work[DELTA]
+        self._trajectory: Trajectory | None = None  # last accepted waypoint
+        self._index = -1
+        self._judged: tuple[Trajectory | None, int] = (None, -1)
+        self._pending = False  # a report's deltas wait for the next tick
+        self._ignored = [slice(*SPANS[stage]) for stage in Stage if stage not in protect]
+
+    @property
+    def deltas(self) -> Codes:
+        """Copy of what the detector was shown last, (COUNT,)."""
+        deltas: Codes = self._deltas.copy()
+        return deltas
+
+    @property
+    def memory(self) -> Mapping[str, NDArray[Any]]:
+        """All that decides, the gate's own part included: a fault in there takes effect."""
+        return {"gate": self._work, **self.detector.memory}
+
+    def judge_report(self, report: CollisionReport) -> Alarm | None:
+        """Perception's message has arrived."""
+        take_report(report.time_to_collision_s, report.future_collision_seq, self._work)
+        self.fresh = (Stage.PERCEPTION,)
+        self._pending = False
+        if Stage.PERCEPTION not in self.protect:
+            self._deltas[:] = 0
+            return None
+        score, threshold = self.detector.score(self._deltas, Stage.PERCEPTION), self.threshold
+        if not score <= threshold:
+            self._reject(Stage.PERCEPTION)
+            return self._alarm(Stage.PERCEPTION, score, threshold, self._deltas)
+        self.detector.learn(self._deltas, Stage.PERCEPTION)
+        self._pending = not self._per_stage
+        return None
+
+    def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
+        """A plan was published: the steps between its waypoints. Changes nothing in the gate.
+
+        For detectors that judge each stage alone; one over all stages has nothing to say yet.
+        """
+        if not self._per_stage or Stage.PLANNING not in self.protect:
+            return None
+        steps = np.zeros((max(0, len(trajectory.waypoints) - 1), COUNT), np.int16)
+        plan_deltas(trajectory.waypoints, self._work, steps)
+        threshold = self.threshold
+        for deltas in steps:
+            score = self.detector.score(deltas, Stage.PLANNING)
+            if not score <= threshold:
+                return self._alarm(Stage.PLANNING, score, threshold, deltas)
+        return None
+
+    def judge_tick(
+        self, trajectory: Trajectory | None, index: int, command: Command
+    ) -> Alarm | None:
+        """The waypoint that is followed now, and the command about to go out.
+
+        A waypoint is a new sample where trajectory or index differ from the last accepted one's.
+        Where its stage raises an alarm, the command that came of it is not judged.
+        """
+        if trajectory is None or (trajectory is self._trajectory and index == self._index):
+            waypoints, row = _NO_WAYPOINTS, -1
+            self.fresh = (Stage.CONTROL,)
+        else:
+            waypoints, row = trajectory.waypoints, index
+            self.fresh = (Stage.PLANNING, Stage.CONTROL)
+        self._judged = (trajectory, index)
+        take_tick(
+            waypoints, row, command.velocity_enu_mps, command.yaw_rad, self._pending, self._work
+        )
+        self._pending = False
+        if self._ignored:
+            for span in self._ignored:
+                self._deltas[span] = 0
+        if self._per_stage:
+            return self._judge_stages(row >= 0)
+        score, threshold = self.detector.score(self._deltas, Stage.CONTROL), self.threshold
+        if not score <= threshold:
+            for stage in self.fresh:
+                self._reject(stage)
+            return self._alarm(Stage.CONTROL, score, threshold, self._deltas)
+        self.detector.learn(self._deltas, Stage.CONTROL)
+        if row >= 0:
+            self._trajectory, self._index = trajectory, index
+        return None
+
+    def _judge_stages(self, new_waypoint: bool) -> Alarm | None:
+        detector, threshold = self.detector, self.threshold
+        if new_waypoint:
+            if Stage.PLANNING in self.protect:
+                score = detector.score(self._deltas, Stage.PLANNING)
+                if not score <= threshold:
+                    self._reject(Stage.PLANNING)
+                    self._reject(Stage.CONTROL)
+                    return self._alarm(Stage.PLANNING, score, threshold, self._deltas)
+                detector.learn(self._deltas, Stage.PLANNING)
+            self._trajectory, self._index = self._judged
+        if Stage.CONTROL in self.protect:
+            score = detector.score(self._deltas, Stage.CONTROL)
+            if not score <= threshold:
+                self._reject(Stage.CONTROL)
+                return self._alarm(Stage.CONTROL, score, threshold, self._deltas)
+            detector.learn(self._deltas, Stage.CONTROL)
+        return None
+
+    def accept_report(self) -> None:
+        """The report judged last passes in spite of its alarm: it becomes the reference."""
+        self._confirm(Stage.PERCEPTION)
+
+    def accept_tick(self) -> None:
+        """The waypoint and command judged last pass in spite of an alarm."""
+        for stage in self.fresh:
+            if stage is not Stage.PERCEPTION:
+                self._confirm(stage)
+        if Stage.PLANNING in self.fresh:
+            self._trajectory, self._index = self._judged
+
+    def forget(self, stage: Stage) -> None:
+        """There is no last sample of that stage any more; the next one is taken unjudged."""
+        first, end = SPANS[stage]
+        self._work[REFERENCE, first:end] = UNKNOWN
+        if stage is Stage.PLANNING:
+            self._trajectory, self._index = None, -1
+
+    @property
+    def threshold(self) -> float:
+        """The detector's, as it is in its memory."""
+        return self.detector.threshold
+
+    def _reject(self, stage: Stage) -> None:
+        first, end = SPANS[stage]
+        self._work[REFERENCE, first:end] = self._work[PREVIOUS, first:end]
+
+    def _confirm(self, stage: Stage) -> None:
+        first, end = SPANS[stage]
+        self._work[REFERENCE, first:end] = self._work[CODE, first:end]
+
+    def _alarm(self, stage: Stage, score: float, threshold: float, deltas: Codes) -> Alarm:
+        blamed = self._blame(stage, threshold, deltas)
+        return Alarm(
+            stage=stage if self._per_stage else Stage.CONTROL,
+            detector=self.detector.name,
+            score=float(score),
+            threshold=float(threshold),
+            states=blamed,
+        )
+
+    def _blame(self, stage: Stage, threshold: float, deltas: Codes) -> tuple[str, ...]:
+        """States that are anomalous on their own, worst first; all that changed, if none is."""
+        first, end = SPANS[stage] if self._per_stage else (0, COUNT)
+        alone: list[tuple[float, int]] = []
+        for place in range(first, end):
+            if deltas[place]:
+                single = np.zeros_like(deltas)
+                single[place] = deltas[place]
+                score = self.detector.score(single, stage)
+                alone.append((score if score == score else np.inf, place))
+        alone.sort(key=lambda entry: (-entry[0], entry[1]))
+        above = [place for score, place in alone if score > threshold]
+        return tuple(NAMES[place] for place in above or [place for _, place in alone])

@@ -1,0 +1,98 @@
+"""GAD: one online Gaussian model a state; alarms are gathered per stage (paper, section V-C).
+
+Mean and sum of squares follow equations 1 and 2, with M_1 = x_1 and S_1 = 0:
+
+    M_k = M_{k-1} + (x_k - M_{k-1}) / k
+    S_k = S_{k-1} + (x_k - M_{k-1}) (x_k - M_k),        sigma = sqrt(S_k / (k - 1)).
+
+The score of a stage is the largest |x - M| / sigma of its states; the threshold is n. Codes are
+integers, and a state that hardly ever changes has a sigma next to nothing, so sigma counts as no
+less than `sigma_floor` of its stage. With fewer than two samples sigma is that floor.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+
+from mavfi_cli.core.compiled import compiled
+from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.detect.fitted import FittedDetector, Shapes
+from mavfi_cli.detect.preprocess import COUNT, Codes, span
+
+N_SIGMA = 5.0
+# In codes. Commands come 25 times as often as waypoints and change the less from one to the next.
+SIGMA_FLOORS = {Stage.PERCEPTION: 0.3, Stage.PLANNING: 0.3, Stage.CONTROL: 0.5}
+_FLOOR = 1  # places in the flat array
+_COUNT = _FLOOR + COUNT
+_MEAN = _COUNT + COUNT
+_SUM = _MEAN + COUNT
+
+
+class GaussianDetector(FittedDetector):
+    """Gaussian-based anomaly detection."""
+
+    name: ClassVar[str] = "gad"
+    per_stage = True
+    shapes: ClassVar[Shapes] = {
+        "n_sigma": (1,),
+        "sigma_floor": (COUNT,),
+        "count": (COUNT,),
+        "mean": (COUNT,),
+        "sum_of_squares": (COUNT,),
+    }
+
+    @classmethod
+    def cold(cls, n_sigma: float = N_SIGMA) -> GaussianDetector:
+        """One that has not seen any sample."""
+        arrays = {name: np.zeros(shape) for name, shape in cls.shapes.items()}
+        arrays["n_sigma"][0] = n_sigma
+        for stage, floor in SIGMA_FLOORS.items():
+            arrays["sigma_floor"][slice(*span(stage))] = floor
+        return cls(arrays)
+
+    def score(self, deltas: Codes, stage: Stage) -> float:
+        """Sigmas between the stage's most anomalous delta and its mean."""
+        first, end = span(stage)
+        distance: float = farthest(self._flat, deltas, first, end)
+        return distance
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Equations 1 and 2, for each state of the stage."""
+        first, end = span(stage)
+        welford(self._flat, deltas, first, end)
+
+
+@compiled
+def farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
+    """Largest distance from the mean in sigmas; NaN where a model is broken."""
+    worst = 0.0
+    for place in range(first, end):
+        count = memory[_COUNT + place]
+        sigma = memory[_FLOOR + place]
+        if not count < 2.0:
+            spread = math.sqrt(memory[_SUM + place] / (count - 1.0))
+            if not spread < sigma:
+                sigma = spread
+        distance = abs(deltas[place] - memory[_MEAN + place]) / sigma
+        if not distance <= worst:
+            worst = distance
+        if math.isnan(worst):
+            return worst
+    return worst
+
+
+@compiled
+def welford(memory: FloatArray, deltas: Codes, first: int, end: int) -> None:
+    """One sample more for each state from `first` to before `end`."""
+    for place in range(first, end):
+        value = float(deltas[place])
+        count = memory[_COUNT + place] + 1.0
+        mean = memory[_MEAN + place]
+        updated = value if count == 1.0 else mean + (value - mean) / count
+        if count > 1.0:
+            memory[_SUM + place] += (value - mean) * (value - updated)
+        memory[_COUNT + place] = count
+        memory[_MEAN + place] = updated

@@ -1,0 +1,37 @@
+"""Baseline `l2`: the norm of all deltas, each in units of its scale."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+from mavfi_cli.core.compiled import compiled
+from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.detect.fitted import FittedDetector, Shapes
+from mavfi_cli.detect.preprocess import COUNT, Codes
+
+
+class NormDetector(FittedDetector):
+    """The score is the root of the sum of squares of the scaled deltas."""
+
+    name: ClassVar[str] = "l2"
+    per_stage = False
+    shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,)}
+
+    def score(self, deltas: Codes, stage: Stage) -> float:
+        """Norm of the scaled deltas."""
+        length: float = norm(self._flat, deltas)
+        return length
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Nothing: the scales are fixed."""
+
+
+@compiled
+def norm(memory: FloatArray, deltas: Codes) -> float:
+    """Root of the sum of squares of the scaled deltas (COUNT,)."""
+    total = 0.0
+    for place in range(COUNT):
+        scaled = deltas[place] / memory[1 + place]
+        total += scaled * scaled
+    return math.sqrt(total)

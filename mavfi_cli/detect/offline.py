@@ -1,0 +1,236 @@
+"""A flight's trace once more through the gate: samples to fit to, and scores of a detector.
+
+A trace is a mapping of column names to arrays, one row a control tick: `stamp_s`, every monitored
+state by its name (NaN or masked while no message has carried it), and, where the trace has them,
+`report_stamp_s` and `waypoint_index`, from which a new message with old values can be told.
+Without them a message is new where one of its values is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.states import STATES, DType
+from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Trajectory
+from mavfi_cli.detect.base import Detector
+from mavfi_cli.detect.dataset import Flight
+from mavfi_cli.detect.gate import ALL_STAGES, Alarm, Gate
+from mavfi_cli.detect.preprocess import COUNT, NAMES, SPANS, Codes, PreprocessParams
+
+Columns = Mapping[str, NDArray[Any]]
+_WAYPOINT = [s.name for s in STATES if s.group.startswith("waypoint_") and s.unit != "s"]
+_REPORT = list(NAMES[slice(*SPANS[Stage.PERCEPTION])])
+_COMMAND = list(NAMES[slice(*SPANS[Stage.CONTROL])])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """What the gate said of one message."""
+
+    stamp_s: float
+    report: bool  # a collision report, else a control tick
+    new_waypoint: bool
+    deltas: Codes  # (COUNT,)
+    score: float  # the highest of the stages that were judged
+    alarm: Alarm | None
+
+
+class _Probe:
+    """Passes everything on to a detector, and remembers the highest score since the last look."""
+
+    def __init__(self, detector: Detector | None) -> None:
+        self.name = "none" if detector is None else detector.name
+        self.per_stage = detector is not None and detector.per_stage
+        self.highest = -np.inf
+        self._detector = detector
+
+    @property
+    def threshold(self) -> float:
+        return np.inf if self._detector is None else self._detector.threshold
+
+    @property
+    def memory(self) -> Mapping[str, NDArray[Any]]:
+        return {} if self._detector is None else self._detector.memory
+
+    def score(self, deltas: Codes, stage: Stage) -> float:
+        score = 0.0 if self._detector is None else self._detector.score(deltas, stage)
+        if not score <= self.highest:
+            self.highest = score
+        return score
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        if self._detector is not None:
+            self._detector.learn(deltas, stage)
+
+    def look(self) -> float:
+        highest, self.highest = self.highest, -np.inf
+        return highest
+
+
+def replay(
+    trace: Columns,
+    detector: Detector | None,
+    params: PreprocessParams | None = None,
+    *,
+    protect: frozenset[Stage] = ALL_STAGES,
+    patience: int = 0,
+) -> Iterator[Judgement]:
+    """Judge every message of a trace, in the order in which they came.
+
+    Nothing is recomputed: the messages are those that were flown.
+
+    Args:
+        detector: fresh; None only takes the deltas.
+        patience: alarms in a row, of one kind of message, that are obeyed; the message after
+            them is accepted. 0: every message becomes the reference, so that scores do not
+            depend on the threshold.
+
+    Raises:
+        ModelError: a column is missing.
+    """
+    messages = _Messages(trace)
+    probe = _Probe(detector)
+    gate = Gate(probe, protect, params)
+    in_a_row = {True: 0, False: 0}
+    for row, stamp_s in enumerate(messages.stamps_s.tolist()):
+        for is_report in (True, False):
+            if is_report:
+                report = messages.report(row)
+                if report is None:
+                    continue
+                alarm = gate.judge_report(report)
+            else:
+                command = messages.command(row)
+                if command is None:
+                    continue
+                alarm = gate.judge_tick(messages.waypoint(row), 0, command)
+            judged = Judgement(
+                stamp_s=stamp_s,
+                report=is_report,
+                new_waypoint=Stage.PLANNING in gate.fresh,
+                deltas=gate.deltas,
+                score=probe.look(),
+                alarm=alarm,
+            )
+            in_a_row[is_report] = in_a_row[is_report] + 1 if alarm is not None else 0
+            if in_a_row[is_report] > patience:
+                in_a_row[is_report] = 0
+                (gate.accept_report if is_report else gate.accept_tick)()
+            yield judged
+
+
+def flight_of(
+    trace: Columns, world: str, seed: int, params: PreprocessParams | None = None
+) -> Flight:
+    """The samples of one error-free flight, for a data set."""
+    judged = list(replay(trace, None, params))
+    return Flight(
+        world=world,
+        seed=seed,
+        stamps_s=np.array([each.stamp_s for each in judged], np.float64),
+        reports=np.array([each.report for each in judged], np.bool_),
+        new_waypoint=np.array([each.new_waypoint for each in judged], np.bool_),
+        deltas=np.array([each.deltas for each in judged], np.int16).reshape(-1, COUNT),
+    )
+
+
+class _Messages:
+    """The messages that the rows of a trace stand for."""
+
+    def __init__(self, trace: Columns) -> None:
+        names = ["stamp_s", *_REPORT, *_WAYPOINT, *_COMMAND]
+        missing = [name for name in names if name not in trace]
+        if missing:
+            raise ModelError(f"a trace without the column {missing[0]!r}")
+        self.stamps_s = _reals(trace["stamp_s"])
+        self._reports = np.column_stack([_reals(trace[name]) for name in _REPORT])
+        self._waypoints = np.column_stack([_reals(trace[name]) for name in _WAYPOINT])
+        self._commands = np.column_stack([_reals(trace[name]) for name in _COMMAND])
+        present = {
+            name: _present(trace[name]) for name in ("future_collision_seq", "waypoint_x",
+                                                     "command_yaw")
+        }  # fmt: skip
+        self._has_waypoint, self._has_command = present["waypoint_x"], present["command_yaw"]
+        self._new_report = present["future_collision_seq"] & _changes(
+            self._reports, trace, ("report_stamp_s",)
+        )
+        self._new_waypoint = self._has_waypoint & (
+            _changes(self._waypoints, trace, ("waypoint_index", "plan_trajectory_seq"))
+            | ~np.concatenate([[False], self._has_waypoint[:-1]])
+        )
+        self._trajectory: Trajectory | None = None
+
+    def report(self, row: int) -> CollisionReport | None:
+        """The report that took effect in this tick, if any did."""
+        if not self._new_report[row]:
+            return None
+        time_s, seq = self._reports[row].tolist()
+        return CollisionReport(
+            stamp_s=self.stamps_s[row],
+            collision=bool(np.isfinite(time_s)),
+            time_to_collision_s=time_s,
+            future_collision_seq=int(seq),
+        )
+
+    def waypoint(self, row: int) -> Trajectory | None:
+        """A trajectory of the present waypoint alone; the same object while it stays the same."""
+        if self._new_waypoint[row]:
+            self._trajectory = Trajectory(
+                stamp_s=self.stamps_s[row],
+                waypoints=self._waypoints[row : row + 1],
+                durations_s=np.ones(1),
+                trajectory_seq=0,
+                future_collision_seq=0,
+            )
+        return self._trajectory if self._has_waypoint[row] else None
+
+    def command(self, row: int) -> Command | None:
+        """The command of this tick."""
+        if not self._has_command[row]:
+            return None
+        return Command(
+            stamp_s=self.stamps_s[row],
+            velocity_enu_mps=self._commands[row, 0:3],
+            yaw_rad=float(self._commands[row, 3]),
+        )
+
+
+def _reals(column: NDArray[Any]) -> FloatArray:
+    filled: FloatArray = np.ma.filled(column.astype(np.float64), np.nan)
+    return filled
+
+
+def _present(column: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a message has carried the state: not masked, and for plain arrays not NaN."""
+    if isinstance(column, np.ma.MaskedArray):
+        return ~np.ma.getmaskarray(column)
+    return ~np.isnan(_reals(column))
+
+
+def _changes(values: FloatArray, trace: Columns, telling: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Rows (n,) whose values, or one of the telling columns, are not those of the row before."""
+    told = [_reals(trace[name]) for name in telling if name in trace]
+    patterns = np.column_stack([values, *told]).view(np.int64)  # NaN equals itself
+    changed = np.ones(len(patterns), np.bool_)
+    changed[1:] = (patterns[1:] != patterns[:-1]).any(axis=1)
+    return changed
+
+
+def columns_of(table: Any) -> dict[str, NDArray[Any]]:
+    """The columns of an Arrow table as masked arrays, so that a NaN is not taken for a null."""
+    columns: dict[str, NDArray[Any]] = {}
+    kinds = {state.name: state.dtype for state in STATES}
+    for name in table.column_names:
+        column = table[name].combine_chunks()
+        if str(column.type) == "string":
+            continue
+        fill = False if kinds.get(name) is DType.BOOL else 0
+        values = column.fill_null(fill).to_numpy(zero_copy_only=False)
+        columns[name] = np.ma.array(values, mask=column.is_null().to_numpy(zero_copy_only=False))
+    return columns

@@ -1,0 +1,102 @@
+"""Trains the autoencoder with torch, which only this module needs: `pip install mavfi[train]`.
+
+Adam on the mean squared reconstruction error of all distinct error-free vectors at once; the
+weights kept are those with the lowest validation loss. One thread, double precision, seeded: the
+same data and the same torch give the same weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.detect.autoencoder import CODED, HIDDEN
+from mavfi_cli.detect.preprocess import COUNT
+
+EPOCHS = 3000
+LEARNING_RATE = 0.01
+CURVE_EVERY = 20  # epochs between two points of the recorded loss curve
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trained:
+    """Weights as `autoencoder.WEIGHTS` names them, and what provenance tells of the training."""
+
+    weights: Mapping[str, FloatArray]
+    told: Mapping[str, Any]
+
+
+def train(
+    inputs: FloatArray, validation: FloatArray, *, seed: int, epochs: int = EPOCHS
+) -> Trained:
+    """Train on scaled vectors (n, 13), stop where those for validation (m, 13) are met best.
+
+    Raises:
+        ModelError: torch is not installed.
+    """
+    try:
+        import torch
+    except ImportError:
+        raise ModelError(
+            "training the autoencoder needs torch: pip install 'mavfi[train]'"
+        ) from None
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _train(torch, inputs, validation, seed, epochs)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(
+    torch: Any, inputs: FloatArray, validation: FloatArray, seed: int, epochs: int
+) -> Trained:
+    source = torch.Generator().manual_seed(seed)
+    sizes = ((COUNT, HIDDEN), (HIDDEN, CODED), (CODED, COUNT))
+    names = ("hidden", "coded", "output")
+    weights = {}
+    for name, (before, after) in zip(names, sizes, strict=True):
+        reach = (6.0 / (before + after)) ** 0.5  # Glorot, uniform
+        drawn = torch.rand((after, before), generator=source, dtype=torch.float64)
+        weights[f"{name}_weights"] = (reach * (2.0 * drawn - 1.0)).requires_grad_()
+        weights[f"{name}_biases"] = torch.zeros(after, dtype=torch.float64).requires_grad_()
+
+    def loss_of(rows: Any) -> Any:
+        hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
+        coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
+        output = coded @ weights["output_weights"].T + weights["output_biases"]
+        return ((output - rows) ** 2).mean()
+
+    rows, checked = torch.tensor(inputs), torch.tensor(validation)
+    optimiser = torch.optim.Adam(list(weights.values()), lr=LEARNING_RATE)
+    best, best_epoch, kept = np.inf, 0, {}
+    curve: list[list[float]] = []
+    for epoch in range(epochs + 1):
+        with torch.no_grad():
+            met = float(loss_of(checked))
+        if met < best:
+            best, best_epoch = met, epoch
+            kept = {name: w.detach().numpy().copy() for name, w in weights.items()}
+        loss = loss_of(rows)
+        if epoch % CURVE_EVERY == 0:
+            curve.append([epoch, float(loss.detach()), met])
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return Trained(
+        weights=kept,
+        told={
+            "epochs": epochs,
+            "learning_rate": LEARNING_RATE,
+            "best_epoch": best_epoch,
+            "validation_loss": best,
+            "distinct_vectors": {"train": len(inputs), "validation": len(validation)},
+            "loss_curve": {"columns": ["epoch", "train", "validation"], "rows": curve},
+            "versions": {"torch": str(torch.__version__)},
+        },
+    )

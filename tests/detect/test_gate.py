@@ -1,0 +1,201 @@
+import numpy as np
+import pytest
+
+from mavfi_cli.core.types import Stage
+from mavfi_cli.detect import registry
+from mavfi_cli.detect.gate import Gate
+from mavfi_cli.detect.preprocess import NAMES
+from detect_builders import command, plan, report
+
+HUGE = 1e200
+
+
+class Notes:
+    """A detector that writes down what it is asked, and alarms on any change beyond a limit."""
+
+    name = "notes"
+
+    def __init__(self, per_stage, limit=50):
+        self.per_stage = per_stage
+        self.threshold = float(limit)
+        self.memory = {}
+        self.scored, self.learned = [], []
+
+    def score(self, deltas, stage):
+        self.scored.append((stage, deltas.tolist()))
+        first, end = {Stage.PERCEPTION: (0, 2), Stage.PLANNING: (2, 9), Stage.CONTROL: (9, 13)}[
+            stage
+        ]
+        watched = deltas[first:end] if self.per_stage else deltas
+        return float(np.abs(watched.astype(int)).max())
+
+    def learn(self, deltas, stage):
+        self.learned.append((stage, deltas.tolist()))
+
+
+def corrupted(trajectory, index, column, value):
+    waypoints = trajectory.waypoints.copy()
+    waypoints[index, column] = value
+    return type(trajectory)(
+        stamp_s=0.0, waypoints=waypoints, durations_s=trajectory.durations_s, trajectory_seq=1,
+        future_collision_seq=0,
+    )  # fmt: skip
+
+
+def primed(per_stage=True, protect=frozenset(Stage)):
+    detector = Notes(per_stage)
+    gate = Gate(detector, protect)
+    trajectory = plan()
+    assert gate.judge_report(report()) is None
+    assert gate.judge_tick(trajectory, 0, command()) is None
+    detector.scored.clear()
+    detector.learned.clear()
+    return gate, detector, trajectory
+
+
+def test_a_waypoint_is_new_when_index_or_trajectory_change():
+    gate, detector, trajectory = primed()
+    gate.judge_tick(trajectory, 0, command())
+    assert gate.fresh == (Stage.CONTROL,)
+    gate.judge_tick(trajectory, 1, command())
+    assert gate.fresh == (Stage.PLANNING, Stage.CONTROL)
+    gate.judge_tick(plan(), 1, command())
+    assert gate.fresh == (Stage.PLANNING, Stage.CONTROL)
+    gate.judge_tick(None, -1, command())
+    assert gate.fresh == (Stage.CONTROL,)
+    assert [stage for stage, _ in detector.scored].count(Stage.PLANNING) == 2
+
+
+@pytest.mark.parametrize("per_stage", [True, False])
+def test_a_bad_waypoint_alarms_and_is_not_the_reference(per_stage):
+    gate, detector, trajectory = primed(per_stage)
+    bad = corrupted(trajectory, 1, 4, HUGE)
+    alarm = gate.judge_tick(bad, 1, command())
+    assert alarm is not None
+    assert alarm.stage is (Stage.PLANNING if per_stage else Stage.CONTROL)
+    assert (alarm.detector, alarm.states, alarm.threshold) == ("notes", ("waypoint_vx",), 50.0)
+    assert alarm.score > 50.0
+    assert detector.learned == []
+    # The same message again is still new, and still bad; the right one is right.
+    assert gate.judge_tick(bad, 1, command()) is not None
+    assert gate.judge_tick(trajectory, 1, command()) is None
+    assert len(detector.learned) == (2 if per_stage else 1)
+
+
+@pytest.mark.parametrize("per_stage", [True, False])
+def test_what_is_accepted_in_spite_of_an_alarm_becomes_the_reference(per_stage):
+    gate, detector, trajectory = primed(per_stage)
+    bad = corrupted(trajectory, 1, 4, HUGE)
+    assert gate.judge_tick(bad, 1, command(vx=HUGE)) is not None
+    gate.accept_tick()
+    assert detector.learned == []
+    assert gate.judge_tick(bad, 1, command(vx=HUGE)) is None
+    assert gate.fresh == (Stage.CONTROL,)
+    alarm = gate.judge_tick(trajectory, 2, command(vx=HUGE))
+    assert alarm is not None
+    assert alarm.states == ("waypoint_vx",)
+
+
+def test_a_bad_command_leaves_a_good_waypoint_accepted():
+    gate, detector, trajectory = primed()
+    alarm = gate.judge_tick(trajectory, 1, command(vy=HUGE))
+    assert alarm is not None
+    assert (alarm.stage, alarm.states) == (Stage.CONTROL, ("command_vy",))
+    assert [stage for stage, _ in detector.learned] == [Stage.PLANNING]
+    assert gate.judge_tick(trajectory, 1, command()) is None
+    assert gate.fresh == (Stage.CONTROL,)
+
+
+@pytest.mark.parametrize("per_stage", [True, False])
+def test_a_bad_report(per_stage):
+    gate, detector, _ = primed(per_stage)
+    alarm = gate.judge_report(report(seq=2**30))
+    assert alarm is not None
+    assert alarm.stage is (Stage.PERCEPTION if per_stage else Stage.CONTROL)
+    assert alarm.states == ("future_collision_seq",)
+    assert gate.judge_report(report(seq=1)) is None
+    assert gate.judge_report(report(seq=2**30)) is not None
+    gate.accept_report()
+    assert gate.judge_report(report(seq=2**30)) is None
+    assert len(detector.learned) == 2
+
+
+def test_a_detector_over_all_stages_sees_a_report_with_the_next_tick_only():
+    gate, detector, trajectory = primed(per_stage=False)
+    gate.judge_report(report(time_s=3.0, seq=1))
+    gate.judge_tick(trajectory, 1, command())
+    gate.judge_tick(trajectory, 1, command())
+    seen = [deltas[:2] for _, deltas in detector.scored]
+    assert seen == [[-3, 1], [-3, 1], [0, 0]]
+    # One that raised an alarm is not seen again, even when it is accepted.
+    detector.scored.clear()
+    gate.judge_report(report(seq=2**30))
+    gate.accept_report()
+    gate.judge_tick(trajectory, 1, command())
+    assert detector.scored[-1] == (Stage.CONTROL, [0] * 13)
+
+
+@pytest.mark.parametrize("per_stage", [True, False])
+@pytest.mark.parametrize("stage", list(Stage))
+def test_only_protected_stages_raise_alarms(per_stage, stage):
+    gate, _, trajectory = primed(per_stage, frozenset({stage}))
+    found = {
+        Stage.PERCEPTION: gate.judge_report(report(seq=2**30)),
+        Stage.CONTROL: gate.judge_tick(trajectory, 0, command(vx=HUGE)),
+        Stage.PLANNING: gate.judge_tick(corrupted(trajectory, 0, 0, HUGE), 0, command(vx=HUGE)),
+    }
+    if stage is Stage.CONTROL:  # the huge command is still anomalous in the next tick
+        assert found.pop(Stage.PLANNING) is not None
+    assert {where for where, alarm in found.items() if alarm is not None} == {stage}
+
+
+def test_a_fresh_plan_is_scanned_without_a_trace_in_the_gate():
+    gate, detector, trajectory = primed()
+    before = gate.memory["gate"].copy()
+    assert gate.judge_plan(trajectory) is None
+    alarm = gate.judge_plan(corrupted(trajectory, 7, 1, np.nan))
+    assert alarm is not None
+    assert (alarm.stage, alarm.states) == (Stage.PLANNING, ("waypoint_y",))
+    assert detector.learned == []
+    np.testing.assert_array_equal(gate.memory["gate"], before)
+    assert Gate(Notes(per_stage=False)).judge_plan(corrupted(trajectory, 7, 1, HUGE)) is None
+    unwatched = Gate(Notes(per_stage=True), frozenset({Stage.CONTROL}))
+    assert unwatched.judge_plan(corrupted(trajectory, 7, 1, HUGE)) is None
+
+
+def test_forgetting_takes_the_next_sample_unjudged():
+    gate, _, trajectory = primed()
+    gate.forget(Stage.CONTROL)
+    assert gate.judge_tick(trajectory, 0, command(vx=HUGE)) is None
+    assert gate.judge_tick(trajectory, 0, command()) is not None
+    gate.forget(Stage.PLANNING)
+    assert gate.judge_tick(corrupted(trajectory, 0, 0, HUGE), 0, command(vx=HUGE)) is None
+
+
+def test_a_nan_threshold_or_score_is_an_alarm():
+    gate, detector, trajectory = primed()
+    detector.threshold = float("nan")
+    assert gate.judge_tick(trajectory, 0, command()) is not None
+    detector.threshold = 50.0
+    detector.score = lambda deltas, stage: float("nan")
+    assert gate.judge_tick(trajectory, 0, command()) is not None
+
+
+def test_a_flip_in_the_gates_own_memory_takes_effect():
+    gate, _, trajectory = primed()
+    gate.memory["gate"][0, NAMES.index("command_vx")] ^= 1 << 12
+    alarm = gate.judge_tick(trajectory, 0, command())
+    assert alarm is not None
+    assert alarm.states == ("command_vx",)
+
+
+@pytest.mark.parametrize("name", ["gad", "aad", "l2", "range"])
+def test_shipped_detectors_pass_a_quiet_flight_and_catch_a_wild_command(name):
+    gate = Gate(registry.find(name))
+    trajectory = plan()
+    for tick in range(200):
+        assert gate.judge_tick(trajectory, tick // 25, command(vx=2.2 + 0.001 * tick)) is None
+    alarm = gate.judge_tick(trajectory, 8, command(vx=-1e80))
+    assert alarm is not None
+    assert alarm.stage is Stage.CONTROL
+    assert alarm.states[0] == "command_vx"
