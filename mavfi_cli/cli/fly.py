@@ -84,7 +84,8 @@ class _Size(click.ParamType[Any]):
               help="Land and disarm at the goal  [only with --link].")  # fmt: skip
 @click.option("--inject", metavar="STAGE|STATE|GROUP",
               help="Corrupt a state: perception, planning or control draws one of that stage; "
-                   "or name a state or group, as `mavfi states` lists them.")  # fmt: skip
+                   "or name a state or group, as `mavfi states` lists them; or detector, "
+                   "detector.threshold ...: what the detector itself keeps.")  # fmt: skip
 @click.option("--at", default="random", show_default=True,
               metavar="random|time=S|tick=N|phase=NAME|invocation=N",
               help="When the fault strikes, counted from the companion's taking over.")  # fmt: skip
@@ -211,7 +212,9 @@ def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConf
     exact = asked.pop("exact_bits") or None
     if level == "source":
         fault = FaultConfig(target=target, seed=seed, exact_bits=exact, **asked)
-        fault.draw()
+        fault.check()
+        if fault.attacks_detector and options["detector"] is None:
+            raise FaultSpecError("a fault in the detector needs one: --detector NAME")
         return fault, None
     instruction = InstructionConfig(
         target=target, seed=seed, field=asked["field"], bits=asked["bits"], **native

@@ -35,10 +35,10 @@ from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor
-from mavfi_cli.mission.injection import Injection, NoInjection
+from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels
 from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
-from mavfi_cli.mission.protection import NoProtection, Protection, Response
+from mavfi_cli.mission.protection import NoProtection, Response
 from mavfi_cli.mission.response import Reaction
 
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
@@ -72,13 +72,12 @@ class Companion:
         planner: Planner,
         briefing: Briefing,
         wall: WallClock,
-        injection: Injection | NoInjection,
+        injection: NoInjection,
+        protection: NoProtection,
     ) -> None:
         self._config = config
         self._injection = injection
-        self.protection = NoProtection()
-        if config.detector is not None:
-            self.protection = Protection(config.detector, wall)
+        self.protection = protection
         v_max, a_max = config.v_max_mps, config.a_max_mps2
         self.pilot = Pilot(
             PilotParams(
@@ -228,6 +227,7 @@ class Companion:
         if not self.sees:
             return None
         self._ticks += 1
+        self._injection.strike_memory(self._moment(stamp_s))
         if self.pilot.trajectory is not None:
             self._strike_latched(self.pilot.trajectory, stamp_s)
         self._state = state

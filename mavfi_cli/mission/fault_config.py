@@ -18,13 +18,16 @@ from mavfi_cli.fi.source.fault import (
     When,
 )
 
+DETECTOR = "detector"  # the target that is no state: what the detector keeps
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultConfig:
     """One source-level fault of a mission.
 
     Attributes:
-        target: a stage, a state, or a group of states.
+        target: a stage, a state, or a group of states; or `detector`, `detector.PART`: its own
+            memory, such as `detector.threshold`.
         seed: root of the fault's own random streams.
         at: "random", "time=SECONDS", "tick=N", "phase=NAME" or "invocation=N".
         together: strike all components of the group at once.
@@ -47,26 +50,51 @@ class FaultConfig:
         """Plain values, for the record of the run."""
         return asdict(self)
 
+    @property
+    def attacks_detector(self) -> bool:
+        """Whether the detector's own memory is hit, not a state between kernels."""
+        return self.target.partition(".")[0] == DETECTOR
+
+    @property
+    def detector_part(self) -> str | None:
+        """The array of the detector's memory that is hit; None draws one."""
+        return self.target.partition(".")[2] or None
+
+    def check(self) -> None:
+        """Say now what is wrong with it; raises as `draw`."""
+        if self.attacks_detector:  # its memory is known in the mission only
+            self.trigger()
+            self.corruption()
+        else:
+            self.draw()
+
+    def trigger(self) -> Trigger:
+        """When it strikes; raises as `parse_trigger`."""
+        return parse_trigger(self.at)
+
+    def corruption(self) -> Corruption:
+        """What is done to a value; raises UnknownName and FaultSpecError."""
+        return Corruption(
+            effect=_member(Effect, "effect", self.effect),
+            bits=self.bits,
+            field=_member(Field, "field", self.field),
+            persistence=_member(Persistence, "persistence", self.persistence),
+            duration_s=math.inf if self.duration_s is None else self.duration_s,
+            period_s=self.period_s,
+        )
+
     def draw(self) -> SourceFault:
-        """The fault, its site drawn.
+        """The fault in a state between kernels, its site drawn.
 
         Raises:
             UnknownName: a name that does not exist.
             FaultError: values that do not fit.
         """
-        duration_s = math.inf if self.duration_s is None else self.duration_s
         return draw_fault(
             self.target,
             seed=self.seed,
-            trigger=parse_trigger(self.at),
-            corruption=Corruption(
-                effect=_member(Effect, "effect", self.effect),
-                bits=self.bits,
-                field=_member(Field, "field", self.field),
-                persistence=_member(Persistence, "persistence", self.persistence),
-                duration_s=duration_s,
-                period_s=self.period_s,
-            ),
+            trigger=self.trigger(),
+            corruption=self.corruption(),
             together=self.together,
             bits=self.exact_bits,
         )

@@ -29,13 +29,14 @@ from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.events import EventLog
-from mavfi_cli.mission.injection import Injection, NoInjection
+from mavfi_cli.mission.injection import DetectorInjection, Injection, NoInjection
 from mavfi_cli.mission.instruction_injection import InstructionInjection
 from mavfi_cli.mission.instruction_plan import Recorder
 from mavfi_cli.mission.narrator import Narrator
 from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.protection import gate_of, protection_of
 from mavfi_cli.mission.trace import Trace
 
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
@@ -75,7 +76,7 @@ class Flight:
         self._on_clock = config.link is None
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
-        self.injection: Injection | NoInjection = NoInjection()
+        self.injection = NoInjection()
         self._narrator = Narrator(watcher)
         self.trace = Trace()
         self.wall = WallClock()
@@ -113,11 +114,20 @@ class Flight:
         """Tell where the goal is and how the camera is mounted; makes the companion ready."""
         require_flyable(briefing, self._config)
         self._briefing = briefing
-        fault = self._config.fault
-        if fault is not None:
-            self.injection = Injection(fault, self._shortest_flight_s(briefing))
+        fault, shortest_s = self._config.fault, self._shortest_flight_s(briefing)
+        protection = protection_of(self._config.detector, self.wall)
+        if fault is not None and fault.attacks_detector:
+            self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
+        elif fault is not None:
+            self.injection = Injection(fault, shortest_s)
         self.companion = Companion(
-            self._config, self._platform, self._planner, briefing, self.wall, self.injection
+            self._config,
+            self._platform,
+            self._planner,
+            briefing,
+            self.wall,
+            self.injection,
+            protection,
         )
 
     def record(self, recorder: Recorder) -> None:

@@ -8,9 +8,11 @@ from typing import Any, TypeVar
 
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
+from mavfi_cli.detect.gate import Gate
 from mavfi_cli.fi.source.activation import Follower
-from mavfi_cli.fi.source.fault import SourceFault
+from mavfi_cli.fi.source.fault import SourceFault, Trigger
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
+from mavfi_cli.fi.source.memory import MemoryInjector
 from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.fault_config import FaultConfig
 
@@ -36,6 +38,9 @@ class NoInjection:
         """The trajectory itself."""
         return trajectory
 
+    def strike_memory(self, moment: Moment) -> None:
+        """Nothing is attacked."""
+
     def begin(self, path: Path) -> None:
         """Nothing to record."""
 
@@ -48,42 +53,15 @@ class NoInjection:
         return None
 
 
-class Injection:
-    """One source-level fault in one mission.
+class _Recorded(NoInjection):
+    """The record of a fault: on the disk before the flight, at the first strike, at the end."""
 
-    Args:
-        config: as asked for.
-        shortest_flight_s: the time over which a random trigger is drawn.
-    """
-
-    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
+    def __init__(self, config: FaultConfig) -> None:
         self._config = config
-        self._fault: SourceFault = config.draw()
-        self._injector = SourceInjector(
-            self._fault,
-            seed=config.seed,
-            shortest_flight_s=shortest_flight_s,
-            listener=self._on_strike,
-        )
         self._path: Path | None = None
         self._state = "planned"
         self._news: list[str] = []
         self._strike: Strike | None = None
-        self.follower = Follower()
-
-    def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
-        """A message as its receiver gets it."""
-        return self._followed(message, self._injector.pass_on(message, moment, index))
-
-    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """The trajectory that is being flown, as it is from this tick on."""
-        struck = self._injector.strike_latched(trajectory, moment, index)
-        return self._followed(trajectory, struck)
-
-    def _followed(self, message: M, sent: M) -> M:
-        if sent is not message and self._strike is not None:
-            self.follower.struck(sent, self._strike)
-        return sent
 
     def begin(self, path: Path) -> None:
         """Write down what is going to happen, before the flight."""
@@ -114,7 +92,6 @@ class Injection:
 
     def record(self) -> dict[str, Any]:
         """What was asked for, what was drawn, what was hit."""
-        fault = self._fault
         reason = "the mission ended before the trigger" if self._state == "not_injected" else ""
         return {
             "schema": SCHEMA,
@@ -122,20 +99,117 @@ class Injection:
             "state": self._state,
             "reason": reason,
             "request": self._config.to_dict(),
+        }
+
+
+class Injection(_Recorded):
+    """One source-level fault in one mission.
+
+    Args:
+        config: as asked for.
+        shortest_flight_s: the time over which a random trigger is drawn.
+    """
+
+    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
+        super().__init__(config)
+        self._fault: SourceFault = config.draw()
+        self._injector = SourceInjector(
+            self._fault,
+            seed=config.seed,
+            shortest_flight_s=shortest_flight_s,
+            listener=self._on_strike,
+        )
+        self.follower: Follower = Follower()
+
+    def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
+        """A message as its receiver gets it."""
+        return self._followed(message, self._injector.pass_on(message, moment, index))
+
+    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
+        """The trajectory that is being flown, as it is from this tick on."""
+        struck = self._injector.strike_latched(trajectory, moment, index)
+        return self._followed(trajectory, struck)
+
+    def _followed(self, message: M, sent: M) -> M:
+        if sent is not message and self._strike is not None:
+            self.follower.struck(sent, self._strike)
+        return sent
+
+    def record(self) -> dict[str, Any]:
+        """What was asked for, what was drawn, what was hit."""
+        fault, reader = self._fault, self.follower.reader
+        return {
+            **super().record(),
             "stage": fault.states[0].stage.value,
             "states": [state.name for state in fault.states],
             "units": [state.unit for state in fault.states],
-            "trigger": {
-                "when": fault.trigger.when.value,
-                "number": fault.trigger.number,
-                "phase": fault.trigger.phase,
-                "drawn_time_s": self._injector.drawn_time_s,
-            },
+            "trigger": trigger_record(fault.trigger, self._injector.drawn_time_s),
             "strikes": [asdict(strike) for strike in self._injector.strikes],
             "strike_count": self._injector.count,
             "activation": self.follower.activation.value,
-            "first_reader": asdict(self.follower.reader) if self.follower.reader else None,
+            "first_reader": asdict(reader) if reader else None,
         }
+
+
+class DetectorInjection(_Recorded):
+    """One fault in the memory of the detector that should catch faults.
+
+    The detector reads all of its memory at its next check, so every strike is read.
+
+    Args:
+        config: as asked for; its target is `detector` or `detector.PART`.
+        shortest_flight_s: the time over which a random trigger is drawn.
+        gate: whose memory is attacked.
+    """
+
+    def __init__(self, config: FaultConfig, shortest_flight_s: float, gate: Gate) -> None:
+        super().__init__(config)
+        self._trigger = config.trigger()
+        self._injector = MemoryInjector(
+            gate.memory,
+            config.detector_part,
+            trigger=self._trigger,
+            corruption=config.corruption(),
+            bits=config.exact_bits,
+            seed=config.seed,
+            shortest_flight_s=shortest_flight_s,
+            listener=self._on_strike,
+        )
+
+    def strike_memory(self, moment: Moment) -> None:
+        """Act on the detector's memory if the moment has come."""
+        self._injector.strike(moment)
+
+    def record(self) -> dict[str, Any]:
+        """What was asked for, what was drawn, what was hit."""
+        applied = self._state == "applied"
+        return {
+            **super().record(),
+            "stage": "detector",
+            "states": [self._injector.array],
+            "units": ["1"],
+            "trigger": trigger_record(self._trigger, self._injector.drawn_time_s),
+            "strikes": [asdict(strike) for strike in self._injector.strikes],
+            "strike_count": self._injector.count,
+            "activation": "read" if applied else "not_injected",
+            "first_reader": {
+                "name": "detector",
+                "stamp_s": self._injector.strikes[0].stamp_s,
+                "state": self._injector.array,
+            }
+            if applied
+            else None,
+        }
+
+
+def trigger_record(trigger: Trigger, drawn_time_s: float) -> dict[str, Any]:
+    """A trigger as plain values."""
+    return {
+        "when": trigger.when.value,
+        "number": trigger.number,
+        "phase": trigger.phase,
+        "drawn_time_s": drawn_time_s,
+    }
 
 
 def strike_text(strike: Strike) -> str:

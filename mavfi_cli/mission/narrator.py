@@ -9,7 +9,7 @@ from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.events import EventLog
-from mavfi_cli.mission.injection import Injection, NoInjection
+from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.progress import Progress, Watcher
 
 PROGRESS_EVERY_S = 1.0
@@ -41,7 +41,7 @@ class Narrator:
         stamp_s: float,
         session: OffboardSession,
         companion: Companion | None,
-        injection: Injection | NoInjection,
+        injection: NoInjection,
     ) -> None:
         """Note what is new at a tick; once a simulated second, show progress."""
         state = session.state
@@ -55,7 +55,7 @@ class Narrator:
         self,
         session: OffboardSession,
         companion: Companion | None,
-        injection: Injection | NoInjection,
+        injection: NoInjection,
     ) -> list[tuple[str, str]]:
         """Kind and text of what happened since the last tick."""
         news: list[tuple[str, str]] = []

@@ -20,6 +20,7 @@ from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.kernel_scope import kernel_of_node, kernel_scope
 from mavfi_cli.mission.node_process import receive, send, serve
 from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.protection import NoProtection
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +48,7 @@ def main() -> None:
         setup.briefing,
         WallClock(),
         NoInjection(),
+        NoProtection(),
     )
     send(connection, kernel_scope(kernel_of_node(setup.node, config.planner)))
     serve(connection, {setup.node: companion.executor.nodes[setup.node].run})

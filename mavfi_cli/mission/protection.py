@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
 
+from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
@@ -212,3 +213,19 @@ class Protection(NoProtection):
                 for stage, entry in self._recoveries.items()
             },
         }
+
+
+def protection_of(config: DetectorConfig | None, wall: WallClock) -> NoProtection:
+    """The protection that a mission asks for; the null object where it asks for none."""
+    return NoProtection() if config is None else Protection(config, wall)
+
+
+def gate_of(protection: NoProtection) -> Gate:
+    """The gate of a protection, to attack it.
+
+    Raises:
+        FaultSpecError: there is none.
+    """
+    if protection.gate is None:
+        raise FaultSpecError("a fault in the detector needs one: --detector NAME")
+    return protection.gate

@@ -9,7 +9,15 @@ from mavfi_cli.core.errors import BitOutsideWidth, FieldUnavailable
 from mavfi_cli.fi import bits as b
 from mavfi_cli.fi.bits import Field
 
-KINDS = [b.FLOAT64, b.FLOAT32, b.INT16, b.INT32, b.INT64, b.BOOL, *(b.raw(n) for n in (1, 2, 4, 8, 16, 64))]
+KINDS = [
+    b.FLOAT64,
+    b.FLOAT32,
+    b.INT16,
+    b.INT32,
+    b.INT64,
+    b.BOOL,
+    *(b.raw(n) for n in (1, 2, 4, 8, 16, 64)),
+]
 VALUES = {
     "float64": st.floats(),
     "float32": st.floats(width=32, allow_nan=False),
