@@ -7,14 +7,18 @@ what comes after it passes, because so many computations agree.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
 
+import numpy as np
+
 from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.detect.registry import find
 from mavfi_cli.mission.detector_config import DetectorConfig
@@ -94,8 +98,8 @@ class Protection(NoProtection):
         self._config = config
         self._wall = wall
         stages = frozenset(Stage(name) for name in config.protect)
-        detector = find(config.name, model=config.model_path, threshold=config.threshold)
-        self.gate: Gate = Gate(detector, stages)
+        _warm_up(Gate(self._detector()))
+        self.gate: Gate = Gate(self._detector(), stages)
         self._threshold = self.gate.threshold
         self._checks = dict.fromkeys(("report", "plan", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
@@ -103,6 +107,11 @@ class Protection(NoProtection):
         self._alarms: list[AlarmRecord] = []
         self._news: list[str] = []
         self._told_s: dict[Stage, float] = {}
+
+    def _detector(self) -> Detector:
+        """A fresh one."""
+        config = self._config
+        return find(config.name, model=config.model_path, threshold=config.threshold)
 
     def report(self, report: CollisionReport, stamp_s: float) -> Response:
         """Judge perception's message on its arrival."""
@@ -213,6 +222,25 @@ class Protection(NoProtection):
                 for stage, entry in self._recoveries.items()
             },
         }
+
+
+def _warm_up(gate: Gate) -> None:
+    """Have everything loaded and compiled before the flight; the gate is of no use afterwards."""
+    report = CollisionReport(
+        stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
+    )
+    plan = Trajectory(
+        stamp_s=0.0,
+        waypoints=np.zeros((2, 10)),
+        durations_s=np.ones(2),
+        trajectory_seq=1,
+        future_collision_seq=0,
+    )
+    command = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
+    for _ in range(2):
+        gate.judge_report(report)
+        gate.judge_plan(plan)
+        gate.judge_tick(plan, 0, command)
 
 
 def protection_of(config: DetectorConfig | None, wall: WallClock) -> NoProtection:

@@ -1,0 +1,200 @@
+"""The gate in a mission: what is withheld, what is computed again, when it ends, what is told."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mavfi_cli.core.errors import ConfigError, FaultSpecError, UnknownName
+from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
+from mavfi_cli.core.wall import WallClock
+from mavfi_cli.detect.preprocess import SPANS
+from mavfi_cli.mission import protection as protection_module
+from mavfi_cli.mission.detector_config import DetectorConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.protection import Protection, Response
+from mavfi_cli.mission.replay import config_of, differing_results, same_file
+from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
+
+LIMIT = 8.0
+TRAJECTORY = Trajectory(
+    stamp_s=0.0, waypoints=np.full((6, 10), 1.5), durations_s=np.full(6, 0.5), trajectory_seq=1,
+    future_collision_seq=0,
+)  # fmt: skip
+COMMAND = Command(stamp_s=0.0, velocity_enu_mps=np.ones(3), yaw_rad=0.5)
+WILD = Command(stamp_s=0.0, velocity_enu_mps=np.array([1e200, 1.0, 1.0]), yaw_rad=0.5)
+
+
+class Limit:
+    """Alarms on any delta beyond a limit; per stage, or over all."""
+
+    name = "limit"
+
+    def __init__(self, *, per_stage):
+        self.per_stage = per_stage
+        self.memory = {"threshold": np.array([LIMIT])}
+
+    @property
+    def threshold(self):
+        return float(self.memory["threshold"][0])
+
+    def score(self, deltas, stage):
+        first, end = SPANS[stage] if self.per_stage else (0, len(deltas))
+        return float(np.abs(deltas[first:end].astype(int)).max())
+
+    def learn(self, deltas, stage):
+        pass
+
+
+@pytest.fixture(params=[True, False], ids=["per_stage", "over_all"])
+def per_stage(request):
+    return request.param
+
+
+@pytest.fixture
+def limit(monkeypatch, per_stage):
+    """The registry knows one detector."""
+    monkeypatch.setattr(protection_module, "find", lambda *_a, **_k: Limit(per_stage=per_stage))
+    return DetectorConfig(name="limit", alarms_max=3)
+
+
+def protection(config):
+    return Protection(config, WallClock())
+
+
+def tick(gate, command, at_s=0.0):
+    return gate.tick(TRAJECTORY, 0, command, at_s)[0]
+
+
+def test_after_so_many_alarms_in_a_row_it_holds_and_then_accepts(limit):
+    gate = protection(limit)
+    assert tick(gate, COMMAND) is Response.PASS
+    told = [tick(gate, WILD, at_s) for at_s in (0.02, 0.04, 0.06, 0.08, 0.1)]
+    assert told == [
+        Response.RECOMPUTE, Response.RECOMPUTE, Response.HOLD, Response.ACCEPT, Response.PASS,
+    ]  # fmt: skip
+    summary = gate.summary()
+    assert summary["responses"] == {"recompute": 2, "hold": 1, "accept": 1}
+    assert summary["alarm_count"] == 4
+    assert summary["recoveries"]["control"] == {"count": 1, "total_s": 0.06}
+
+
+def test_a_message_that_passes_ends_the_row(limit):
+    gate = protection(limit)
+    told = [tick(gate, c) for c in (COMMAND, WILD, WILD, COMMAND, WILD, WILD, COMMAND)]
+    assert told.count(Response.RECOMPUTE) == 4
+    assert told.count(Response.PASS) == 3
+
+
+def test_people_hear_of_a_row_of_alarms_once_and_of_a_hold_always(limit):
+    gate = protection(limit)
+    for command in (COMMAND, WILD, WILD, WILD, WILD):
+        tick(gate, command)
+    first, second = gate.news()
+    assert first == "limit alarm in control: command_vx; recompute"
+    assert second == "limit alarm in control: command_vx; hold"
+    assert gate.news() == []
+
+
+def test_a_wild_report_is_withheld(limit):
+    gate = protection(limit)
+    calm = CollisionReport(
+        stamp_s=0.0, collision=True, time_to_collision_s=3.0, future_collision_seq=1
+    )
+    assert gate.report(calm, 0.0) is Response.PASS
+    wild = replace(calm, future_collision_seq=1 << 20)
+    assert gate.report(wild, 0.3) is Response.RECOMPUTE
+    assert gate.report(calm, 0.6) is Response.PASS
+    assert gate.summary()["recoveries"]["perception"] == {"count": 1, "total_s": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        ({"protect": ()}, ConfigError), ({"protect": ("vision",)}, UnknownName),
+        ({"threshold": 0.0}, ConfigError), ({"threshold": float("nan")}, ConfigError),
+        ({"alarms_max": 0}, ConfigError),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(wrong, error):
+    with pytest.raises(error):
+        DetectorConfig(name="gad", **wrong)
+
+
+# Whole missions ------------------------------------------------------------------------------
+
+FLIP = FaultConfig(target="command_vx", at="time=3", exact_bits=(61,))
+
+
+@pytest.fixture
+def guarded(fly_short, limit):
+    def fly(**changes):
+        return load_run(fly_short(detector=limit, **changes).path)
+
+    return fly
+
+
+@pytest.mark.slow
+def test_a_golden_flight_is_the_same_with_a_silent_gate(guarded, short_flight):
+    golden, run = load_run(short_flight.path), guarded()
+    assert run.result["detection"]["alarm_count"] == 0
+    assert run.result["detection"]["checks"]["tick"] == run.trace.num_rows
+    assert same_file(run.folder.trace, golden.folder.trace)
+    assert same_file(run.folder.tlog, golden.folder.tlog)
+
+
+@pytest.mark.slow
+def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
+    guarded, short_flight, tmp_path
+):
+    run = guarded(fault=FLIP)
+    (strike,) = run.result["fault"]["strikes"]
+    (alarm,) = run.result["detection"]["alarms"]
+    assert alarm["stamp_s"] == pytest.approx(strike["stamp_s"])
+    assert (alarm["stage"], alarm["response"]) == ("control", "recompute")
+    assert alarm["states"][0] == "command_vx"
+    assert run.result["fault"]["activation"] == "overwritten"
+    largest = np.abs(run.trace["command_vx"].to_numpy(zero_copy_only=False)).max()
+    assert largest < 5.0
+    text = b"limit alarm in control"
+    assert text in run.folder.tlog.read_bytes()
+    assert any(e["kind"] == "alarm" for e in run.result["events"])
+    again = load_run(fly_mission(config_of(run), tmp_path, Watcher()).path)
+    assert same_file(again.folder.trace, run.folder.trace)
+    assert not differing_results(again.result, run.result)
+
+
+@pytest.mark.slow
+def test_a_stage_that_is_not_protected_is_not_watched(fly_short, limit):
+    config = replace(limit, protect=("perception", "planning"))
+    run = load_run(fly_short(detector=config, fault=FLIP).path)
+    assert run.result["detection"]["alarm_count"] == 0
+    assert run.result["fault"]["activation"] == "read"
+
+
+@pytest.mark.slow
+def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
+    """The threshold's highest exponent bit: 8 becomes a number beyond all deltas."""
+    fault = FaultConfig(target="detector.threshold", at="time=1", exact_bits=(62,))
+    record = guarded(fault=fault).result["fault"]
+    assert (record["stage"], record["state"], record["activation"]) == (
+        "detector", "applied", "read",
+    )  # fmt: skip
+    (change,) = record["strikes"][0]["changes"]
+    assert change["before"] == LIMIT
+    assert change["state"] == "threshold"
+
+
+def test_a_fault_in_no_detector_is_refused(fly_short):
+    with pytest.raises(FaultSpecError, match="--detector"):
+        fly_short(fault=FaultConfig(target="detector"))
+
+
+def test_the_record_of_a_guarded_run_can_be_read_back(guarded):
+    run = guarded()
+    asked = json.loads(run.folder.result.read_text())["config"]["detector"]
+    assert config_of(run).detector == DetectorConfig(name="limit", alarms_max=3)
+    assert asked["protect"] == [stage.value for stage in Stage]
