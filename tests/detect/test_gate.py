@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
+from detect_builders import command, plan, report
 
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import registry
 from mavfi_cli.detect.gate import Gate
 from mavfi_cli.detect.preprocess import NAMES
-from detect_builders import command, plan, report
 
 HUGE = 1e200
 
