@@ -80,19 +80,20 @@ def test_yaw_wraps_and_its_sign_flip_elsewhere_does_not():
 
 
 def test_reports_and_ticks_write_only_what_is_theirs():
+    keep = True
     work = pre.working_array(PreprocessParams())
     waypoints = np.zeros((2, 10))
     waypoints[1, 0] = 9.0
     pre.take_report(math.inf, 1, work)
-    pre.take_tick(waypoints, 0, np.zeros(3), 0.0, True, work)
+    pre.take_tick(waypoints, 0, np.zeros(3), 0.0, keep, work)
     assert not work[pre.DELTA].any()  # nothing was known before
     pre.take_report(3.0, 2, work)
-    pre.take_tick(waypoints, 1, np.array([0.0, 0.0, 2.5]), 0.0, True, work)
+    pre.take_tick(waypoints, 1, np.array([0.0, 0.0, 2.5]), 0.0, keep, work)
     expected = dict.fromkeys(NAMES, 0) | {
         "time_to_collision": -3, "future_collision_seq": 1, "waypoint_x": 3, "command_vz": 4,
     }  # fmt: skip
     assert dict(zip(NAMES, work[pre.DELTA].tolist(), strict=True)) == expected
-    pre.take_tick(waypoints, -1, np.array([0.0, 0.0, 2.5]), 0.0, False, work)
+    pre.take_tick(waypoints, -1, np.array([0.0, 0.0, 2.5]), 0.0, not keep, work)
     assert not work[pre.DELTA].any()
 
 
