@@ -58,6 +58,8 @@ class MissionResult:
 
 _WITHOUT_EFFECT = {
     "overwritten": Injected.NOT_ACTIVATED,
+    "not_read": Injected.NOT_ACTIVATED,
+    "unchanged": Injected.NOT_ACTIVATED,
     "ended_before_read": Injected.NOT_ACTIVATED,
     "not_read_in_window": Injected.UNREAD,
 }

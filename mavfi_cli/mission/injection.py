@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
 from mavfi_cli.detect.gate import Gate
-from mavfi_cli.fi.source.activation import Follower
+from mavfi_cli.fi.source.activation import Follower, Reader
 from mavfi_cli.fi.source.fault import SourceFault, Trigger
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
 from mavfi_cli.fi.source.memory import MemoryInjector
@@ -146,8 +146,10 @@ class Injection(_Recorded):
             "trigger": trigger_record(fault.trigger, self._injector.drawn_time_s),
             "strikes": [asdict(strike) for strike in self._injector.strikes],
             "strike_count": self._injector.count,
-            "activation": self.follower.activation.value,
-            "first_reader": asdict(reader) if reader else None,
+            "activation": {
+                "activation": self.follower.activation.value,
+                "first_reader": asdict(reader) if reader else None,
+            },
         }
 
 
@@ -191,15 +193,15 @@ class DetectorInjection(_Recorded):
             "trigger": trigger_record(self._trigger, self._injector.drawn_time_s),
             "strikes": [asdict(strike) for strike in self._injector.strikes],
             "strike_count": self._injector.count,
-            "activation": "read" if applied else "not_injected",
-            "first_reader": {
-                "name": "detector",
-                "stamp_s": self._injector.strikes[0].stamp_s,
-                "state": self._injector.array,
-            }
-            if applied
-            else None,
+            "activation": {
+                "activation": "read" if applied else "not_injected",
+                "first_reader": self._reader() if applied else None,
+            },
         }
+
+    def _reader(self) -> dict[str, Any]:
+        stamp_s = self._injector.strikes[0].stamp_s
+        return asdict(Reader(name="detector", stamp_s=stamp_s, state=self._injector.array))
 
 
 def trigger_record(trigger: Trigger, drawn_time_s: float) -> dict[str, Any]:

@@ -162,14 +162,14 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
 
 def _activation(fault: dict[str, Any]) -> str:
     """Whether anybody worked with the corrupted value."""
-    reader = fault["first_reader"]
+    reader = fault["activation"]["first_reader"]
     if reader is not None:
         return f"first read by {reader['name']} at {reader['stamp_s']:.2f} s ({reader['state']})"
     return {
         "overwritten": "overwritten before anybody read it",
         "not_read": "never read: the mission ended before",
         "unchanged": "changed nothing: the value was that already",
-    }[fault["activation"]]
+    }[fault["activation"]["activation"]]
 
 
 def _instruction_lines(fault: dict[str, Any]) -> list[str]:
@@ -244,9 +244,7 @@ def _no_effect(fault: dict[str, Any]) -> str:
     """Why a fault did nothing: it was not there, nobody read it, or whoever did was not moved."""
     if fault["state"] == "not_injected":
         return "none, not injected"
-    activation = fault["activation"]
-    if isinstance(activation, dict):  # instruction level
-        activation = activation["activation"]
+    activation = fault["activation"]["activation"]
     return "masked" if activation == "read" else f"none, {activation.replace('_', ' ')}"
 
 

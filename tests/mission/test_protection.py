@@ -156,7 +156,7 @@ def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
     assert alarm["stamp_s"] == pytest.approx(strike["stamp_s"])
     assert (alarm["stage"], alarm["response"]) == ("control", "recompute")
     assert alarm["states"][0] == "command_vx"
-    assert run.result["fault"]["activation"] == "overwritten"
+    assert run.result["fault"]["activation"]["activation"] == "overwritten"
     largest = np.abs(run.trace["command_vx"].to_numpy(zero_copy_only=False)).max()
     assert largest < 5.0
     text = b"limit alarm in control"
@@ -172,7 +172,7 @@ def test_a_stage_that_is_not_protected_is_not_watched(fly_short, limit):
     config = replace(limit, protect=("perception", "planning"))
     run = load_run(fly_short(detector=config, fault=FLIP).path)
     assert run.result["detection"]["alarm_count"] == 0
-    assert run.result["fault"]["activation"] == "read"
+    assert run.result["fault"]["activation"]["activation"] == "read"
 
 
 @pytest.mark.slow
@@ -180,7 +180,7 @@ def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
     """The threshold's highest exponent bit: 8 becomes a number beyond all deltas."""
     fault = FaultConfig(target="detector.threshold", at="time=1", exact_bits=(62,))
     record = guarded(fault=fault).result["fault"]
-    assert (record["stage"], record["state"], record["activation"]) == (
+    assert (record["stage"], record["state"], record["activation"]["activation"]) == (
         "detector", "applied", "read",
     )  # fmt: skip
     (change,) = record["strikes"][0]["changes"]

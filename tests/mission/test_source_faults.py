@@ -37,8 +37,8 @@ def test_golden_and_faulty_flight_part_at_the_strike(sideways):
     parting = first_difference(sideways, paired_golden(sideways))
     assert (parting.column, parting.stamp_s) == ("command_vx", strike["stamp_s"])
     assert (parting.this, parting.other) == (change["after"], change["before"])
-    assert fault["activation"] == "read"
-    assert fault["first_reader"] == {
+    assert fault["activation"]["activation"] == "read"
+    assert fault["activation"]["first_reader"] == {
         "name": "setpoint", "stamp_s": strike["stamp_s"], "state": "command_vx",
     }  # fmt: skip
     assert json.loads(sideways.folder.fault.read_text()) == fault
@@ -53,14 +53,14 @@ def test_a_fault_repeats_to_the_byte(sideways, tmp_path):
 
 def test_a_flip_that_is_read_and_moves_nothing_is_masked(struck):
     run = struck("future_collision_seq", at="time=3", exact_bits=(3,))
-    assert run.result["fault"]["activation"] == "read"
+    assert run.result["fault"]["activation"]["activation"] == "read"
     (line,) = difference_lines(run, paired_golden(run))
     assert "masked" in line
 
 
 def test_a_time_to_no_collision_is_overwritten_unread(struck):
     run = struck("time_to_collision", at="time=3", exact_bits=(61,))
-    assert run.result["fault"]["activation"] == "overwritten"
+    assert run.result["fault"]["activation"]["activation"] == "overwritten"
     (line,) = difference_lines(run, paired_golden(run))
     assert "masked" not in line
     assert "overwritten" in line
@@ -68,13 +68,13 @@ def test_a_time_to_no_collision_is_overwritten_unread(struck):
 
 def test_the_geometry_of_a_plan_is_first_read_by_the_collision_check(struck):
     run = struck("waypoint_x", at="time=3", exact_bits=(62,))
-    assert run.result["fault"]["first_reader"]["name"] == "collision_check"
+    assert run.result["fault"]["activation"]["first_reader"]["name"] == "collision_check"
 
 
 def test_a_flip_in_a_flown_plan_causes_no_check_by_itself(struck):
     run = struck("waypoint_x", at="time=3", exact_bits=(0,))
     golden = paired_golden(run)
-    assert run.result["fault"]["activation"] == "read"
+    assert run.result["fault"]["activation"]["activation"] == "read"
     assert run.result["nodes"] == golden.result["nodes"]
     assert run.result["kernels"] == golden.result["kernels"]
     assert run.result["response_time_s"] == golden.result["response_time_s"]
@@ -82,5 +82,5 @@ def test_a_flip_in_a_flown_plan_causes_no_check_by_itself(struck):
 
 def test_a_trigger_that_never_comes_is_not_injected(struck):
     fault = struck("planning", at="time=1000").result["fault"]
-    assert (fault["state"], fault["activation"]) == ("not_injected", "not_injected")
+    assert (fault["state"], fault["activation"]["activation"]) == ("not_injected", "not_injected")
     assert fault["reason"]
