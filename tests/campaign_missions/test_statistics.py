@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mavfi_cli.campaign.statistics.bootstrap import interval, mean, median
+from mavfi_cli.campaign.statistics.bootstrap import LARGE, interval, mean, median
 from mavfi_cli.campaign.statistics.layers import cross_layer, failures_per_hour
 from mavfi_cli.campaign.statistics.paired import holm, mcnemar
 from mavfi_cli.campaign.statistics.proportions import (
@@ -116,6 +116,14 @@ def test_bootstrap_intervals_cover_as_often_as_they_say():
         found = interval(rng.exponential(size=40), resamples=999, seed=trial)
         covered += found.low <= 1.0 <= found.high
     assert 0.89 <= covered / 300 <= 0.98
+
+
+def test_intervals_of_large_samples_are_nearly_those_of_the_bootstrap():
+    values = np.random.default_rng(2).lognormal(3.0, 0.4, size=LARGE)
+    normal, resampled = interval(values), interval(values[:-1], resamples=2000)
+    width = resampled.high - resampled.low
+    assert normal.low == pytest.approx(resampled.low, abs=0.1 * width)
+    assert normal.high == pytest.approx(resampled.high, abs=0.1 * width)
 
 
 def test_bootstrap_intervals_repeat_and_survive_few_values():
