@@ -14,40 +14,44 @@ from collections import Counter
 from pathlib import Path
 
 from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.processes import MISSION, SLOT, TEMPLATE
 
-VICTIMS = ("runner", "template", "slot", "mission", "vehicle")
+RUNNER, VEHICLE = "runner", "vehicle"
+VICTIMS = (RUNNER, TEMPLATE, SLOT, MISSION, VEHICLE)
+_MARK = "MAVFI_TEST_CAMPAIGN"
 
 
-def descendants(pid):
-    """Every living process that another one of them started, with its generation from 1."""
-    parents = {}
-    for entry in Path("/proc").glob("[0-9]*/stat"):
+def marked(mark):
+    """An environment by which the processes of one campaign, and no others, are found again."""
+    return {**os.environ, _MARK: mark}
+
+
+def processes(mark):
+    """Process ids by kind, of everything that the runner of this mark has started."""
+    found = {}
+    for entry in Path("/proc").glob("[0-9]*"):
         try:
-            fields = entry.read_text().rpartition(")")[2].split()
+            environment = (entry / "environ").read_bytes().split(b"\0")
+            name = (entry / "comm").read_text().strip()
+            line = (entry / "cmdline").read_bytes()
         except OSError:
             continue
-        if fields[0] != "Z":
-            parents[int(entry.parent.name)] = int(fields[1])
-    found = {}
-    generation, layer = 1, {pid}
-    while layer:
-        layer = {child for child, parent in parents.items() if parent in layer}
-        found.update(dict.fromkeys(layer, generation))
-        generation += 1
+        if f"{_MARK}={mark}".encode() not in environment:
+            continue  # also of a zombie, which has none
+        kind = VEHICLE if b"sitl" in line.split(b"\0") else name
+        found.setdefault(kind, []).append(int(entry.name))
     return found
 
 
-def kill_one(runner, victim):
+def kill_one(runner, mark, victim):
     """Kill one process of that kind, if missions are flying and there is one now."""
-    generation = VICTIMS.index(victim)
-    found = descendants(runner.pid)
-    if VICTIMS.index("mission") not in found.values():
+    found = processes(mark)
+    if MISSION not in found:
         return False
-    if generation == 0:
+    if victim == RUNNER:
         runner.kill()
         return True
-    chosen = sorted(pid for pid, g in found.items() if g == generation)
-    for pid in chosen[:1]:
+    for pid in found.get(victim, [])[:1]:
         try:
             os.kill(pid, signal.SIGKILL)
         except ProcessLookupError:
@@ -56,11 +60,12 @@ def kill_one(runner, victim):
     return False
 
 
-def complete_with_kills(start, kills, seed, pause_s):
+def complete_with_kills(start, mark, kills, seed, pause_s, victims=VICTIMS):
     """Run a campaign to its end in spite of so many kills; how often each kind was hit.
 
     Args:
-        start: starts the runner, a subprocess.Popen.
+        start: starts the runner with the environment of the mark, a subprocess.Popen.
+        kills: when there were so many, the runner is left in peace.
         pause_s: at most between two kills.
     """
     rng = random.Random(seed)
@@ -72,8 +77,8 @@ def complete_with_kills(start, kills, seed, pause_s):
                 runner.wait()
                 break
             time.sleep(rng.uniform(0.0, pause_s))
-            victim = rng.choice(VICTIMS)
-            if runner.poll() is None and kill_one(runner, victim):
+            victim = rng.choice(victims)
+            if runner.poll() is None and kill_one(runner, mark, victim):
                 hits[victim] += 1
         if runner.wait() == 0:
             return hits
@@ -87,6 +92,12 @@ def results_of(folder):
             result = {k: v for k, v in each.result.items() if k != "host"}
             found.append((each.number, each.outcome, json.dumps(result, sort_keys=True)))
     return found
+
+
+def start_fake(folder, count):
+    """Start the runner above; its mark is its folder."""
+    line = [sys.executable, __file__, str(folder), str(count), "fake_task"]
+    return subprocess.Popen(line, stderr=subprocess.DEVNULL, env=marked(str(folder)))
 
 
 if __name__ == "__main__":  # the runner of the tests: a list of missions without flights
@@ -103,9 +114,3 @@ if __name__ == "__main__":  # the runner of the tests: a list of missions withou
         run_campaign(missions, folder, Options(jobs=2, task=task)).close()
     except CampaignStopped as error:
         sys.exit(str(error))
-
-
-def start_fake(folder, count):
-    """Start the runner above."""
-    line = [sys.executable, __file__, str(folder), str(count), "fake_task"]
-    return subprocess.Popen(line, stderr=subprocess.DEVNULL)
