@@ -199,11 +199,12 @@ class _Run:
         jobs = self._options.jobs or len(os.sched_getaffinity(0))
         with Slots(jobs, self._options.task) as slots:
             while len(asked) < 2:
-                while slots.free and not asked and (entry := self._next()) is not None:
-                    self._start(slots, entry)
+                self._fill(slots, asked)
                 if not self._flying:
                     break
-                for ended in slots.wait(_LOOK_S):
+                over = slots.wait(_LOOK_S)
+                self._fill(slots, asked)  # at once: the ledger is written while they fly
+                for ended in over:
                     self._take(ended)
                 self._spectator.on_progress(self._progress())
         if asked:
@@ -214,6 +215,11 @@ class _Run:
                 f"{len(self._given_up)} missions were ended from outside {ATTEMPTS} times, the "
                 f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
             )
+
+    def _fill(self, slots: Slots, asked: Sequence[int]) -> None:
+        """Start as many missions as there are free slots."""
+        while slots.free and not asked and (entry := self._next()) is not None:
+            self._start(slots, entry)
 
     def _next(self) -> Entry | None:
         return self._again.pop() if self._again else self._queue.next()

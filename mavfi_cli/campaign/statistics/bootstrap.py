@@ -17,7 +17,7 @@ from mavfi_cli.campaign.statistics.proportions import z_of
 from mavfi_cli.core.types import FloatArray
 
 RESAMPLES = 9999
-LARGE = 5000  # from so many values on the mean is normal, and the bootstrap would only be slow
+LARGE = 500  # from so many values on the mean is normal, and the bootstrap would only be slow
 _CHUNK = 4_000_000  # numbers that are drawn at once
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
 
