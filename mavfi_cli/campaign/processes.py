@@ -8,7 +8,8 @@ import os
 import signal
 from pathlib import Path
 
-_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
+TEMPLATE, SLOT, MISSION = "mavfi-template", "mavfi-slot", "mavfi-mission"  # what ps calls them
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 
 
@@ -24,7 +25,12 @@ def die_with(parent: int) -> None:
         os._exit(1)
 
 
-def _request(option: int, value: int) -> None:
+def call_this_process(name: str) -> None:
+    """Have ps and top call this process so; at most 15 bytes."""
+    _request(_PR_SET_NAME, ctypes.c_char_p(name.encode()))
+
+
+def _request(option: int, value: int | ctypes.c_char_p) -> None:
     if _prctl(option, value, 0, 0, 0) != 0:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code))

@@ -27,7 +27,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.campaign.processes import become_reaper, die_with, end_children
+from mavfi_cli.campaign.processes import (
+    MISSION,
+    SLOT,
+    become_reaper,
+    call_this_process,
+    die_with,
+    end_children,
+)
 from mavfi_cli.core.errors import MavfiError
 
 PACKET = 1 << 17  # bytes, of an order or a report
@@ -47,6 +54,7 @@ class Task(Protocol):
 
 def serve(channel: socket.socket, task: Task) -> NoReturn:
     """The slot's whole life."""
+    call_this_process(SLOT)
     become_reaper()
     while True:
         try:
@@ -121,6 +129,7 @@ def _perform(order: Mapping[str, Any], task: Task, slot: int, writing: int) -> N
     """The mission's whole life, in a process group of its own."""
     code = 1
     try:
+        call_this_process(MISSION)
         os.setsid()
         die_with(slot)
         out = Path(order["out"])

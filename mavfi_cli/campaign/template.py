@@ -17,6 +17,7 @@ import socket
 import sys
 from typing import NoReturn, cast
 
+from mavfi_cli.campaign.processes import TEMPLATE, call_this_process
 from mavfi_cli.campaign.slot import Task, serve
 
 READY = b"ready"
@@ -24,6 +25,7 @@ READY = b"ready"
 
 def main() -> NoReturn:
     """Serve until the runner closes its end."""
+    call_this_process(TEMPLATE)
     control = socket.socket(fileno=int(sys.argv[1]))
     task = cast(Task, importlib.import_module(sys.argv[2]))
     task.prepare()

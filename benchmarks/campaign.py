@@ -1,0 +1,98 @@
+"""How many missions an hour a campaign flies, and how much of the time goes outside missions.
+
+    python benchmarks/campaign.py [--missions 100] [--jobs 2 ...] [--world sparse]
+
+Flies half of the missions golden and half with a source-level fault, then as many pairs with an
+instruction-level fault; each with every number of jobs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.progress import Progress, Spectator
+from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+
+STAGES = ("perception", "planning", "control")
+REQUIRED = {"golden and source level": 1000.0, "instruction level": 700.0}
+OUTSIDE_LIMIT = 0.05
+
+
+class _Last(Spectator):
+    """Keeps the newest progress."""
+
+    progress: Progress
+
+    def on_progress(self, progress: Progress) -> None:
+        self.progress = progress
+
+
+def source_missions(world: str, count: int) -> list[PlannedMission]:
+    """Golden and faulty flights in turns."""
+    found = []
+    for seed in range(1, count // 2 + 1):
+        golden = MissionConfig(world=world, seed=seed)
+        fault = FaultConfig(target=STAGES[seed % 3], seed=seed)
+        faulty = MissionConfig(world=world, seed=seed, fault=fault)
+        found += [PlannedMission(config=golden), PlannedMission(config=faulty)]
+    return found
+
+
+def instruction_missions(world: str, count: int) -> list[PlannedMission]:
+    """Flights with a fault in each stage of the same missions, as Table IV has them."""
+    return [
+        PlannedMission(
+            config=MissionConfig(
+                world=world, seed=1 + index // 9,
+                instruction=InstructionConfig(target=STAGES[index % 3], seed=index),
+            )
+        )
+        for index in range(count)
+    ]  # fmt: skip
+
+
+def row(name: str, missions: Sequence[PlannedMission], jobs: int) -> str:
+    """Fly them, and tell one line of the table."""
+    last = _Last()
+    with tempfile.TemporaryDirectory() as folder:
+        options = Options(jobs=jobs, keep=Keep.NONE)
+        with run_campaign(missions, Path(folder) / "campaign", options, last) as ledger:
+            errors = sum(result.outcome is None for result in ledger.results())
+    seen = last.progress
+    outside = 1.0 - seen.inside_s / (jobs * seen.elapsed_s)
+    return (
+        f"| {name} | {jobs} | {len(missions)} | {seen.rate_per_h:.0f} | {REQUIRED[name]:.0f} | "
+        f"{100 * outside:.1f} % | {100 * OUTSIDE_LIMIT:.0f} % | {errors} |"
+    )
+
+
+def main() -> None:
+    """Fly and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--missions", type=int, default=100)
+    parser.add_argument("--jobs", type=int, nargs="+", default=[1, os.cpu_count() or 1])
+    parser.add_argument("--world", default="sparse")
+    given = parser.parse_args()
+    print(
+        "| missions | jobs | flown | an hour | required (2 cores) | outside missions | at most "
+        "| could not begin |\n|---|---|---|---|---|---|---|---|"
+    )
+    for jobs in given.jobs:
+        source = source_missions(given.world, given.missions)
+        print(row("golden and source level", source, jobs), flush=True)
+    for jobs in given.jobs:
+        native = instruction_missions(given.world, given.missions)
+        print(row("instruction level", native, jobs), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,157 @@
+"""What the campaign itself costs: dispatch of 10,000 missions, a ledger of 1,000,000 rows.
+
+    python benchmarks/campaign_scale.py [--queued 10000] [--rows 1000000]
+
+Dispatch is measured with missions that do nothing: this file is their task. The rows are
+synthetic: a tenth is missing, the rest are flights of 40 settings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.progress import Progress, Spectator
+from mavfi_cli.campaign.run import Options, run_campaign, store_plan
+from mavfi_cli.campaign.summary import summarise
+from mavfi_cli.mission.config import MissionConfig
+
+CELLS = 40
+DISPATCH_LIMIT_S, LEDGER_LIMIT_S = 0.005, 10.0
+
+
+def prepare() -> None:
+    """Nothing: the task's first half."""
+
+
+def perform(_changes: Mapping[str, Any], out: Path) -> Path:
+    """A mission that does nothing but leave its record: the task's second half."""
+    run = out / "nothing-1"
+    run.mkdir()
+    (run / "result.json").write_text('{"outcome": "success", "reason": "", "nodes": {}}')
+    return run
+
+
+class _Last(Spectator):
+    """Keeps the newest progress."""
+
+    progress: Progress
+
+    def on_progress(self, progress: Progress) -> None:
+        self.progress = progress
+
+
+def dispatch(count: int, jobs: int) -> str:
+    """Fly missions that do nothing; what one costs outside its own process."""
+    here = str(Path(__file__).resolve().parent)
+    os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
+    missions = [PlannedMission(config=MissionConfig(seed=seed)) for seed in range(count)]
+    last = _Last()
+    with tempfile.TemporaryDirectory() as folder:
+        options = Options(jobs=jobs, keep=Keep.NONE, task="campaign_scale")
+        begun = resource.getrusage(resource.RUSAGE_SELF)
+        run_campaign(missions, Path(folder) / "campaign", options, last).close()
+        ended = resource.getrusage(resource.RUSAGE_SELF)
+    seen = last.progress
+    outside_s = (jobs * seen.elapsed_s - seen.inside_s) / count
+    own_s = (ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime) / count
+    return (
+        f"| dispatch, {count} queued, {jobs} jobs: slot time between two missions | "
+        f"{1e3 * outside_s:.2f} ms | {1e3 * DISPATCH_LIMIT_S:.0f} ms |\n"
+        f"| of it processor time of the runner | {1e3 * own_s:.2f} ms | |\n"
+        f"| a whole mission that does nothing, in its slot | {1e3 * seen.inside_s / count:.2f} ms "
+        f"| |"
+    )
+
+
+def planned(rows: int) -> Iterator[PlannedMission]:
+    """Missions of as many settings as Table IV."""
+    base = MissionConfig()
+    for number in range(rows):
+        labels = {"world": f"w{number % 4}", "setting": f"s{number // 4 % (CELLS // 4)}"}
+        yield PlannedMission(config=base, labels=labels, pair=str(number // CELLS))
+
+
+def fill(folder: Path, rows: int) -> None:
+    """A ledger of that many missions, nine tenths of them flown."""
+    rng = np.random.Generator(np.random.PCG64(1))
+    with Ledger(folder, writing=True) as ledger:
+        store_plan(ledger, list(planned(0)))
+        ledger.plan(planned(rows))
+        database = ledger._db  # a transaction a mission would take hours
+        database.execute("BEGIN")
+        for number in range(rows):
+            if number % 10 == 9:
+                continue
+            time_s, golden = 20.0 + float(rng.exponential()), number // 4 % (CELLS // 4) == 0
+            database.execute(
+                "INSERT INTO results VALUES (?, ?, ?, '', ?, ?, ?, ?, ?, ?, ?, ?, ?, 1, NULL)",
+                (
+                    number, State.FLOWN.value, "success" if rng.random() < 0.9 else "collision",
+                    (Injected.GOLDEN if golden else Injected.ACTIVE).value,
+                    time_s, 2.5 * time_s, 540.0 * time_s, 100.0 * time_s, 1.0,
+                    int(rng.integers(5)), time_s + 10.0, 3.0,
+                ),
+            )  # fmt: skip
+            database.execute("INSERT INTO records VALUES (?, x'')", (number,))
+        database.execute("COMMIT")
+
+
+def timed(name: str, work: Callable[[], object], limit_s: float = LEDGER_LIMIT_S) -> str:
+    """One line of the table."""
+    begun = time.perf_counter()
+    work()
+    return f"| {name} | {time.perf_counter() - begun:.2f} s | {limit_s:g} s |"
+
+
+def ledger_rows(rows: int) -> Iterator[str]:
+    """Open, resume and summarise a long ledger."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "campaign"
+        fill(folder, rows)
+        yield timed(f"ledger of {rows} rows: open and count", lambda: _count(folder))
+        yield timed("find the first missing mission, and all", lambda: _missing(folder))
+        yield timed("summarise 40 settings", lambda: _summarise(folder))
+
+
+def _count(folder: Path) -> None:
+    with Ledger(folder) as ledger:
+        assert ledger.over() < ledger.planned()
+
+
+def _missing(folder: Path) -> None:
+    with Ledger(folder) as ledger:
+        assert sum(1 for _ in ledger.missing()) == ledger.planned() - ledger.over()
+
+
+def _summarise(folder: Path) -> None:
+    with Ledger(folder) as ledger:
+        assert len(summarise(ledger).cells) == CELLS
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--queued", type=int, default=10_000)
+    parser.add_argument("--rows", type=int, default=1_000_000)
+    given = parser.parse_args()
+    print("| what | figure | required |\n|---|---|---|", flush=True)
+    print(dispatch(given.queued, os.cpu_count() or 1), flush=True)
+    for line in ledger_rows(given.rows):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,196 @@
+"""`mavfi campaign` as a user calls it: a short campaign, and every bad input in one line."""
+
+import csv
+import json
+import sqlite3
+import subprocess
+import sys
+
+import pyarrow.parquet as pq
+import pytest
+
+from mavfi_cli.campaign.ledger import LEDGER
+from mavfi_cli.cli import campaign as command
+
+SPEC = """
+name = "short"
+repetitions = 2
+keep = "all"
+[mission]
+start = [2.0, 2.0, 0.0]
+goal = [10.0, 6.0, 5.0]
+[factors]
+world = "farm"
+[[setting]]
+name = "golden"
+[[setting]]
+name = "FI"
+site = "waypoint_position"
+together = true
+field = "mantissa"
+"""
+
+
+def written(folder, text=SPEC, name="short.toml"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def flown(mavfi, tmp_path_factory):
+    """The folder of the short campaign, flown, and the run that flew it."""
+    home = tmp_path_factory.mktemp("home")
+    run = mavfi("campaign", "run", written(home), "--json", cwd=home)
+    assert run.returncode == 0, run.stderr
+    return home / "campaigns" / "short", run
+
+
+@pytest.mark.slow
+def test_a_campaign_is_flown_and_summed_up(flown):
+    folder, run = flown
+    summary = json.loads(run.stdout)
+    assert (summary["name"], summary["missions"], summary["missing"]) == ("short", 4, 0)
+    golden, faulty = summary["cells"]
+    assert golden["labels"] == {"setting": "golden", "world": "farm"}
+    assert golden["success"]["count"] == golden["success"]["total"] == 2
+    assert faulty["success"]["total"] + faulty["inactive"]["total"] == 2
+    assert golden["metrics"]["flight_time_s"]["value"] > 2.0
+    assert "4/4 missions" in run.stderr
+    assert (folder / "campaign.toml").read_text().startswith('name = "short"\n')
+    assert len(list((folder / "runs").glob("*/result.json"))) == 4
+
+
+@pytest.mark.slow
+def test_a_complete_campaign_flies_nothing_again(flown, mavfi):
+    folder, _ = flown
+    for what in ([folder], [folder, "--missing-only"]):
+        run = mavfi("campaign", "run", *what, "--quiet")
+        assert (run.returncode, run.stderr) == (0, "")
+        assert run.stdout.startswith("short: 4 of 4 missions\n")
+    assert mavfi("campaign", "status", folder).stdout == run.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["table.csv", "table.parquet"])
+def test_export_has_a_row_a_mission(flown, mavfi, tmp_path, name):
+    folder, _ = flown
+    run = mavfi("campaign", "export", folder, tmp_path / name)
+    assert run.stdout == f"4 missions in {tmp_path / name}\n"
+    if name.endswith(".csv"):
+        rows = list(csv.DictReader((tmp_path / name).read_text().splitlines()))
+    else:
+        rows = pq.read_table(tmp_path / name).to_pylist()
+    assert [int(row["number"]) for row in rows] == [0, 1, 2, 3]
+    assert [row["label_setting"] for row in rows] == ["golden", "FI"] * 2
+    assert {row["outcome"] for row in rows[::2]} == {"success"}
+    assert [int(row["seed"]) for row in rows] == [1, 1, 2, 2]
+
+
+@pytest.mark.slow
+def test_a_changed_specification_shows_the_difference(flown, mavfi, tmp_path):
+    folder, _ = flown
+    changed = written(tmp_path, SPEC.replace("mantissa", "exponent"))
+    run = mavfi("campaign", "run", changed, "--out", folder)
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert "holds another campaign: 4 missions, now there are 4; 2 are new" in line
+    assert '"field":"exponent"' in line
+    assert "--append adds" in line
+
+
+@pytest.fixture
+def refused(mavfi, tmp_path):
+    """Run a command that must end with one line on stderr and leave nothing; the line."""
+
+    def run(*arguments, code=1):
+        before = sorted(tmp_path.iterdir())
+        done = mavfi("campaign", *arguments, cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (code, ""), done.stderr
+        (line,) = done.stderr.splitlines()
+        assert sorted(tmp_path.iterdir()) == before
+        return line.removeprefix("error: ")
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ('world = "farm"', 'world = "fram"', "unknown world 'fram': did you mean 'farm'?"),
+        ('world = "farm"', 'wrold = "farm"', "factors.wrold: unknown key; did you mean 'world'?"),
+        ('world = "farm"', "world = []", "factors.world: an empty list of values"),
+        ("repetitions = 2", "repetitions = 0", "repetitions: expected a whole number from 1"),
+        ("waypoint_position", "waypoint_postion", "did you mean 'waypoint_position'?"),
+        ('field = "mantissa"', 'field = "mantisa"', "did you mean 'mantissa'?"),
+        ('world = "farm"', 'planner = "rtt"', "unknown planner 'rtt': did you mean 'rrt'?"),
+        ('world = "farm"', 'vehicle = "sola"', "unknown vehicle 'sola': did you mean 'solo'?"),
+        ('world = "farm"', 'platform = "x68"', "unknown platform 'x68': did you mean 'x86'?"),
+    ],
+)
+def test_a_bad_specification_gets_one_line_and_flies_nothing(refused, tmp_path, old, new, problem):
+    assert old in SPEC
+    assert problem in refused("run", written(tmp_path, SPEC.replace(old, new)))
+
+
+def test_what_does_not_exist_gets_one_line(refused, tmp_path):
+    assert "did you mean 'table3'?" in refused("run", "table33")
+    assert "No such file" in refused("run", "none.toml")
+    assert "no campaign there" in refused("status", tmp_path / "nowhere")
+    assert "no campaign was begun there" in refused(
+        "run", written(tmp_path), "--missing-only", "--out", tmp_path / "nowhere"
+    )
+    assert "scale: must be above 0" in refused("run", "table3", "--scale", "0")
+
+
+def test_a_ledger_of_another_version_gets_one_line(mavfi, tmp_path):
+    folder = tmp_path / "old"
+    folder.mkdir()
+    database = sqlite3.connect(folder / LEDGER)
+    database.execute("CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
+    database.execute("INSERT INTO meta VALUES ('schema', '7')")
+    database.commit()
+    database.close()
+    for arguments in (("status", folder), ("run", folder)):
+        done = mavfi("campaign", *arguments)
+        assert done.returncode == 1
+        assert "a ledger of version 7; this mavfi reads version 1" in done.stderr
+
+
+def test_plan_says_what_would_be_flown(mavfi, tmp_path):
+    done = mavfi("campaign", "plan", "table3", "--scale", "0.1", "--json")
+    told = json.loads(done.stdout)["campaign"]
+    assert (told["missions"], told["pairs"]) == (40, 10)
+    assert told["settings"]["setting=golden world=sparse"] == 10
+    assert not list(tmp_path.iterdir())
+
+
+def test_plan_answers_how_many_missions_a_question_takes(mavfi):
+    done = mavfi("campaign", "plan", "--margin", "0.05", "--difference", "0.1")
+    assert done.stdout.splitlines() == [
+        "381 missions a setting: Wilson interval of +-0.05 at a rate of 0.5, 95 % confidence",
+        "155 pairs: a difference of 0.1 found with 80 % power, 95 % confidence",
+    ]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("plan",), ("run",), ("run", "table3", "--keep", "some"), ("run", "table3", "--jobs", "0")],
+)
+def test_wrong_usage_is_exit_code_2(mavfi, arguments):
+    assert mavfi("campaign", *arguments).returncode == 2
+
+
+def test_every_preset_is_named_in_the_help():
+    from mavfi_cli.campaign.spec import presets
+
+    for name in presets():
+        assert name in command.campaign.help
+
+
+def test_help_needs_no_heavy_import():
+    code = (
+        "import sys; from mavfi_cli.cli.campaign import campaign; "
+        "assert not {'numpy', 'numba', 'sqlite3', 'pyarrow'} & set(sys.modules), sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

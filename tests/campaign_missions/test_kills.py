@@ -1,0 +1,64 @@
+"""kill -9 at random: nothing is lost, nothing is doubled, the results are the same."""
+
+import os
+import signal
+import time
+from functools import partial
+
+from conftest import planned
+from killing import (
+    RUNNER,
+    VICTIMS,
+    complete_with_kills,
+    kill_one,
+    processes,
+    results_of,
+    start_fake,
+)
+
+from mavfi_cli.campaign.processes import MISSION, SLOT
+
+MISSIONS, KILLS = 40, 8
+
+
+def test_random_kills_lose_and_double_nothing(tmp_path):
+    undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
+    assert start_fake(undisturbed, MISSIONS).wait() == 0
+    start = partial(start_fake, disturbed, MISSIONS)
+    hits = complete_with_kills(
+        start, str(disturbed), KILLS, seed=1, pause_s=0.2, victims=VICTIMS[:-1]
+    )
+    assert hits.total() == KILLS
+    assert results_of(disturbed) == results_of(undisturbed)
+    assert [number for number, *_ in results_of(disturbed)] == list(range(MISSIONS))
+
+
+def test_nothing_goes_on_when_the_runner_is_killed(tmp_path):
+    mark = str(tmp_path / "campaign")
+    runner = start_fake(tmp_path / "campaign", 1000)
+    while MISSION not in processes(mark):
+        time.sleep(0.05)
+    assert kill_one(runner, mark, RUNNER)
+    runner.wait()
+    deadline = time.monotonic() + 30.0
+    while processes(mark):
+        assert time.monotonic() < deadline, "processes are left of a killed runner"
+        time.sleep(0.05)
+
+
+def test_a_killed_slot_costs_an_attempt_and_no_mission(campaign, monkeypatch):
+    mark = str(campaign.folder)
+    monkeypatch.setenv("MAVFI_TEST_CAMPAIGN", mark)
+    struck = []
+
+    def strike(progress):
+        if not struck and progress.running == 2 and len(processes(mark).get(MISSION, [])) == 2:
+            struck.append(processes(mark)[SLOT][0])
+            os.kill(struck[0], signal.SIGKILL)
+
+    campaign.notes.on_progress = strike
+    with campaign.run(planned("sleep:3.0", "sleep:3.0", "fly")) as ledger:
+        attempts = [result.attempts for result in ledger.results()]
+    assert struck
+    assert sorted(attempts) == [1, 1, 2]
+    assert campaign.notes.lines[0].endswith("its slot was killed; begun again")

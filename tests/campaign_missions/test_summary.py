@@ -1,0 +1,144 @@
+"""What a summary counts where, and which missions it compares."""
+
+import json
+import math
+
+import pytest
+
+from mavfi_cli.campaign.comparison import against_golden, protection
+from mavfi_cli.campaign.groups import groups
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.summary import summarise, table
+from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.files import plain
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+
+ACTIVE, GOLDEN = Injected.ACTIVE, Injected.GOLDEN
+FI = {"setting": "FI", "stage": "control"}
+SAVED = {"setting": "D&R", "stage": "control", "detector": "gad"}
+
+
+class Book:
+    """Writes a ledger mission by mission."""
+
+    def __init__(self, folder):
+        self.ledger = Ledger(folder, writing=True)
+
+    def add(self, labels, seed, time_s, *, injected=ACTIVE, outcome="success"):
+        fault = None if injected is GOLDEN else FaultConfig(target="control", seed=seed)
+        number = self.ledger.planned()
+        mission = PlannedMission(config=MissionConfig(seed=seed, fault=fault), labels=labels)
+        self.ledger.plan([mission])
+        quality = {"flight_time_s": time_s, "distance_m": 50.0, "energy_regression_j": 9e3}
+        self.ledger.add(
+            number, state=State.FLOWN, reason="", injected=injected, wall_s=1.0, attempts=1,
+            path=None, result={
+                "outcome": outcome, "quality_of_flight": quality, "pilot": {"replans": seed},
+            },
+        )  # fmt: skip
+
+
+@pytest.fixture
+def book(tmp_path):
+    written = Book(tmp_path / "campaign")
+    yield written
+    written.ledger.close()
+
+
+def fill(book):
+    """Ten golden flights of 20 s; faulty ones 10 s longer, of which 3 fail; protected 2 s."""
+    for seed in range(10):
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN)
+        book.add(FI, seed, 30.0 + (seed == 9), outcome="collision" if seed < 3 else "success")
+        book.add(SAVED, seed, 22.0 + (seed == 9), outcome="timeout" if seed < 1 else "success")
+
+
+def test_faults_that_did_nothing_are_counted_apart(book):
+    fates = [ACTIVE, Injected.UNREAD, Injected.NOT_ACTIVATED, Injected.NOT_INJECTED, Injected.NULL]
+    for seed, injected in enumerate(fates):
+        outcome = "collision" if injected is ACTIVE else "success"
+        book.add(FI, seed, 20.0 + seed, injected=injected, outcome=outcome)
+    (cell,) = summarise(book.ledger).cells
+    assert (cell.success.count, cell.success.total) == (1, 2)
+    assert (cell.inactive.count, cell.inactive.total) == (3, 3)
+    assert (cell.every.count, cell.every.total) == (4, 5)
+    assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
+    assert cell.metrics["flight_time_s"].value == 21.0
+    assert cell.metrics["flight_time_s"].count == 1
+
+
+def test_errors_are_counted_nowhere_else(book):
+    fill(book)
+    book.ledger.plan([PlannedMission(config=MissionConfig(seed=99), labels={"setting": "golden"})])
+    book.ledger.add(
+        30, state=State.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
+        attempts=1, path=None,
+    )  # fmt: skip
+    golden = summarise(book.ledger).cells[0]
+    assert (golden.planned, golden.errors, golden.every.total) == (11, 1, 10)
+
+
+def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
+    fill(book)
+    faulty, saved = against_golden(groups(book.ledger))
+    assert (faulty.first, faulty.second) == ({"setting": "golden"}, FI)
+    assert (faulty.success.pairs, faulty.success.only_first) == (10, 3)
+    assert faulty.success.difference == pytest.approx(-0.3)
+    assert faulty.success.p_value == pytest.approx(0.25)
+    assert faulty.corrected_p == pytest.approx(0.5)
+    assert faulty.differences["flight_time_s"].value == pytest.approx(10.0 + 1 / 7)
+    assert faulty.differences["flight_time_s"].count == 7
+    assert faulty.differences["replans"].value == 0.0
+    assert faulty.worst.increase == pytest.approx(11.0 / 20.0)
+    assert math.isnan(faulty.worst.recovered)
+    assert saved.second == SAVED
+
+
+def test_protection_is_held_against_the_same_faults_without_it(book):
+    fill(book)
+    (saved,) = protection(groups(book.ledger))
+    assert (saved.first, saved.second) == (FI, SAVED)
+    assert (saved.success.only_second, saved.success.neither) == (2, 1)
+    assert saved.differences["flight_time_s"].value == pytest.approx(-8.0)
+    assert saved.worst.golden == 20.0
+    assert saved.worst.recovered == pytest.approx((31.0 - 23.0) / 20.0)
+    assert saved.worst.recovered_share == pytest.approx(8.0 / 11.0)
+
+
+def test_settings_are_gathered_by_labels(book):
+    for seed in range(4):
+        book.add({"setting": "FI", "stage": "planning", "world": "farm"}, seed, 20.0)
+        book.add({"setting": "FI", "stage": "control", "world": "farm"}, seed, 21.0)
+        book.add({"setting": "FI", "stage": "control", "world": "dense"}, seed, 22.0)
+    cells = summarise(book.ledger, ["setting", "world"]).cells
+    assert [(cell.labels["world"], cell.success.total) for cell in cells] == [
+        ("farm", 8), ("dense", 4),
+    ]  # fmt: skip
+    assert cells[0].labels == {"setting": "FI", "world": "farm"}
+    with pytest.raises(UnknownName, match="did you mean 'world'"):
+        summarise(book.ledger, ["wrld"])
+
+
+def test_a_faulty_mission_pairs_with_no_golden_flight_of_another_seed(book):
+    book.add({"setting": "golden"}, 1, 20.0, injected=GOLDEN)
+    book.add(FI, 2, 30.0)
+    assert against_golden(groups(book.ledger)) == []
+
+
+def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
+    fill(book)
+    summary = summarise(book.ledger)
+    text = "\n".join(table(summary))
+    assert "setting=FI stage=control" in text
+    assert "7/10" in text
+    assert "collision 3" in text
+    assert "recovered 40.0 points, 72.7 %" in text
+    assert json.loads(json.dumps(plain(summary.to_dict()), allow_nan=False))["missing"] == 0
+
+
+def test_a_campaign_that_has_just_begun_has_a_table(book):
+    book.ledger.plan([PlannedMission(config=MissionConfig(), labels={})])
+    assert "all missions" in "\n".join(table(summarise(book.ledger)))
