@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 
 class Outcome(Enum):
@@ -60,3 +62,22 @@ def shares(outcomes: Iterable[Outcome]) -> dict[Outcome, Share]:
         outcome: wilson(count, total if outcome is Outcome.NOT_INJECTED else injected)
         for outcome, count in counts.items()
     }
+
+
+def shares_to_json(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Any]]:
+    """What `shares` says, as plain values; a share of nothing is null."""
+    return {
+        outcome.value: {
+            "count": share.count,
+            "of": share.total,
+            "share": None if math.isnan(share.share) else share.share,
+            "wilson95": [share.low, share.high],
+        }
+        for outcome, share in shares(outcomes).items()
+    }
+
+
+def counted(names: Iterable[str]) -> dict[str, int]:
+    """How often each name occurs, the most frequent first."""
+    counts = Counter(names)
+    return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}
