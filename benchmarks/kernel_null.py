@@ -42,6 +42,7 @@ from mavfi_cli.mission.config import MissionConfig
 WAYS = ("free", "ended", "armed", "counted", "stopped", "after")
 PAIRS = (("ended", "free"), ("armed", "free"), ("after", "stopped"))
 NEVER = 1 << 40  # more executions than any call has
+NOWHERE = 0x1000  # nothing is mapped there
 
 
 def finish(tracee: Tracee) -> None:
@@ -65,8 +66,7 @@ def run(place: Place, way: str) -> float:
     tracee = place.start()
     entry = place.layout.image.address(place.layout.scope.entry)
     if way in ("armed", "counted"):
-        inside = 1 if way == "armed" else 0  # no instruction begins in the middle of another
-        counter = PerfBreakpoint(tracee.tid, entry + inside, NEVER)
+        counter = PerfBreakpoint(tracee.tid, NOWHERE if way == "armed" else entry, NEVER)
         finish(tracee)
         counter.close()
     elif way in ("stopped", "after"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import pickle
@@ -191,6 +192,7 @@ def template_of(kernel: str, inputs: Path) -> Template:
     return Template(arguments=("-m", "mavfi_cli.campaign.kernels.template", kernel), data=data)
 
 
+@functools.cache
 def load(kernel: str, template: Template) -> None:
     """Load a kernel once, so that all its compiled code is in the cache from now on."""
     Place(kernel, template, look_up=False).close()

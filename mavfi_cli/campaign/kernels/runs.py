@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,7 +84,10 @@ class _Bench:
         return (self.kernel,)
 
     def open(self) -> Attacker[KernelVerdict]:
-        place = Place(self.kernel, template_of(self.kernel, self.plan.inputs), layout=self.layout)
+        template = template_of(self.kernel, self.plan.inputs)
+        return self.attacker(Place(self.kernel, template, layout=self.layout))
+
+    def attacker(self, place: Place) -> Attacker[KernelVerdict]:
         kernel = catalogue.find(self.kernel)
         return attacker_of(kernel, place, self.golden, tolerance=self.plan.tolerance)
 
@@ -120,8 +122,9 @@ def _run_kernel(
 ) -> KernelRuns:
     begun = time.perf_counter()
     with one_processor():
-        prepared = _prepare(plan, name)
+        prepared, place = _prepare(plan, name)
     bench = _Bench(plan=plan, kernel=name, layout=prepared.layout, golden=prepared.golden)
+    workers.take(bench, bench.attacker(place))
     context = {
         "kernel": name,
         "scope": list(prepared.layout.scope.objects),
@@ -138,20 +141,25 @@ def _run_kernel(
     return KernelRuns(prepared=prepared, records=records, wall_s=time.perf_counter() - begun)
 
 
-def _prepare(plan: Plan, name: str) -> Prepared:
-    """Golden run and profile."""
+def _prepare(plan: Plan, name: str) -> tuple[Prepared, Place]:
+    """Golden run and profile, and the place where they were made."""
     begun = time.perf_counter()
     kernel, template = catalogue.find(name), template_of(name, plan.inputs)
     load(name, template)
-    with closing(Place(name, template)) as place:
+    place = Place(name, template)
+    try:
         golden, profile = golden_run(place), None
         if plan.strategy().rule is Rule.INSTRUCTION:
             rng = generator(plan.seed, Stream.FAULT, name, "profile")
             profile = profile_kernel(place, rng, windows=plan.windows, sampled=kernel.too_long)
-        return Prepared(
-            kernel=name,
-            layout=place.layout,
-            golden=golden,
-            profile=profile,
-            prepare_s=time.perf_counter() - begun,
-        )
+    except BaseException:
+        place.close()
+        raise
+    prepared = Prepared(
+        kernel=name,
+        layout=place.layout,
+        golden=golden,
+        profile=profile,
+        prepare_s=time.perf_counter() - begun,
+    )
+    return prepared, place

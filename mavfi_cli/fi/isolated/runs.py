@@ -203,9 +203,14 @@ class _Open:
     @classmethod
     def of(cls, bench: Bench) -> Attacker[Any]:
         if cls.attacker is None or cls.stream != bench.stream:
-            cls.close()
-            cls.attacker, cls.stream = bench.open(), bench.stream
+            cls.keep(bench, bench.open())
+        assert cls.attacker is not None
         return cls.attacker
+
+    @classmethod
+    def keep(cls, bench: Bench, attacker: Attacker[Any]) -> None:
+        cls.close()
+        cls.attacker, cls.stream = attacker, bench.stream
 
     @classmethod
     def close(cls) -> None:
@@ -252,6 +257,13 @@ class Workers:
         _Open.close()
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
+
+    def take(self, bench: Bench, attacker: Attacker[Any]) -> None:
+        """Take over what was prepared in this process; what no worker here needs is closed."""
+        if self._pool is None:
+            _Open.keep(bench, attacker)
+        else:
+            attacker.place.close()
 
     def run(self, bench: Bench, tasks: Sequence[_Task]) -> Iterator[tuple[int, RunResult[Any]]]:
         """The results in the order of the tasks.
