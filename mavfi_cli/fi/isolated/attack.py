@@ -15,7 +15,6 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi.isolated.outcome import Outcome
 from mavfi_cli.fi.native.alarm import Alarm
 from mavfi_cli.fi.native.fault import InstructionFault, Stage
@@ -24,10 +23,9 @@ from mavfi_cli.fi.native.inject import (
     NOTHING,
     Followed,
     Injection,
-    apply,
-    follow,
     instruction_at,
     reach,
+    strike,
 )
 from mavfi_cli.fi.native.tracee import Ended, Tracee
 from mavfi_cli.fi.sampling import Rule, Strategy
@@ -192,16 +190,8 @@ class Attacker(Generic[V]):
 
     def _corrupt(self, start: float, tracee: Tracee, fault: InstructionFault) -> RunResult[V]:
         """Stopped in front of the attacked instruction: flip, follow, run to the end."""
-        instruction = instruction_at(tracee, tracee.registers.ip)
-        if instruction is None or instruction.raw != fault.instruction_bytes:
-            found = "nothing" if instruction is None else instruction.text
-            raise FaultError(f"{fault.target} holds {found!r}, expected {fault.instruction!r}")
-        injection, followed = None, NOTHING
         with self._deadline(tracee) as alarm:
-            if fault.corruption is not None:
-                injection = apply(tracee, instruction, fault.corruption)
-                window = self.limits.follow_window if tracee.ended is None else 0
-                followed = follow(tracee, instruction, fault.corruption, injection, window=window)
+            injection, followed = strike(tracee, fault, window=self.limits.follow_window)
             ended = run_out(tracee)
         reason = injection.reason if injection is not None else ""
         hung = alarm.fired and ended.signal == signal.SIGKILL
