@@ -15,7 +15,7 @@ from mavfi_cli.fi import record
 from mavfi_cli.fi.isolated.attack import Limits
 from mavfi_cli.fi.isolated.campaign import Plan, csv_rows, run_campaign
 from mavfi_cli.fi.isolated.compare import Comparison, digest, magnitude
-from mavfi_cli.fi.isolated.outcome import Outcome, shares, wilson
+from mavfi_cli.fi.isolated.outcome import Outcome, design_effect, shares, wilson
 from mavfi_cli.fi.isolated.program import ProgramTarget, Workplace, golden_run, profile_program
 from mavfi_cli.fi.native.arch.decode import decode
 from mavfi_cli.fi.native.breakpoints import Mechanism
@@ -326,6 +326,38 @@ def test_not_injected_runs_are_no_part_of_the_other_shares():
     assert (result[Outcome.SDC].share, result[Outcome.SDC].total) == (0.5, 2)
     assert (result[Outcome.NOT_INJECTED].share, result[Outcome.NOT_INJECTED].total) == (0.5, 4)
     assert math.isnan(wilson(0, 0).share)
+
+
+def test_runs_of_a_window_count_less_the_more_they_are_alike():
+    """Against the spread of the share over repeated samples of windows and of runs in them."""
+    rng = np.random.default_rng(4)
+    chances = rng.beta(0.5, 0.5, size=5000)  # of a crash, window by window
+
+    def campaign():
+        drawn = rng.choice(chances, size=20)
+        windows = rng.integers(20, size=400)
+        return rng.random(400) < drawn[windows], [("f", int(window)) for window in windows]
+
+    campaigns = [campaign() for _ in range(300)]
+    spread = np.var([hits.mean() for hits, _ in campaigns])
+    binomial = chances.mean() * (1.0 - chances.mean()) / 400
+    effects = [design_effect(hits.tolist(), windows) for hits, windows in campaigns]
+    assert spread / binomial > 5.0
+    assert np.mean(effects) == pytest.approx(spread / binomial, rel=0.2)
+
+
+def test_independent_runs_count_in_full():
+    rng = np.random.default_rng(5)
+    hits = (rng.random(400) < 0.3).tolist()
+    assert design_effect(hits, [None] * 400) == pytest.approx(1.0, abs=0.01)
+    strata = [(number % 2, number) for number in range(400)]
+    assert design_effect(hits, strata) == pytest.approx(1.0, abs=0.02)
+    assert design_effect([True] * 9, [("f", 1)] * 9) == 1.0
+    half = [Outcome.SDC, Outcome.BENIGN] * 50
+    alone = shares(half)[Outcome.SDC]
+    alike = shares(half, [("f", number % 2) for number in range(100)])[Outcome.SDC]
+    assert alike.share == alone.share == 0.5
+    assert alike.high - alike.low > 2.0 * (alone.high - alone.low)
 
 
 @pytest.mark.parametrize(

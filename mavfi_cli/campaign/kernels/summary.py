@@ -9,7 +9,7 @@ from typing import Any
 from mavfi_cli.campaign.kernels import catalogue
 from mavfi_cli.campaign.kernels.profile import in_words
 from mavfi_cli.campaign.kernels.runs import KernelRuns, Plan
-from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares_to_json
+from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json
 from mavfi_cli.fi.isolated.runs import csv_table
 
 SCHEMA = 1
@@ -36,6 +36,7 @@ def _kernel(runs: KernelRuns) -> dict[str, Any]:
     prepared, records = runs.prepared, runs.records
     profile = prepared.profile
     outcomes = [Outcome(entry["outcome"]) for entry in records]
+    windows = [] if profile is None else [profile.window_of(entry) for entry in records]
     sizes = [entry["magnitude"]["relative"] for entry in _with(records, Outcome.SDC)]
     finite = sorted(size for size in sizes if size is not None)
     run_s = sum(entry["run_s"] for entry in records)
@@ -52,7 +53,7 @@ def _kernel(runs: KernelRuns) -> dict[str, Any]:
             "cpu_s": prepared.golden.cpu_s,
             "wall_s": prepared.golden.wall_s,
         },
-        "outcomes": shares_to_json(outcomes),
+        "outcomes": shares_to_json(shares(outcomes, windows)),
         "crashes": counted(_crash(entry) for entry in _with(records, Outcome.CRASH)),
         "not_injected": counted(
             entry["not_injected_reason"] for entry in _with(records, Outcome.NOT_INJECTED)
@@ -92,8 +93,9 @@ def table(summary: Mapping[str, Any]) -> str:
     lines.append("")
     lines.append(
         f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
-        "95 % Wilson interval"
+        "95 % Wilson interval,"
     )
+    lines.append("widened by the likeness of faults in a window where windows are sampled")
     lines.append(f"inputs: {summary['plan']['flight']}; tolerance {summary['plan']['tolerance']:g}")
     for kernel in summary["kernels"]:
         lines += _notes(kernel)

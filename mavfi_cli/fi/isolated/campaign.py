@@ -11,7 +11,7 @@ from typing import Any
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.isolated.attack import Attacker
 from mavfi_cli.fi.isolated.journal import Journal
-from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares_to_json
+from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json
 from mavfi_cli.fi.isolated.profile import TargetProfile
 from mavfi_cli.fi.isolated.program import (
     Golden,
@@ -96,7 +96,7 @@ class Campaign:
             "profile_s": None if profile is None else profile.cost_s,
             "golden_wall_s": self.golden.wall_s,
             "wall_s": self.wall_s,
-            "outcomes": shares_to_json(Outcome(entry["outcome"]) for entry in records),
+            "outcomes": shares_to_json(shares(Outcome(entry["outcome"]) for entry in records)),
             "crashes": counted(
                 f"signal {entry['signal']}" if entry["signal"] else f"exit {entry['exit_code']}"
                 for entry in records

@@ -13,14 +13,16 @@ their mean length, and an instruction uniformly out of its stepped windows.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.isolated.attack import Place
+from mavfi_cli.fi.isolated.outcome import Window
 from mavfi_cli.fi.native.fault import InstructionFault, Stage
 from mavfi_cli.fi.native.image import Image, Location
 from mavfi_cli.fi.native.profile import Profile, Segment, record_window
@@ -74,6 +76,15 @@ class TargetProfile:
             if start <= address < start + len(data):
                 return data[address - start : address - start + 16]
         return b""
+
+    def window_of(self, record: Mapping[str, Any]) -> Window | None:
+        """The sampled window that a fault is from; None where no sample of windows was taken."""
+        first = record["trigger"][0]
+        for number, stratum in enumerate(self.strata):
+            at = stratum.marker
+            if at is not None and (at.object, at.offset) == (first["object"], first["offset"]):
+                return None if stratum.profile.complete else (number, int(first["count"]))
+        return None
 
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
         """One fault, uniform over the executed instructions."""
