@@ -13,6 +13,7 @@ from mavfi_cli.campaign.kernels.replay import replay_runs
 from mavfi_cli.campaign.kernels.summary import CSV_COLUMNS, csv_rows, summarise, table
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
+from mavfi_cli.fi.isolated import profile as isolated_profile
 from mavfi_cli.fi.isolated.compare import digest
 from mavfi_cli.report.kernel_plot import write_kernel_plot
 
@@ -126,6 +127,22 @@ def test_the_planner_is_attacked_in_its_own_library(attack):
     _, (runs,) = attack("rrtconnect", runs=10)
     assert {entry["object"] for entry in runs.records} <= {"libompl.so", "numba:segment_free"}
     assert runs.prepared.profile.complete
+
+
+def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
+    monkeypatch.setattr(isolated_profile, "ENOUGH", 0)
+    (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
+    start, windows = runs.prepared.profile.strata
+    assert start.marker is None
+    assert (len(windows.profile.segments), windows.profile.complete) == (3, False)
+    hit = {runs.prepared.profile.window_of(entry) for entry in runs.records} - {None}
+    assert hit <= {(1, segment.start[0].count) for segment in windows.profile.segments}
+    assert len(hit) > 1
+    (kernel,) = summarise(plan, [runs])["kernels"]
+    count = windows.profile.windows_in_run
+    assert f"by sample: the beginning, 3 of {count} windows from collide" in kernel["population"]
+    assert all(not replay.differs for replay in replay_runs(tmp_path))
 
 
 def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):

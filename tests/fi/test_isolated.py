@@ -205,6 +205,10 @@ def test_sampled_invocations_say_that_they_are_a_sample(target, workplace):
     assert (len(profile.segments), profile.windows_in_run, profile.complete) == (4, 50, False)
     campaign = run_campaign(Plan(target=program, runs=6, seed=5, windows=4))
     assert campaign.summary()["windows"] == "4 of 50"
+    hit = {campaign.profiled.window_of(entry) for entry in campaign.records}
+    starts = {segment.start[0].count for segment in campaign.profiled.strata[0].profile.segments}
+    assert hit <= {(0, number) for number in starts}
+    assert len(hit) > 1
     assert {entry["symbol"].split("+")[0] for entry in campaign.records} == {"body"}
 
 

@@ -82,7 +82,8 @@ class Campaign:
     def summary(self) -> dict[str, Any]:
         """Counts, shares and intervals, with everything that the numbers depend on."""
         profile, records = self.profiled, self.records
-        windows = None if profile is None else profile.strata[0].profile
+        stepped = None if profile is None else profile.strata[0].profile
+        windows = [] if profile is None else [profile.window_of(entry) for entry in records]
         return {
             **self.plan.context(),
             "sampling": self.plan.strategy().name,
@@ -91,12 +92,14 @@ class Campaign:
             "executed_in_scope": None if profile is None else profile.executed,
             "profile_complete": None if profile is None else profile.complete,
             "windows": None
-            if windows is None
-            else f"{len(windows.segments)} of {windows.windows_in_run}",
+            if stepped is None
+            else f"{len(stepped.segments)} of {stepped.windows_in_run}",
             "profile_s": None if profile is None else profile.cost_s,
             "golden_wall_s": self.golden.wall_s,
             "wall_s": self.wall_s,
-            "outcomes": shares_to_json(shares(Outcome(entry["outcome"]) for entry in records)),
+            "outcomes": shares_to_json(
+                shares((Outcome(entry["outcome"]) for entry in records), windows)
+            ),
             "crashes": counted(
                 f"signal {entry['signal']}" if entry["signal"] else f"exit {entry['exit_code']}"
                 for entry in records
