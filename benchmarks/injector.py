@@ -116,21 +116,19 @@ def starts(program: Path, runs: int = 40) -> tuple[list[float], list[float]]:
 
 def summarise(campaign: Campaign, say: Callable[[str], None]) -> None:
     """The figures of a campaign."""
-    results = [run.result for run in campaign.runs]
-    total = sum(result.run_s for result in results)
-    quick = [result.run_s for result in results if result.outcome is not Outcome.HANG]
-    hangs = len(results) - len(quick)
-    say(f"injections per hour and core: {3600 * len(results) / total:,.0f} in all")
+    records = campaign.records
+    total = sum(entry["run_s"] for entry in records)
+    quick = [e["run_s"] for e in records if e["outcome"] != Outcome.HANG.value]
+    hangs = len(records) - len(quick)
+    say(f"injections per hour and core: {3600 * len(records) / total:,.0f} in all")
     say(f"  without the {hangs} hangs: {3600 * len(quick) / sum(quick):,.0f}")
-    say(f"  one run: {milliseconds([result.run_s for result in results])}")
-    profile = campaign.profiled.profile if campaign.profiled else None
+    say(f"  one run: {milliseconds([entry['run_s'] for entry in records])}")
+    profile = campaign.profiled
     if profile is not None:
         say(f"  profile: {profile.executed} instructions in scope, {profile.cost_s:.2f} s, once")
-    injections = [result.injection for result in results if result.injection is not None]
-    say(f"stop: {milliseconds([done.stop_s for done in injections])}")
-    hits = [
-        sum(stage.count for stage in result.fault.trigger) for result in results if result.fault
-    ]
+    stops = [entry["injection"].get("stop_s") for entry in records]
+    say(f"stop: {milliseconds([stop for stop in stops if stop is not None])}")
+    hits = [sum(stage["count"] for stage in entry["trigger"]) for entry in records]
     say(f"counted executions a run: mean {np.mean(hits):.0f}, most {max(hits)}")
 
 

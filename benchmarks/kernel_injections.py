@@ -4,10 +4,10 @@
 
 For each kernel: exact injections per hour and core (sum of the runs' durations, hangs included; and
 with the preparation spread over 5,000 runs), the share of a run that goes into process start, the
-counted executions and the golden computation, the stop time, the slow-down of a kernel by a null
-injection, and how many of the replays came out identical. Targets: 50,000 an hour for PID and point
-cloud, 5,000 for OctoMap and RRT*; stop median under 0.2 ms, 99th percentile under 1 ms; 1,000
-identical replays over all kernels; a null injection costs less than 1 % outside the counted window.
+counted executions and the golden computation, the stop time, and how many of the replays came out
+identical. Targets: 50,000 an hour for PID and point cloud, 5,000 for OctoMap and RRT*; stop median
+under 0.2 ms, 99th percentile under 1 ms; 1,000 identical replays over all kernels. What a null
+injection costs is measured by `kernel_null.py`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.campaign.kernels import catalogue
-from mavfi_cli.campaign.kernels.attack import without_flip
 from mavfi_cli.campaign.kernels.place import Place, template_of
+from mavfi_cli.campaign.kernels.profile import in_words
 from mavfi_cli.campaign.kernels.recorder import inputs_of_flight
 from mavfi_cli.campaign.kernels.replay import replay_runs
-from mavfi_cli.campaign.kernels.runs import Plan, one_processor, run_kernels
-from mavfi_cli.fi import record
+from mavfi_cli.campaign.kernels.runs import Plan, run_kernels
+from mavfi_cli.fi.isolated.runs import one_processor
 from mavfi_cli.mission.config import MissionConfig
 
 
@@ -43,19 +43,6 @@ def starts(place: Place, runs: int = 20) -> tuple[float, float]:
     return float(np.median(ready)), float(np.median(call))
 
 
-def after_the_window(place: Place, fault, runs: int = 20) -> float:
-    """Median CPU time of a call whose null injection came at its first counted instruction."""
-    call = []
-    for _ in range(runs):
-        tracee = place.start()
-        first = fault.trigger[0]
-        if tracee.run_to(place.layout.image.address(first.location)):
-            while tracee.ended is None:
-                tracee.resume()
-        call.append(place.told().cpu_s)
-    return float(np.median(call))
-
-
 def measure(plan: Plan, folder: Path, replays: int) -> tuple[int, int]:
     """Print the figures of one kernel; identical replays and all replays."""
     (name,) = plan.kernels
@@ -69,8 +56,6 @@ def measure(plan: Plan, folder: Path, replays: int) -> tuple[int, int]:
         closing(Place(name, template_of(name, plan.inputs), layout=prepared.layout)) as place,
     ):
         ready_s, call_s = starts(place)
-        fault = without_flip(record.fault_of(records[0]))
-        null_s = after_the_window(place, fault)
     hangs = sum(entry["outcome"] == "hang" for entry in records)
     mean_s = run_s.mean()
     spread_s = mean_s + prepared.prepare_s / 5000
@@ -85,10 +70,9 @@ def measure(plan: Plan, folder: Path, replays: int) -> tuple[int, int]:
     )
     print(
         f"  stop: median {np.median(stop_ms):.3f} ms, 99th percentile "
-        f"{np.percentile(stop_ms, 99):.3f} ms; CPU time of the call {1e3 * call_s:.2f} ms, stopped "
-        f"once at the entry {1e3 * null_s:.2f} ms ({null_s / call_s - 1:+.1%})"
+        f"{np.percentile(stop_ms, 99):.3f} ms; CPU time of the call {1e3 * call_s:.2f} ms"
     )
-    print(f"  population: {prepared.profile.in_words()}")
+    print(f"  population: {in_words(prepared.profile)}")
     found = list(replay_runs(folder, (name,), replays)) if replays else []
     equal = sum(not replay.differs for replay in found)
     for replay in found:

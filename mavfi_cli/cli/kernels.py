@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -35,7 +35,12 @@ if TYPE_CHECKING:
 @click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
 @click.option("--scope", multiple=True, help="Program: shared object in scope.")
 @click.option("--function", help="Program: attack only inside calls of this function.")
-@click.option("--windows", default=16, show_default=True, help="Invocations that are sampled.")
+@click.option(
+    "--windows",
+    default=16,
+    show_default=True,
+    help="Windows (of a program: calls of --function) that are stepped, where all is too much.",
+)
 @click.option(
     "--sampling",
     default="instruction-uniform",
@@ -174,12 +179,10 @@ def _table(campaign: Campaign) -> str:
 
 
 def _save(campaign: Campaign, folder: Path) -> None:
+    from mavfi_cli.core.files import write_json, write_text
     from mavfi_cli.fi.isolated.campaign import csv_rows, to_json
 
-    partial = folder / "kernels.json.partial"
-    partial.write_text(json.dumps(to_json(campaign), indent=1) + "\n", encoding="utf-8")
-    os.replace(partial, folder / "kernels.json")
-    partial = folder / "kernels.csv.partial"
-    with partial.open("w", encoding="utf-8", newline="") as stream:
-        csv.writer(stream).writerows(csv_rows(campaign))
-    os.replace(partial, folder / "kernels.csv")
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(csv_rows(campaign))
+    write_text(folder / "kernels.csv", text.getvalue())
+    write_json(folder / "kernels.json", to_json(campaign))

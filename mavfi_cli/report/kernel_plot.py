@@ -14,6 +14,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = {"sdc": "#8e5aa3", "crash": "#e4572e", "hang": "#f2b134", "benign": "#c3d4e6"}
+_DARKER = {"sdc": "#6d3f84", "crash": "#b23a17", "hang": "#a06c00", "benign": "#4f6a88"}
+_INK = "#1d232b"
+_WIDTH = 0.6
+_ROOM = 5.0  # per cent that a number inside a bar needs; smaller shares are written beside it
+_LINE = 3.2  # per cent that a line of such numbers is high
+_VISIBLE = 0.5  # per cent; narrower intervals are not drawn
 _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 
@@ -49,25 +55,34 @@ def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
 
 
 def _bar(axes: Axes, place: int, outcomes: Mapping[str, Any]) -> None:
-    base = 0.0
+    """Segments from below; every one but the last has its interval at its upper edge."""
+    base, below = 0.0, -_LINE / 2  # a number does not lie on the axis
     for number, (name, colour) in enumerate(_COLOURS.items()):
         row = outcomes[name]
         share = 100.0 * (row["share"] or 0.0)
-        axes.bar(place, share, bottom=base, width=0.66, color=colour)
-        if share >= 5.0:
+        axes.bar(place, share, bottom=base, width=_WIDTH, color=colour)
+        if share >= _ROOM:
             axes.text(
-                place - 0.16, base + share / 2, f"{share:.0f}", color="#1d232b", fontsize=8.5,
+                place - 0.16, base + share / 2, f"{share:.0f}", color=_INK, fontsize=8.5,
                 ha="center", va="center",
             )  # fmt: skip
+        elif row["count"]:
+            below = max(base + share / 2, below + _LINE)
+            axes.text(
+                place + _WIDTH / 2 + 0.03, below, _small(share), color=_DARKER[name],
+                fontsize=7.5, ha="left", va="center",
+            )  # fmt: skip
         low, high = (100.0 * edge for edge in row["wilson95"])
-        if row["count"]:
-            top = name == "benign"  # the last one has its inner edge below
-            down, up = (high - share, share - low) if top else (share - low, high - share)
+        if row["count"] and name != "benign" and high - low >= _VISIBLE:
             axes.errorbar(
-                place + 0.03 + 0.08 * number, base if top else base + share, [[down], [up]],
-                color="#1d232b", elinewidth=0.9, capsize=2.0,
+                place + 0.03 + 0.1 * number, base + share, [[share - low], [high - share]],
+                color=_INK, elinewidth=0.9, capsize=2.0,
             )  # fmt: skip
         base += share
+
+
+def _small(share: float) -> str:
+    return f"{share:.1f}" if share >= 0.05 else "< 0.1"
 
 
 def _tick(kernel: Mapping[str, Any]) -> str:
@@ -76,8 +91,9 @@ def _tick(kernel: Mapping[str, Any]) -> str:
 
 
 def _caption(summary: Mapping[str, Any]) -> str:
-    model = summary["plan"]["model"]
+    bits = summary["plan"]["model"]["bits"]
     return (
-        f"{model['bits']} bit(s) flipped once a run; sampling: {summary['sampling']}\n"
-        "whiskers: 95 % Wilson interval of a share, at its inner edge"
+        f"{'one bit' if bits == 1 else f'{bits} bits'} flipped a run; sampling: "
+        f"{summary['sampling']}\n"
+        "whiskers: 95 % Wilson interval of a segment's share, at its upper edge; benign is the rest"
     )

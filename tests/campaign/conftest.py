@@ -1,5 +1,6 @@
 """Inputs of the kernels, recorded once, and a campaign on them."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,20 @@ def attack(tracing, kernel_inputs):
 
 
 @pytest.fixture(scope="session")
-def control_campaign(attack):
+def control_folder(tmp_path_factory, kernel_inputs):
+    """The folder of the campaign on the controller; copy it before you change it."""
+    folder = tmp_path_factory.mktemp("control")
+    (folder / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    return folder
+
+
+@pytest.fixture(scope="session")
+def control_campaign(attack, control_folder):
     """Thirty faults in the controller."""
-    return attack("control", runs=30)
+    return attack("control", runs=30, folder=control_folder)
+
+
+@pytest.fixture
+def control_copy(control_campaign, control_folder, tmp_path):
+    """A copy of that campaign's folder."""
+    return Path(shutil.copytree(control_folder, tmp_path / "control"))

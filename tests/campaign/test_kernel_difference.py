@@ -35,6 +35,22 @@ def test_damaged_bytes_are_refused():
         unpack(bytes(data))
 
 
+def test_whatever_the_damage_it_is_one_error():
+    """A kernel that goes wrong may write anything; a header of an array is a Python literal."""
+    whole = pack({"a": np.arange(24.0).reshape(2, 12), "b": np.array([True])})
+    rng = np.random.default_rng(1)
+    letters = np.frombuffer(b"0123456789'(){}[],:<>fiuVOS \n\"", np.uint8)
+    refused = 0
+    for _ in range(3000):
+        data = np.frombuffer(whole, np.uint8).copy()
+        data[rng.integers(len(data), size=3)] = rng.choice(letters, 3)
+        try:
+            unpack(data.tobytes())
+        except ValueError:
+            refused += 1
+    assert 1000 < refused < 3000
+
+
 def test_numbers_have_an_absolute_and_a_relative_size():
     golden = {"v": np.array([2.0, 0.0, math.nan, math.inf])}
     found = numbers(golden, {"v": np.array([2.5, 0.125, math.nan, math.inf])})

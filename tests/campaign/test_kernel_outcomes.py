@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavfi_cli.campaign.kernels.attack import Attacker, golden_run
+from mavfi_cli.campaign.kernels.attack import attacker_of, golden_run
 from mavfi_cli.campaign.kernels.catalogue import Kernel
 from mavfi_cli.campaign.kernels.place import Place, Template
 from mavfi_cli.campaign.kernels.profile import profile_kernel
@@ -71,7 +71,7 @@ def fault_in_r10(place, profile, bit):
 @pytest.mark.parametrize("expected", BODIES)
 def test_known_outcomes(known, expected):
     place = known(BODIES[expected])
-    attacker = Attacker(kernel=KNOWN, place=place, golden=golden_run(place))
+    attacker = attacker_of(KNOWN, place, golden_run(place))
     profile = profile_kernel(place, np.random.default_rng(0), windows=4)
     assert profile.complete
     for bit in (43, 44, 45, 46):
@@ -80,7 +80,7 @@ def test_known_outcomes(known, expected):
         assert result.injection.applied
         assert (result.signal == 11) == (expected is Outcome.CRASH)
         if expected is Outcome.SDC:
-            assert result.difference.absolute == 2.0**bit
+            assert result.verdict.difference.absolute == 2.0**bit
 
 
 def test_a_kernel_that_does_not_repeat_itself_is_refused(known):

@@ -12,6 +12,8 @@ from mavfi_cli.campaign.kernels.inputs import load_inputs
 from mavfi_cli.campaign.kernels.replay import replay_runs
 from mavfi_cli.campaign.kernels.summary import CSV_COLUMNS, csv_rows, summarise, table
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
+from mavfi_cli.core.files import write_json
+from mavfi_cli.fi.isolated import profile as isolated_profile
 from mavfi_cli.fi.isolated.compare import digest
 from mavfi_cli.report.kernel_plot import write_kernel_plot
 
@@ -27,13 +29,14 @@ def untimed(runs):
     return records
 
 
-def test_the_number_of_workers_changes_nothing(attack):
-    _, alone = attack("control", "point_cloud", runs=12)
+def test_the_number_of_workers_changes_nothing(attack, control_campaign):
+    _, (control,) = control_campaign
+    _, (cloud,) = attack("point_cloud", runs=12)
     _, together = attack("control", "point_cloud", runs=12, jobs=2)
-    for one, two in zip(alone, together, strict=True):
-        assert untimed(one) == untimed(two)
-        assert {entry["outcome"] for entry in one.records} <= OUTCOMES
-        assert any(entry["injection"]["applied"] for entry in one.records)
+    for alone, two in zip((control, cloud), together, strict=True):
+        assert untimed(two) == untimed(alone)[:12]
+        assert {entry["outcome"] for entry in two.records} <= OUTCOMES
+        assert any(entry["injection"]["applied"] for entry in two.records)
 
 
 def test_the_golden_run_is_the_kernel_itself(control_campaign, kernel_inputs):
@@ -54,33 +57,36 @@ def test_other_seeds_draw_other_faults(attack, control_campaign):
     assert [e["corruption"] for e in other.records] != [e["corruption"] for e in many.records[:5]]
 
 
-def test_a_campaign_that_was_cut_off_goes_on(attack, tmp_path):
-    _, (first,) = attack("control", runs=6, folder=tmp_path)
-    lines = (tmp_path / "runs.jsonl").read_text().splitlines(keepends=True)
-    (tmp_path / "runs.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
-    _, (second,) = attack("control", runs=8, folder=tmp_path)
+def test_a_campaign_that_was_cut_off_goes_on(attack, control_campaign, control_copy):
+    _, (first,) = control_campaign
+    lines = (control_copy / "runs.jsonl").read_text().splitlines(keepends=True)
+    (control_copy / "runs.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
+    _, (second,) = attack("control", runs=8, folder=control_copy)
     assert [entry["run"] for entry in second.records] == list(range(8))
-    assert untimed(second)[:6] == untimed(first)
+    assert untimed(second) == untimed(first)[:8]
     took = [entry["run_s"] for entry in first.records]
     assert [entry["run_s"] for entry in second.records[:3]] == took[:3]
 
 
-def test_another_campaign_is_not_mixed_in(attack, tmp_path):
-    attack("control", runs=1, folder=tmp_path)
+def test_another_campaign_is_not_mixed_in(attack, control_copy):
     with pytest.raises(ConfigError, match=r"another campaign; it differs in \['tolerance'\]"):
-        attack("control", runs=1, folder=tmp_path, tolerance=0.5)
+        attack("control", runs=1, folder=control_copy, tolerance=0.5)
 
 
-def test_recorded_runs_repeat(attack, kernel_inputs, tmp_path):
-    (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
-    attack("control", runs=10, folder=tmp_path)
-    replays = list(replay_runs(tmp_path, ("control",)))
-    assert [replay.differs for replay in replays] == [()] * 10
-    line = json.loads((tmp_path / "runs.jsonl").read_text().splitlines()[0])
+def test_recorded_runs_repeat(control_copy):
+    replays = list(replay_runs(control_copy, ("control",)))
+    assert [replay.differs for replay in replays] == [()] * 30
+    line = json.loads((control_copy / "runs.jsonl").read_text().splitlines()[0])
     line["output_sha256"] = "0"
-    (tmp_path / "runs.jsonl").write_text(json.dumps(line) + "\n")
-    (replay,) = replay_runs(tmp_path)
+    (control_copy / "runs.jsonl").write_text(json.dumps(line) + "\n")
+    (replay,) = replay_runs(control_copy)
     assert replay.differs == ("output_sha256",)
+
+
+def test_runs_of_a_program_are_not_replayed_as_kernels(tmp_path):
+    write_json(tmp_path / "plan.json", {"program": ["a.out"]})
+    with pytest.raises(RecordError, match="runs of a program"):
+        list(replay_runs(tmp_path))
 
 
 def test_nothing_to_replay_is_an_error(tmp_path):
@@ -121,6 +127,22 @@ def test_the_planner_is_attacked_in_its_own_library(attack):
     _, (runs,) = attack("rrtconnect", runs=10)
     assert {entry["object"] for entry in runs.records} <= {"libompl.so", "numba:segment_free"}
     assert runs.prepared.profile.complete
+
+
+def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
+    monkeypatch.setattr(isolated_profile, "ENOUGH", 0)
+    (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
+    start, windows = runs.prepared.profile.strata
+    assert start.marker is None
+    assert (len(windows.profile.segments), windows.profile.complete) == (3, False)
+    hit = {runs.prepared.profile.window_of(entry) for entry in runs.records} - {None}
+    assert hit <= {(1, segment.start[0].count) for segment in windows.profile.segments}
+    assert len(hit) > 1
+    (kernel,) = summarise(plan, [runs])["kernels"]
+    count = windows.profile.windows_in_run
+    assert f"by sample: the beginning, 3 of {count} windows from collide" in kernel["population"]
+    assert all(not replay.differs for replay in replay_runs(tmp_path))
 
 
 def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):

@@ -3,24 +3,20 @@
 import csv
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
+from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi import record
+from mavfi_cli.fi.isolated.attack import Limits
 from mavfi_cli.fi.isolated.campaign import Plan, csv_rows, run_campaign
-from mavfi_cli.fi.isolated.compare import Comparison, magnitude
-from mavfi_cli.fi.isolated.outcome import Outcome, shares, wilson
-from mavfi_cli.fi.isolated.program import (
-    Limits,
-    ProgramTarget,
-    Workplace,
-    golden_run,
-    profile_program,
-    run_fault,
-)
+from mavfi_cli.fi.isolated.compare import Comparison, digest, magnitude
+from mavfi_cli.fi.isolated.outcome import Outcome, design_effect, shares, wilson
+from mavfi_cli.fi.isolated.program import ProgramTarget, Workplace, golden_run, profile_program
 from mavfi_cli.fi.native.arch.decode import decode
 from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.fault import (
@@ -95,36 +91,37 @@ def victim_fault(place, target, bit):
 def test_programs_of_known_outcome(target, workplace, name, bit, outcome):
     program = target(name)
     place = workplace(program)
-    golden = golden_run(program, place)
+    attacker = place.attacker(golden_run(place))
     fault = victim_fault(place, program, bit)
     for _ in range(2 if outcome is Outcome.HANG else 5):
-        result = run_fault(program, place, golden, fault)
+        result = attacker.run(fault)
         assert result.outcome is outcome
         assert result.injection.applied
         assert result.injection.before ^ result.injection.after == 1 << bit
     if outcome is Outcome.CRASH:
         assert result.signal == 11
     if outcome is Outcome.SDC:
-        assert result.magnitude == pytest.approx((23 - 7) / 7)
+        assert result.verdict.magnitude == pytest.approx((23 - 7) / 7)
 
 
 def test_a_tolerance_makes_small_differences_benign(target, workplace):
     program = target("sdc", comparison=Comparison(tolerance=3.0))
     place = workplace(program)
-    result = run_fault(program, place, golden_run(program, place), victim_fault(place, program, 4))
-    assert (result.outcome, result.within_tolerance) == (Outcome.BENIGN, True)
+    attacker = place.attacker(golden_run(place))
+    result = attacker.run(victim_fault(place, program, 4))
+    assert (result.outcome, result.verdict.within_tolerance) == (Outcome.BENIGN, True)
 
 
 def test_the_same_fault_gives_the_same_output_20_times(target, workplace):
     program = target("counting", "60")
     place = workplace(program)
-    golden = golden_run(program, place)
+    attacker = place.attacker(golden_run(place))
     campaign = run_campaign(Plan(target=program, runs=12, seed=8))
-    run = next(r for r in campaign.runs if r.result.outcome is Outcome.SDC)
-    results = [run_fault(program, place, golden, run.result.fault) for _ in range(20)]
-    assert {r.output_sha256 for r in results} == {run.result.output_sha256}
-    assert {(r.injection.before, r.injection.after) for r in results} == {
-        (run.result.injection.before, run.result.injection.after)
+    entry = next(entry for entry in campaign.records if entry["outcome"] == "sdc")
+    results = [attacker.run(record.fault_of(entry)) for _ in range(20)]
+    assert {r.verdict.output_sha256 for r in results} == {entry["output_sha256"]}
+    assert {(hex(r.injection.before), hex(r.injection.after)) for r in results} == {
+        (entry["injection"]["before"], entry["injection"]["after"])
     }
 
 
@@ -134,22 +131,21 @@ def test_what_was_overwritten_before_it_was_read_is_benign(target, sites):
     model = FaultModel(roles=frozenset((Role.DESTINATION,)), sites=sites)
     campaign = run_campaign(Plan(target=target("sorting"), runs=80, seed=3, model=model))
     fates = {
-        (run.result.followed.activation, run.result.outcome)
-        for run in campaign.runs
-        if run.result.followed.activation is Activation.OVERWRITTEN
+        (Activation(entry["activation"]["activation"]), Outcome(entry["outcome"]))
+        for entry in campaign.records
+        if entry["activation"]["activation"] == Activation.OVERWRITTEN.value
     }
     expected = set() if sites != DATA_REGISTERS else {(Activation.OVERWRITTEN, Outcome.BENIGN)}
     assert fates - {(Activation.OVERWRITTEN, Outcome.BENIGN)} == set()
     assert fates >= expected
-    assert {run.result.outcome for run in campaign.runs} > {Outcome.BENIGN}
+    assert {entry["outcome"] for entry in campaign.records} > {"benign"}
 
 
 def test_a_null_injection_changes_nothing(target):
     campaign = run_campaign(Plan(target=target("counting", "60"), runs=10, seed=2, null=True))
-    assert {run.result.outcome for run in campaign.runs} == {Outcome.BENIGN}
-    assert {run.result.output_sha256 for run in campaign.runs} == {
-        campaign.runs[0].result.output_sha256
-    }
+    assert {entry["outcome"] for entry in campaign.records} == {"benign"}
+    golden = digest(campaign.golden.output)
+    assert {entry["output_sha256"] for entry in campaign.records} == {golden}
 
 
 def test_workers_draw_disjoint_streams_and_do_not_change_the_result(target):
@@ -158,19 +154,20 @@ def test_workers_draw_disjoint_streams_and_do_not_change_the_result(target):
 
     def essence(campaign):
         return [
-            (r.index, r.result.fault, r.result.outcome, r.result.output_sha256)
-            for r in campaign.runs
+            (entry["run"], record.fault_of(entry), entry["outcome"], entry["output_sha256"])
+            for entry in campaign.records
         ]
 
     assert essence(alone) == essence(together)
-    assert len({r.result.fault for r in alone.runs}) > 20
+    assert len({record.fault_of(entry) for entry in alone.records}) > 20
 
 
 def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplace):
     program = target("counting", "5")
     place = workplace(program)
-    golden = golden_run(program, place)
-    fault = run_campaign(Plan(target=target("counting", "60"), runs=1, seed=1)).runs[0].result.fault
+    attacker = place.attacker(golden_run(place))
+    (entry,) = run_campaign(Plan(target=target("counting", "60"), runs=1, seed=1)).records
+    fault = record.fault_of(entry)
     late = InstructionFault(
         trigger=(Stage(fault.target, 100_000),),
         execution=100_000,
@@ -178,7 +175,7 @@ def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplac
         instruction_bytes=fault.instruction_bytes,
         corruption=fault.corruption,
     )
-    result = run_fault(program, place, golden, late)
+    result = attacker.run(late)
     assert result.outcome is Outcome.NOT_INJECTED
     assert "ended before execution 100000 of counting+0x" in result.reason
     assert result.followed.activation is Activation.NOT_INJECTED
@@ -187,7 +184,7 @@ def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplac
 def test_another_instruction_at_the_place_is_refused(target, workplace):
     program = target("sdc")
     place = workplace(program)
-    golden = golden_run(program, place)
+    attacker = place.attacker(golden_run(place))
     fault = victim_fault(place, program, 1)
     other = InstructionFault(
         trigger=fault.trigger,
@@ -197,17 +194,22 @@ def test_another_instruction_at_the_place_is_refused(target, workplace):
         corruption=fault.corruption,
     )
     with pytest.raises(FaultError, match="expected 'nop'"):
-        run_fault(program, place, golden, other)
+        attacker.run(other)
 
 
 def test_sampled_invocations_say_that_they_are_a_sample(target, workplace):
     program = target("counting", "50", function="body")
-    profiled = profile_program(program, workplace(program), np.random.default_rng(3), windows=4)
-    profile = profiled.profile
+    profiled = profile_program(workplace(program), np.random.default_rng(3), windows=4)
+    (stratum,) = profiled.strata
+    profile = stratum.profile
     assert (len(profile.segments), profile.windows_in_run, profile.complete) == (4, 50, False)
     campaign = run_campaign(Plan(target=program, runs=6, seed=5, windows=4))
     assert campaign.summary()["windows"] == "4 of 50"
-    assert {run.record["symbol"].split("+")[0] for run in campaign.runs} == {"body"}
+    hit = {campaign.profiled.window_of(entry) for entry in campaign.records}
+    starts = {segment.start[0].count for segment in campaign.profiled.strata[0].profile.segments}
+    assert hit <= {(0, number) for number in starts}
+    assert len(hit) > 1
+    assert {entry["symbol"].split("+")[0] for entry in campaign.records} == {"body"}
 
 
 def test_debug_registers_give_the_same_faults_and_outcomes(target):
@@ -216,7 +218,10 @@ def test_debug_registers_give_the_same_faults_and_outcomes(target):
     def essence(mechanism):
         program = target("counting", "12", function="body", mechanism=mechanism)
         campaign = run_campaign(Plan(target=program, runs=10, seed=5, windows=3))
-        return [(r.result.fault, r.result.outcome, r.result.output_sha256) for r in campaign.runs]
+        return [
+            (record.fault_of(entry), entry["outcome"], entry["output_sha256"])
+            for entry in campaign.records
+        ]
 
     assert essence(Mechanism.PERF) == essence(Mechanism.DEBUG)
 
@@ -227,12 +232,12 @@ def test_time_rules_name_themselves_and_count_what_they_miss(target, options):
     summary = campaign.summary()
     assert summary["sampling"].startswith(next(iter(options.values())))
     assert sum(row["count"] for row in summary["outcomes"].values()) == 8
-    for run in campaign.runs:
-        injected = run.result.outcome is not Outcome.NOT_INJECTED
-        assert injected == (not run.result.reason)
+    for entry in campaign.records:
+        injected = entry["outcome"] != "not_injected"
+        assert injected == (not entry["not_injected_reason"])
         if injected and "compat" in options:
-            assert set(run.record["corruption"]["bits"]) <= set(range(8))
-            assert run.record["corruption"]["operand"] not in ("rax", "eax", "rsp", "rip")
+            assert set(entry["corruption"]["bits"]) <= set(range(8))
+            assert entry["corruption"]["operand"] not in ("rax", "eax", "rsp", "rip")
 
 
 def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_program):
@@ -243,7 +248,7 @@ def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_progr
     program = ProgramTarget(command=Command.of([str(script)]), comparison=Comparison())
     place = Workplace(program)
     with pytest.raises(TargetError, match="two fault-free runs differ"):
-        golden_run(program, place)
+        golden_run(place)
     place.close()
 
 
@@ -251,22 +256,38 @@ def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_progr
 
 
 def test_a_record_survives_and_gives_the_fault_back(target, tmp_path):
-    campaign = run_campaign(Plan(target=target("counting", "30"), runs=5, seed=9), folder=tmp_path)
+    plan = Plan(target=target("counting", "30"), runs=5, seed=9)
+    campaign = run_campaign(plan, folder=tmp_path)
     planned = [json.loads(line) for line in (tmp_path / "faults.jsonl").read_text().splitlines()]
-    for before, run in zip(planned, campaign.runs, strict=True):
+    for before, entry in zip(planned, campaign.records, strict=True):
         assert before["state"] == "planned"
         path = tmp_path / "fault.json"
-        record.write(path, run.record)
+        record.write(path, entry)
         again = record.read(path)
-        assert record.fault_of(again) == record.fault_of(before) == run.result.fault
+        rng = generator(9, Stream.FAULT, entry["run"])
+        drawn = campaign.profiled.draw(plan.strategy(), rng)
+        assert record.fault_of(again) == record.fault_of(before) == drawn
         assert again["object"] == "counting"
         assert again["symbol"]
-        assert int(again["injection"]["before"], 16) == run.result.injection.before
+        assert again == entry
+
+
+def test_a_campaign_that_was_cut_off_goes_on(target, tmp_path):
+    plan = Plan(target=target("counting", "30"), runs=6, seed=9)
+    first = run_campaign(plan, folder=tmp_path).records
+    lines = (tmp_path / "runs.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "runs.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
+    second = run_campaign(replace(plan, runs=8), folder=tmp_path).records
+    assert [entry["run"] for entry in second] == list(range(8))
+    assert second[:3] == first[:3]
+    assert [entry["outcome"] for entry in second[:6]] == [entry["outcome"] for entry in first]
+    with pytest.raises(ConfigError, match=r"another campaign; it differs in \['seed'\]"):
+        run_campaign(replace(plan, seed=10), folder=tmp_path)
 
 
 def test_a_record_of_another_build_is_refused(target, start):
     campaign = run_campaign(Plan(target=target("counting", "30"), runs=1, seed=9))
-    written = campaign.runs[0].record
+    written = campaign.records[0]
     image = Image(start("counting").pid)
     record.require_same_build(written, image)
     changed = {**written, "build_ids": {"counting": "0123", "libgone.so": "45"}}
@@ -309,6 +330,38 @@ def test_not_injected_runs_are_no_part_of_the_other_shares():
     assert (result[Outcome.SDC].share, result[Outcome.SDC].total) == (0.5, 2)
     assert (result[Outcome.NOT_INJECTED].share, result[Outcome.NOT_INJECTED].total) == (0.5, 4)
     assert math.isnan(wilson(0, 0).share)
+
+
+def test_runs_of_a_window_count_less_the_more_they_are_alike():
+    """Against the spread of the share over repeated samples of windows and of runs in them."""
+    rng = np.random.default_rng(4)
+    chances = rng.beta(0.5, 0.5, size=5000)  # of a crash, window by window
+
+    def campaign():
+        drawn = rng.choice(chances, size=20)
+        windows = rng.integers(20, size=400)
+        return rng.random(400) < drawn[windows], [("f", int(window)) for window in windows]
+
+    campaigns = [campaign() for _ in range(300)]
+    spread = np.var([hits.mean() for hits, _ in campaigns])
+    binomial = chances.mean() * (1.0 - chances.mean()) / 400
+    effects = [design_effect(hits.tolist(), windows) for hits, windows in campaigns]
+    assert spread / binomial > 5.0
+    assert np.mean(effects) == pytest.approx(spread / binomial, rel=0.2)
+
+
+def test_independent_runs_count_in_full():
+    rng = np.random.default_rng(5)
+    hits = (rng.random(400) < 0.3).tolist()
+    assert design_effect(hits, [None] * 400) == pytest.approx(1.0, abs=0.01)
+    strata = [(number % 2, number) for number in range(400)]
+    assert design_effect(hits, strata) == pytest.approx(1.0, abs=0.02)
+    assert design_effect([True] * 9, [("f", 1)] * 9) == 1.0
+    half = [Outcome.SDC, Outcome.BENIGN] * 50
+    alone = shares(half)[Outcome.SDC]
+    alike = shares(half, [("f", number % 2) for number in range(100)])[Outcome.SDC]
+    assert alike.share == alone.share == 0.5
+    assert alike.high - alike.low > 2.0 * (alone.high - alone.low)
 
 
 @pytest.mark.parametrize(
@@ -360,7 +413,7 @@ def test_a_file_as_output(native_program, tmp_path, target):
         objects=("dash",),
     )
     place = Workplace(program)
-    assert golden_run(program, place).output == b"42\n"
+    assert golden_run(place).output == b"42\n"
     place.close()
 
 

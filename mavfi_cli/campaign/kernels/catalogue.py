@@ -29,8 +29,8 @@ class Kernel:
         prepare: from the inputs to a call; everything before the kernel itself happens here.
         compare: size of the difference of two outputs.
         repeatable: the call leaves no state behind, so it is warmed up by calling it.
-        too_long: to be stepped as a whole; functions inside it are sampled.
-        inner: compiled functions that are sampled beside those of its scope.
+        too_long: to be stepped as a whole; a sample of windows is.
+        inner: compiled functions where windows begin, beside those of its scope.
     """
 
     name: str
@@ -128,7 +128,12 @@ KERNELS = {
             repeatable=False,
             too_long=True,
         ),
-        Kernel(name="collision_check", title="Collision check", prepare=_collision_check),
+        Kernel(
+            name="collision_check",
+            title="Collision check",
+            prepare=_collision_check,
+            too_long=True,
+        ),
         Kernel(name="rrt", title="RRT", prepare=_planner("rrt"), compare=paths),
         Kernel(
             name="rrtconnect", title="RRTConnect", prepare=_planner("rrtconnect"), compare=paths

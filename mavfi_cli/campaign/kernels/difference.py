@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import tokenize
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,12 @@ from numpy.typing import NDArray
 from mavfi_cli.autonomy.octree import occupied_leaves
 
 Output = dict[str, NDArray[np.generic]]
+
+# What numpy raises when it reads an array whose header is no header, beside ValueError.
+_DAMAGE = (
+    OSError, EOFError, SyntaxError, MemoryError, TypeError, OverflowError, SystemError,
+    tokenize.TokenError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +74,7 @@ def unpack(data: bytes) -> Output:
         while buffer.tell() < len(data):
             name = np.load(buffer, allow_pickle=False)
             output[str(name)] = np.load(buffer, allow_pickle=False)
-    except (OSError, EOFError, SyntaxError, MemoryError) as error:
+    except _DAMAGE as error:
         raise ValueError(f"damaged output: {error}") from None
     return output
 

@@ -14,6 +14,7 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import DepthFrame, FloatArray, PointCloud
 
+INPUTS = "inputs.pickle"  # file of a campaign's folder
 _PROTOCOL = 5
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import pickle
@@ -17,7 +18,7 @@ from mavfi_cli.campaign.kernels.template import ASK_SCOPE, GO, LENGTH_BYTES, PID
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.breakpoints import Mechanism
-from mavfi_cli.fi.native.image import Image
+from mavfi_cli.fi.native.image import Image, Scope, scope_of
 from mavfi_cli.fi.native.tracee import Tracee
 from mavfi_cli.mission.kernel_scope import KernelScope
 
@@ -65,9 +66,11 @@ class Told:
 class Place:
     """One template of a kernel with its output file; belongs to the thread that made it."""
 
+    kind = "kernel"
+
     def __init__(
         self,
-        kernel: str,
+        name: str,
         template: Template,
         *,
         layout: Layout | None = None,
@@ -77,7 +80,7 @@ class Place:
         """Start the template.
 
         Args:
-            kernel: its name.
+            name: of the kernel.
             template: how its process is started.
             layout: of another template of the same kernel; looking it up takes seconds.
             mechanism: how executions are counted.
@@ -86,7 +89,7 @@ class Place:
         Raises:
             TargetError: the kernel cannot be loaded.
         """
-        self.kernel = kernel
+        self.name = name
         self._mechanism = mechanism
         self._output = os.memfd_create("mavfi-kernel-output", 0)
         self._control, theirs = socket.socketpair()
@@ -126,7 +129,7 @@ class Place:
         while len(data) < size:
             piece = self._control.recv(size - len(data))
             if not piece:
-                raise TargetError(self.kernel, f"does not load: {self._last_words()}")
+                raise TargetError(self.name, f"does not load: {self._last_words()}")
             data += piece
         return data
 
@@ -145,10 +148,18 @@ class Place:
         self._control.send(RUN)
         told = self._control.recv(PID_BYTES)
         if len(told) < PID_BYTES:
-            raise FaultError(f"the process that loads {self.kernel} has died")
+            raise FaultError(f"the process that loads {self.name} has died")
         tracee = Tracee.attach(int.from_bytes(told, "little"), mechanism=self._mechanism)
         self._control.send(GO)
         return tracee
+
+    def image(self, _: Tracee) -> Image:
+        """What a run has in its memory: the same in all."""
+        return self.layout.image
+
+    def scope(self, image: Image) -> Scope:
+        """The code that may be hit."""
+        return scope_of(image, self.layout.scope.objects)
 
     def told(self) -> Told | None:
         """What the run that has ended left; None where it left nothing whole."""
@@ -181,6 +192,7 @@ def template_of(kernel: str, inputs: Path) -> Template:
     return Template(arguments=("-m", "mavfi_cli.campaign.kernels.template", kernel), data=data)
 
 
+@functools.cache
 def load(kernel: str, template: Template) -> None:
     """Load a kernel once, so that all its compiled code is in the cache from now on."""
     Place(kernel, template, look_up=False).close()

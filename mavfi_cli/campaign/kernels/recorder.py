@@ -13,12 +13,12 @@ from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.pilot import Directive, PlanRequest
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.campaign.kernels.inputs import (
+    INPUTS,
     KernelInputs,
     PlanningTask,
     load_inputs,
     save_inputs,
 )
-from mavfi_cli.campaign.kernels.journal import INPUTS
 from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import Command, DepthFrame, FloatArray, Outcome, PointCloud, VehicleState

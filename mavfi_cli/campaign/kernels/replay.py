@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.kernels import catalogue
-from mavfi_cli.campaign.kernels.attack import Attacker, golden_run
-from mavfi_cli.campaign.kernels.journal import INPUTS, read_plan, read_runs
+from mavfi_cli.campaign.kernels.attack import KernelVerdict, attacker_of, golden_run
+from mavfi_cli.campaign.kernels.inputs import INPUTS
 from mavfi_cli.campaign.kernels.place import Place, load, template_of
-from mavfi_cli.campaign.kernels.runs import completed, one_processor
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.fi import record
+from mavfi_cli.fi.isolated.attack import Attacker
+from mavfi_cli.fi.isolated.journal import read_plan, read_runs
+from mavfi_cli.fi.isolated.runs import completed, one_processor
 
 # What a replay must repeat; how long things took is not part of it.
 _COMPARED = (
@@ -43,13 +45,20 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
         runs: only as many of each kernel, the first; 0 for all.
 
     Raises:
-        RecordError: the folder holds no runs that can be repeated.
+        RecordError: the folder holds no runs of kernels that can be repeated.
         BuildMismatch: a record is of another build; says what differs.
     """
-    tolerance = float(read_plan(folder)["tolerance"])
+    plan = read_plan(folder)
+    if "tolerance" not in plan:
+        raise RecordError(f"{folder}: holds runs of a program; only our kernels' can be repeated")
+    tolerance = float(plan["tolerance"])
     found = False
     for kernel in catalogue.select(kernels):
-        records = [entry for entry in read_runs(folder, kernel.name) if entry["trigger"]]
+        records = [
+            entry
+            for entry in read_runs(folder)
+            if entry.get("kernel") == kernel.name and entry["trigger"]
+        ]
         if not records:
             continue
         found = True
@@ -57,9 +66,7 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
         with one_processor():
             load(kernel.name, template)
             with closing(Place(kernel.name, template)) as place:
-                attacker = Attacker(
-                    kernel=kernel, place=place, golden=golden_run(place), tolerance=tolerance
-                )
+                attacker = attacker_of(kernel, place, golden_run(place), tolerance=tolerance)
                 for entry in records[: runs or None]:
                     record.require_same_build(entry, place.layout.image)
                     yield _replay(attacker, entry)
@@ -67,7 +74,7 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
         raise RecordError(f"{folder}: no runs that can be repeated")
 
 
-def _replay(attacker: Attacker, entry: dict[str, Any]) -> Replay:
+def _replay(attacker: Attacker[KernelVerdict], entry: dict[str, Any]) -> Replay:
     again = completed(entry, attacker.run(record.fault_of(entry)))
     differs = [name for name in _COMPARED if again[name] != entry[name]]
     was, now = entry["injection"], again["injection"]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import signal
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.campaign.kernels import catalogue, journal
+from mavfi_cli.campaign.kernels import catalogue
+from mavfi_cli.campaign.kernels.profile import in_words
 from mavfi_cli.campaign.kernels.runs import KernelRuns, Plan
-from mavfi_cli.fi.isolated.outcome import Outcome, shares
+from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json
+from mavfi_cli.fi.isolated.runs import csv_table
 
 SCHEMA = 1
 _COLUMNS = (
@@ -26,7 +26,7 @@ def summarise(plan: Plan, campaign: Sequence[KernelRuns]) -> dict[str, Any]:
     """The whole campaign as plain values."""
     return {
         "schema": SCHEMA,
-        "plan": journal.plan_to_json(plan),
+        "plan": plan.to_json(),
         "sampling": plan.strategy().name,
         "kernels": [_kernel(runs) for runs in campaign],
     }
@@ -36,6 +36,7 @@ def _kernel(runs: KernelRuns) -> dict[str, Any]:
     prepared, records = runs.prepared, runs.records
     profile = prepared.profile
     outcomes = [Outcome(entry["outcome"]) for entry in records]
+    windows = [] if profile is None else [profile.window_of(entry) for entry in records]
     sizes = [entry["magnitude"]["relative"] for entry in _with(records, Outcome.SDC)]
     finite = sorted(size for size in sizes if size is not None)
     run_s = sum(entry["run_s"] for entry in records)
@@ -43,7 +44,7 @@ def _kernel(runs: KernelRuns) -> dict[str, Any]:
         "kernel": prepared.kernel,
         "title": catalogue.find(prepared.kernel).title,
         "runs": len(records),
-        "population": "moments of one call" if profile is None else profile.in_words(),
+        "population": "moments of one call" if profile is None else in_words(profile),
         "complete": None if profile is None else profile.complete,
         "instructions": None if profile is None else profile.instructions,
         "scope": list(prepared.layout.scope.objects),
@@ -52,20 +53,12 @@ def _kernel(runs: KernelRuns) -> dict[str, Any]:
             "cpu_s": prepared.golden.cpu_s,
             "wall_s": prepared.golden.wall_s,
         },
-        "outcomes": {
-            outcome.value: {
-                "count": share.count,
-                "of": share.total,
-                "share": None if math.isnan(share.share) else share.share,
-                "wilson95": [share.low, share.high],
-            }
-            for outcome, share in shares(outcomes).items()
-        },
-        "crashes": _counted(_crash(entry) for entry in _with(records, Outcome.CRASH)),
-        "not_injected": _counted(
+        "outcomes": shares_to_json(shares(outcomes, windows)),
+        "crashes": counted(_crash(entry) for entry in _with(records, Outcome.CRASH)),
+        "not_injected": counted(
             entry["not_injected_reason"] for entry in _with(records, Outcome.NOT_INJECTED)
         ),
-        "activation": _counted(entry["activation"]["activation"] for entry in records),
+        "activation": counted(entry["activation"]["activation"] for entry in records),
         "sdc_relative": {
             "median": finite[len(finite) // 2] if finite else None,
             "largest": finite[-1] if finite else None,
@@ -90,11 +83,6 @@ def _crash(entry: Mapping[str, Any]) -> str:
     return str(entry["error"]).partition(":")[0] or "exit"
 
 
-def _counted(names: Iterable[str]) -> dict[str, int]:
-    counts = Counter(names)
-    return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}
-
-
 def table(summary: Mapping[str, Any]) -> str:
     """The summary as text: one row a kernel, shares of injected runs with 95 % intervals."""
     head = f"{'kernel':<17}{'runs':>6}" + "".join(f"{o.value:>21}" for o in _SHOWN)
@@ -105,8 +93,9 @@ def table(summary: Mapping[str, Any]) -> str:
     lines.append("")
     lines.append(
         f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
-        "95 % Wilson interval"
+        "95 % Wilson interval,"
     )
+    lines.append("widened by the likeness of faults in a window where windows are sampled")
     lines.append(f"inputs: {summary['plan']['flight']}; tolerance {summary['plan']['tolerance']:g}")
     for kernel in summary["kernels"]:
         lines += _notes(kernel)
@@ -139,15 +128,4 @@ def _notes(kernel: Mapping[str, Any]) -> list[str]:
 
 def csv_rows(campaign: Iterable[KernelRuns]) -> Iterator[list[str]]:
     """Header and one row a run."""
-    yield list(CSV_COLUMNS)
-    for runs in campaign:
-        for entry in runs.records:
-            flat = {
-                **entry,
-                **(entry.get("corruption") or {}),
-                **entry["injection"],
-                **(entry["magnitude"] or {}),
-            }
-            flat["activation"] = entry["activation"]["activation"]
-            flat["bits"] = " ".join(str(bit) for bit in flat.get("bits", ()))
-            yield ["" if flat.get(name) is None else str(flat[name]) for name in CSV_COLUMNS]
+    return csv_table(CSV_COLUMNS, (entry for runs in campaign for entry in runs.records))

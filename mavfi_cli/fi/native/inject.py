@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from enum import Enum
 
+from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.native.arch.decode import Instruction, address_of, decode
 from mavfi_cli.fi.native.arch.x86_64 import TRAP_FLAG, width_of
@@ -189,6 +190,30 @@ def follow(
             return Followed(activation=Activation.ENDED_BEFORE_READ, after_instructions=distance)
     what = Activation.NOT_READ_IN_WINDOW if window else Activation.NOT_FOLLOWED
     return Followed(activation=what, after_instructions=window)
+
+
+def strike(
+    tracee: Tracee, fault: InstructionFault, *, window: int
+) -> tuple[Injection | None, Followed]:
+    """At the stop in front of the attacked instruction: corrupt as the fault says, and follow.
+
+    Args:
+        tracee: stopped there.
+        fault: with its corruption; without one nothing is done.
+        window: how many instructions a destination fault is followed.
+
+    Raises:
+        FaultError: another instruction is at the place.
+    """
+    instruction = instruction_at(tracee, tracee.registers.ip)
+    if instruction is None or instruction.raw != fault.instruction_bytes:
+        found = "nothing" if instruction is None else instruction.text
+        raise FaultError(f"{fault.target} holds {found!r}, expected {fault.instruction!r}")
+    if fault.corruption is None:
+        return None, NOTHING
+    injection = apply(tracee, instruction, fault.corruption)
+    steps = window if tracee.ended is None else 0
+    return injection, follow(tracee, instruction, fault.corruption, injection, window=steps)
 
 
 def _touch(

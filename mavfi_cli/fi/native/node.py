@@ -17,20 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi import record
 from mavfi_cli.fi.native.breakpoints import ExecutionCounter
 from mavfi_cli.fi.native.fault import InstructionFault, Stage
 from mavfi_cli.fi.native.image import Image, Location, Regions, scope_of
-from mavfi_cli.fi.native.inject import (
-    NOTHING,
-    Followed,
-    Injection,
-    apply,
-    follow,
-    instruction_at,
-    reach,
-)
+from mavfi_cli.fi.native.inject import NOTHING, Followed, Injection, reach, strike
 from mavfi_cli.fi.native.profile import Segment, record_window
 from mavfi_cli.fi.native.tracee import Ended, Tracee, stack_word
 
@@ -195,7 +187,7 @@ def attack(
         if not reason:
             if stopped is not None:
                 stopped(tracee)
-            injection, followed = _corrupt(tracee, fault, window)
+            injection, followed = strike(tracee, fault, window=window)
             reason = "" if injection is None else injection.reason
             if leave_stopped and tracee.ended is None:
                 os.kill(pid, signal.SIGSTOP)
@@ -207,17 +199,3 @@ def attack(
     return Attack(
         injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
     )
-
-
-def _corrupt(
-    tracee: Tracee, fault: InstructionFault, window: int
-) -> tuple[Injection | None, Followed]:
-    instruction = instruction_at(tracee, tracee.registers.ip)
-    if instruction is None or instruction.raw != fault.instruction_bytes:
-        found = "nothing" if instruction is None else instruction.text
-        raise FaultError(f"{fault.target} holds {found!r}, expected {fault.instruction!r}")
-    if fault.corruption is None:
-        return None, NOTHING
-    injection = apply(tracee, instruction, fault.corruption)
-    steps = window if tracee.ended is None else 0
-    return injection, follow(tracee, instruction, fault.corruption, injection, window=steps)

@@ -8,7 +8,7 @@ breakpoint instruction, so that no way back in (return, callback, exception) is 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,9 +83,15 @@ class WindowTooLong(TargetError):
 
 
 def record_window(
-    tracee: Tracee, scope: Scope, *, limit: int, program: str, until_return: bool = False
+    tracee: Tracee,
+    scope: Scope,
+    *,
+    limit: int,
+    program: str,
+    until_return: bool = False,
+    markers: Sequence[int] = (),
 ) -> NDArray[np.int64]:
-    """Step from the present stop to the end of the program, or of the current function.
+    """Step from the present stop to the end of the program, of the function, or to a marker.
 
     Args:
         tracee: stopped at the start of the window.
@@ -93,15 +99,20 @@ def record_window(
         limit: refuse longer windows.
         program: its name, for the error.
         until_return: the target is at a function's entry; the window ends when it returns.
+        markers: addresses in scope; the window ends in front of the next execution of one. The
+            instruction that the target is stopped in front of is in the window in any case.
 
     Raises:
         WindowTooLong: more than `limit` instructions in scope.
     """
-    stop = np.array([-1, 0], np.int64)
+    stop = np.array([-1, 0, *markers], np.int64)
     if until_return:
-        stop[:] = stack_word(tracee), tracee.registers.sp
+        stop[:2] = stack_word(tracee), tracee.registers.sp
     parts: list[NDArray[np.int64]] = []
-    total = 0
+    if tracee.registers.ip in markers:
+        parts.append(np.array([tracee.registers.ip], np.int64))
+        clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
+    total = len(parts)
     for part in _parts(tracee, scope, stop):
         parts.append(part)
         total += len(part)

@@ -63,7 +63,8 @@ def _run(
         tid: the stopped thread.
         spans: (n, 2) addresses in scope.
         trace: (m,) filled from the start.
-        stop: (2,) the window ends at this address once the stack pointer is above the second.
+        stop: (2 + m,) the window ends at the first address once the stack pointer is above the
+            second number, and at each of the other addresses.
         offsets: (2,) of instruction and stack pointer in `struct user`.
         status: (1,) the last wait status, where it is not a plain step.
 
@@ -76,6 +77,9 @@ def _run(
         ip = _ptrace(PEEKUSER, tid, offsets[0], 0)
         if ip == stop[0] and _ptrace(PEEKUSER, tid, offsets[1], 0) > stop[1]:
             return recorded, WINDOW_END
+        for place in range(2, stop.shape[0]):
+            if ip == stop[place]:
+                return recorded, WINDOW_END
         if ip != repeating:
             repeating = np.int64(-1)
             inside = False
