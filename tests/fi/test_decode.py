@@ -7,7 +7,7 @@ arch = pytest.importorskip("platform")
 if arch.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
-from mavfi_cli.fi.native.arch.decode import address_of, decode, widest_vector  # noqa: E402
+from mavfi_cli.fi.native.arch import address_of, decode, widest_vector  # noqa: E402
 
 FULL = (1 << 64) - 1
 
@@ -40,7 +40,7 @@ def test_implicit_operands_are_named():
     assert {"rax", "rdx", "cf", "of"} <= names(multiply.writes)
     copy = of("f348a5")  # rep movsq
     assert {"rsi", "rdi", "rcx", "df"} <= names(copy.reads)
-    assert copy.repeats
+    assert copy.run_over
 
 
 def test_flags_are_single_bits():

@@ -10,7 +10,7 @@ if platform.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.fault import FaultModel, Role, Site, draw_corruption
 from mavfi_cli.fi.sampling import strategy
 

@@ -21,7 +21,7 @@ from mavfi_cli.fi.isolated.program import (
     profile_program,
     run_fault,
 )
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.fault import (
     DATA_REGISTERS,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.fi import record
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.fault import InstructionFault, Role, Stage, explicit_corruption
 from mavfi_cli.fi.native.image import Image, Location, executable_mapping
 from mavfi_cli.fi.native.inject import Activation

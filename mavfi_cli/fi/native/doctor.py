@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.fi.native.arch.decode import widest_vector
+from mavfi_cli.fi.native.arch import widest_vector
 from mavfi_cli.fi.native.breakpoints import perf_allowed
 from mavfi_cli.fi.native.spawn import Command, run_to_entry, spawn
 from mavfi_cli.fi.native.tracee import Tracee

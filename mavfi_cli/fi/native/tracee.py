@@ -16,14 +16,13 @@ from dataclasses import dataclass, field
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.alarm import Alarm
-from mavfi_cli.fi.native.arch import TRAITS, Registers
+from mavfi_cli.fi.native.arch import TRAITS, DebugBreakpoint, Registers
 from mavfi_cli.fi.native.breakpoints import (
     SI_KERNEL,
     TRAP_BRKPT,
     TRAP_HWBKPT,
     TRAP_PERF,
     TRAP_TRACE,
-    DebugBreakpoint,
     ExecutionCounter,
     Mechanism,
     PerfBreakpoint,
