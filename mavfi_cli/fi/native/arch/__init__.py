@@ -31,19 +31,7 @@ if SUPPORTED or TYPE_CHECKING:
         width_of,
     )
 else:
-    from mavfi_cli.fi.native.arch.unsupported import (
-        TRAITS,
-        DebugBreakpoint,
-        Registers,
-        address_of,
-        all_registers,
-        decode,
-        erase_trap,
-        record_steps,
-        register_kind,
-        widest_vector,
-        width_of,
-    )
+    from mavfi_cli.fi.native.arch.unsupported import *  # noqa: F403
 
 __all__ = [
     "SUPPORTED", "TRAITS", "DebugBreakpoint", "Instruction", "MemoryUse", "RegisterUse",
