@@ -13,13 +13,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.breakpoints import ExecutionCounter
 from mavfi_cli.fi.native.fault import Stage
 from mavfi_cli.fi.native.image import Image, scope_of
 from mavfi_cli.fi.native.node import InvocationProfile, profile_invocation
 from mavfi_cli.fi.native.profile import Profile, Segment, WindowTooLong, record_window
 from mavfi_cli.fi.native.tracee import Tracee, stack_word
-from mavfi_cli.mission.kernel_scope import KernelScope
+from mavfi_cli.mission.kernel_scope import KernelScope, kernel_of_node
 from mavfi_cli.mission.node_process import NodeProcess
 from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.spawned_node import SpawnedNode, TracerThread
@@ -28,8 +29,9 @@ T = TypeVar("T")
 Order = tuple[Any, float]  # input, start stamp
 Armed = Callable[[], None]
 WHOLE_LIMIT = 600_000  # instructions; more are sampled, where the kernel has inner functions
-WINDOWS = 16
-_ALWAYS_SAMPLED = "octomap"
+# Always sampled, and how many windows: of some 300 instructions in OctoMap, 40,000 in RRT*.
+_WINDOWS = {"octomap": 16, "rrtstar": 4}
+_OTHER_WINDOWS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,13 +78,14 @@ def profile_kernel(
     Raises:
         TargetError: too long to be stepped, and without inner functions.
     """
-    if setup.node != _ALWAYS_SAMPLED:
+    kernel = kernel_of_node(setup.node, setup.config.planner)
+    if kernel not in _WINDOWS:
         try:
             return _whole(setup, orders, invocation)
         except WindowTooLong as error:
             if setup.node != "planner":
                 raise error
-    return _sampled(setup, orders, invocation, rng)
+    return _sampled(setup, orders, invocation, _WINDOWS.get(kernel, _OTHER_WINDOWS), rng)
 
 
 def _traced(
@@ -92,7 +95,12 @@ def _traced(
     spawned = SpawnedNode()
     try:
         scope = spawned.begin(setup)
-        tracer = TracerThread(lambda armed: work(spawned.pid, scope, armed))
+
+        def trace(armed: Armed) -> T:
+            linux.share_processor(spawned.pid)
+            return work(spawned.pid, scope, armed)
+
+        tracer = TracerThread(trace)
         tracer.await_armed()
         process = NodeProcess(spawned.connection, spawned.pid)
         for value, start_s in orders[:-1]:
@@ -121,7 +129,7 @@ def _whole(setup: Setup, orders: Sequence[Order], invocation: int) -> KernelProf
 
 
 def _sampled(
-    setup: Setup, orders: Sequence[Order], invocation: int, rng: np.random.Generator
+    setup: Setup, orders: Sequence[Order], invocation: int, windows: int, rng: np.random.Generator
 ) -> KernelProfile:
     """Step some invocations of one function of the kernel, drawn by how often it runs."""
     counts = _traced(
@@ -131,7 +139,7 @@ def _sampled(
     if not total:
         raise FaultError(f"this invocation of {setup.node} calls none of its inner functions")
     which = int(np.searchsorted(np.cumsum(counts), rng.integers(total), side="right"))
-    number = min(WINDOWS, counts[which])
+    number = min(windows, counts[which])
     drawn = sorted(1 + rng.choice(counts[which], size=number, replace=False))
 
     def work(pid: int, scope: KernelScope, armed: Armed) -> list[InvocationProfile]:
