@@ -172,14 +172,13 @@ def _injection() -> Iterator[Check]:
                     remedy="instruction-level injection is not available here")  # fmt: skip
         return
 
-    for capability, works in (
-        (check_tracing(), "a program was stopped, a register flipped and read back"),
-        (check_counting(), "executions are counted by the kernel"),
-    ):
-        limited = capability.problem is not None
+    for capability in (check_tracing(), check_counting()):
+        remedy = capability.remedy
+        if capability.problem is not None:
+            remedy = remedy or _ALLOW_PTRACE
         yield Check(
             name=capability.name,
-            verdict=Verdict.LIMITED if limited else Verdict.OK,
-            found=capability.problem or works,
-            remedy=(capability.remedy or _ALLOW_PTRACE) if limited else "",
+            verdict=Verdict.LIMITED if remedy else Verdict.OK,
+            found=capability.problem or capability.found,
+            remedy=remedy,
         )

@@ -61,6 +61,11 @@ def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
     return result & 0xFFFF_FFFF_FFFF_FFFF
 
 
+def peek_user(tid: int, offset: int) -> int:
+    """A word of a stopped thread's `struct user`."""
+    return request(PEEKUSER, tid, offset)
+
+
 def seize(tid: int, *, kill_with_tracer: bool) -> None:
     """Attach without stopping; new threads and children are attached by the kernel.
 

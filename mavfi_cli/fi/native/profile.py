@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
-from mavfi_cli.fi.native.arch import TRAITS, record_steps
+from mavfi_cli.fi.native.arch import TRAITS, record_steps, return_address
 from mavfi_cli.fi.native.arch.traits import StepEnd
 from mavfi_cli.fi.native.fault import Stage
 from mavfi_cli.fi.native.image import Location, Scope
 from mavfi_cli.fi.native.inject import clean_step, instruction_at
-from mavfi_cli.fi.native.tracee import Ended, Tracee, stack_word
+from mavfi_cli.fi.native.tracee import Ended, Tracee
 
 _CHUNK = 16384
 
@@ -100,7 +100,7 @@ def record_window(
     """
     stop = np.array([-1, 0], np.int64)
     if until_return:
-        stop[:] = stack_word(tracee), tracee.registers.sp
+        stop[:] = return_address(tracee), tracee.registers.sp
     parts: list[NDArray[np.int64]] = []
     total = 0
     for part in _parts(tracee, scope, stop):

@@ -27,6 +27,7 @@ if SUPPORTED or TYPE_CHECKING:
         erase_trap,
         record_steps,
         register_kind,
+        return_address,
         widest_vector,
         width_of,
     )
@@ -36,5 +37,5 @@ else:
 __all__ = [
     "SUPPORTED", "TRAITS", "DebugBreakpoint", "Instruction", "MemoryUse", "RegisterUse",
     "Registers", "Traits", "address_of", "all_registers", "decode", "erase_trap", "record_steps",
-    "register_kind", "widest_vector", "width_of",
+    "register_kind", "return_address", "widest_vector", "width_of",
 ]  # fmt: skip

@@ -33,5 +33,5 @@ class _Refusing:
 
 TRAITS = _Refusing()
 Registers = DebugBreakpoint = refuse
-decode = address_of = erase_trap = record_steps = refuse
+decode = address_of = erase_trap = record_steps = return_address = refuse
 all_registers = register_kind = widest_vector = width_of = refuse

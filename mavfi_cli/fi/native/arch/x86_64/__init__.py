@@ -10,9 +10,14 @@ from mavfi_cli.fi.native.arch.x86_64.registers import (
     register_kind,
     width_of,
 )
-from mavfi_cli.fi.native.arch.x86_64.stepping import DebugBreakpoint, erase_trap, record_steps
+from mavfi_cli.fi.native.arch.x86_64.stepping import (
+    DebugBreakpoint,
+    erase_trap,
+    record_steps,
+    return_address,
+)
 
 __all__ = [
     "TRAITS", "DebugBreakpoint", "Registers", "address_of", "all_registers", "decode",
-    "erase_trap", "record_steps", "register_kind", "widest_vector", "width_of",
+    "erase_trap", "record_steps", "register_kind", "return_address", "widest_vector", "width_of",
 ]  # fmt: skip

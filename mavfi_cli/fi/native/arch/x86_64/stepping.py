@@ -55,22 +55,38 @@ def erase_trap(tracee: Tracee, instruction: Instruction) -> None:
             tracee.registers.write("r11", saved & ~TRAP_FLAG)
 
 
-class DebugBreakpoint:
-    """Debug register 0 of a *stopped* thread: traps before every execution at `address`.
+def return_address(tracee: Tracee) -> int:
+    """Where the function returns to at whose first instruction the target is stopped."""
+    return int.from_bytes(tracee.read_memory(tracee.registers.sp, 8), "little")
 
-    Intel SDM volume 3, section 18.2.
+
+class DebugBreakpoint:
+    """A debug register of a *stopped* thread: traps before every execution at `address`.
+
+    Intel SDM volume 3, section 18.2. A thread has four.
+
+    Args:
+        tid: the thread.
+        address: of the instruction.
+        slot: which register, 0 to 3.
     """
 
-    def __init__(self, tid: int, address: int) -> None:
+    def __init__(self, tid: int, address: int, slot: int = 0) -> None:
         self._tid = tid
-        self._poke(7, 0)
-        self._poke(0, address)
-        self._poke(7, 1)  # enabled for the thread; type execute, length 1
+        self._enabled = 1 << 2 * slot  # for the thread; type execute, length 1: zeros
+        self._taken = 3 << 2 * slot | 0xF << 16 + 4 * slot
+        self._enable(0)
+        self._poke(slot, address)
+        self._enable(self._enabled)
 
     def close(self) -> None:
         """Take the breakpoint away; the thread must be stopped, or gone."""
         with contextlib.suppress(ProcessLookupError):
-            self._poke(7, 0)
+            self._enable(0)
+
+    def _enable(self, bits: int) -> None:
+        others = linux.peek_user(self._tid, _DEBUG_REGISTERS + 8 * 7) & ~self._taken
+        self._poke(7, others | bits)
 
     def _poke(self, register: int, value: int) -> None:
         linux.request(linux.POKEUSER, self._tid, _DEBUG_REGISTERS + 8 * register, value)
