@@ -76,7 +76,6 @@ class InstructionInjection(NoInjection):
             self._spawned.connection,
             pid,
             ending=self._ending,
-            errors_kill=True,
             patient=self._for_debugger is not None,
         )
 

@@ -62,7 +62,7 @@ def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
         counter = EntryCounter(spawned.pid, address)
         process = NodeProcess(spawned.connection, spawned.pid)
         for value, start_s in orders:
-            process.take(setup.node, process.order(setup.node, value, start_s))
+            process.take(process.order(setup.node, value, start_s))
             counts.append(counter.read())
     finally:
         if counter is not None:
@@ -105,7 +105,7 @@ def _traced(
         tracer.await_armed()
         process = NodeProcess(spawned.connection, spawned.pid)
         for value, start_s in orders[:-1]:
-            process.take(setup.node, process.order(setup.node, value, start_s))
+            process.take(process.order(setup.node, value, start_s))
         process.order(setup.node, *orders[-1])
         return tracer.result()
     finally:
