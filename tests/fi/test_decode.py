@@ -91,3 +91,10 @@ def test_push_pop_and_ret_use_the_stack(code, offset, reads):
 
 def test_no_instruction_is_none():
     assert of("0604") is None
+
+
+@pytest.mark.parametrize("code", ["f20f114570", "f20f104508", "f20f10c1"])
+def test_the_scalar_move_is_not_the_string_move_of_the_same_name(code):
+    assert of(code).mnemonic == of("a5").mnemonic == "movsd"
+    assert "df" not in names(of(code).reads)
+    assert "df" in names(of("a5").reads)

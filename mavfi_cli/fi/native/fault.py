@@ -171,12 +171,12 @@ def _registers(
             continue
         if not (use.explicit or model.implicit):
             continue
-        mask = use.mask & _field_mask(instruction, model, site)
+        mask, operand = use.mask & _field_mask(instruction, model, site), use.operand
         known = merged.get(use.register)
         if known is not None:  # the flags of one instruction are one operand
-            mask |= known.mask
+            mask, operand = mask | known.mask, use.register
         merged[use.register] = _Candidate(
-            site=site, role=role, register=use.register, operand=use.operand, mask=mask
+            site=site, role=role, register=use.register, operand=operand, mask=mask
         )
     return [candidate for candidate in merged.values() if candidate.mask]
 

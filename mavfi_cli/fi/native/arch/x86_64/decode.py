@@ -157,6 +157,8 @@ def _legacy_cover(found: Any) -> int:
 def _flags(found: Any, table: dict[str, int]) -> list[RegisterUse | None]:
     if x86.X86_GRP_FPU in found.groups:
         return []
+    # Capstone takes the scalar SSE `movsd` for the string instruction of the same name.
+    vector = any(_VECTOR.match(found.reg_name(r)) for ids in found.regs_access() for r in ids)
     return [
         RegisterUse(
             register="rflags",
@@ -166,7 +168,7 @@ def _flags(found: Any, table: dict[str, int]) -> list[RegisterUse | None]:
             operand=name,
         )
         for name, test in table.items()
-        if found.eflags & test
+        if found.eflags & test and not (name == "df" and vector)
     ]
 
 
