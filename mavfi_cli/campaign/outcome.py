@@ -62,8 +62,6 @@ _BY_ACTIVATION = {
     "not_read": Injected.NOT_ACTIVATED,
     "not_injected": Injected.NOT_INJECTED,
     "overwritten": Injected.NOT_ACTIVATED,
-    "not_read": Injected.NOT_ACTIVATED,
-    "unchanged": Injected.NOT_ACTIVATED,
     "ended_before_read": Injected.NOT_ACTIVATED,
     "not_read_in_window": Injected.UNREAD,
 }

@@ -12,7 +12,6 @@ MavfiError                      one known error, one line, exit code 1
 │   └── LinkLost                the peer fell silent or closed the connection
 ├── VehicleProcessError         the simulated vehicle could not start or ended early
 ├── ModelError                  a detector's model or data set that cannot be used or made
-├── NodeCrashed                 a node of the companion died; the mission's outcome is `crash`
 ├── RecordError                 a run folder that cannot be written or read
 ├── FaultError                  a fault that cannot be described, placed or repeated
 │   ├── FaultSpecError          a fault description that makes no sense
@@ -127,13 +126,6 @@ class ModelError(MavfiError):
 
     def __init__(self, problem: str, *, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
-
-
-class NodeCrashed(MavfiError):
-    """A node of the companion died: how, and what it said."""
-
-    def __init__(self, node: str, how: str) -> None:
-        super().__init__(f"node {node} crashed: {how}")
 
 
 class RecordError(MavfiError):

@@ -133,7 +133,7 @@ def require_same_build(record: Mapping[str, Any], image: Image) -> None:
     """
     differences = []
     for name, build_id in record["build_ids"].items():
-        loaded = image.objects.get(name)
+        loaded = image.find(name)
         if loaded is None:
             differences.append(f"{name} is not loaded")
         elif loaded.build_id != build_id:

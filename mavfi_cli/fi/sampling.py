@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from mavfi_cli.core.errors import FaultError, UnknownName
-from mavfi_cli.fi.native.arch.decode import Instruction, decode
+from mavfi_cli.fi.native.arch import Instruction, decode
 from mavfi_cli.fi.native.fault import (
     Corruption,
     FaultModel,

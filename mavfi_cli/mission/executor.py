@@ -5,10 +5,10 @@ invocation that starts at `t` occupies the node, and one core of the platform, u
 its latency; only then is its output published. The real computation is done at any host time
 in between, so the vehicle's simulation need not wait for it.
 
-A node in a process of its own may die. The input that it worked on is lost, and it starts anew,
-with fresh state, a restart time after its output was due. A node that hangs works on until the
-watchdog kills it. Both are decided by *what* became of the process, never by when the host
-noticed, so they repeat.
+A node in a process of its own may die, of a signal or of an error in its kernel. The input that it
+worked on is lost, and it starts anew, with fresh state, a restart time after its output was due. A
+node that hangs works on until the watchdog kills it. Both are decided by *what* became of the
+process, never by when the host noticed, so they repeat.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class Loss:
     stamp_s: float  # when the output was due, or the watchdog acted
     hung: bool
     how: str
+    traceback: str = ""  # of an error in the kernel
 
 
 @dataclass(slots=True, eq=False)
@@ -84,7 +85,7 @@ class _Job:
         if not self.done:
             assert self.node.process is not None
             assert self.order is not None
-            self.output, host_s = self.node.process.take(self.node.name, self.order)
+            self.output, host_s = self.node.process.take(self.order)
             wall.add(self.node.name, host_s)
             self.done = True
         return self.output
@@ -253,7 +254,8 @@ class Executor:
         self._at(gone_s, lambda stamp_s: self._bury(job.node, stamp_s))
 
     def _note_loss(self, node: Node, gone_s: float, loss: NodeLost) -> None:
-        entry = Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how)
+        entry = Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how,
+                     traceback=loss.traceback)  # fmt: skip
         node.losses.append(entry)
         self.losses.append(entry)
 

@@ -11,12 +11,13 @@ from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi import record
 from mavfi_cli.fi.native.image import Image
 from mavfi_cli.fi.native.node import Attack, attack
+from mavfi_cli.fi.native.tracer import TracerThread
 from mavfi_cli.mission.injection import SCHEMA, NoInjection
 from mavfi_cli.mission.instruction_plan import PlannedFault
 from mavfi_cli.mission.kernel_scope import KernelScope
 from mavfi_cli.mission.node_process import NodeProcess
 from mavfi_cli.mission.node_server import Setup
-from mavfi_cli.mission.spawned_node import SpawnedNode, TracerThread
+from mavfi_cli.mission.spawned_node import SpawnedNode
 
 _TIMING = ("stop_s",)
 
@@ -75,7 +76,6 @@ class InstructionInjection(NoInjection):
             self._spawned.connection,
             pid,
             ending=self._ending,
-            errors_kill=True,
             patient=self._for_debugger is not None,
         )
 

@@ -106,7 +106,10 @@ def plan_fault(
     orders = all_orders.get(node, [])
     counts = _kept(folder / f"entries-{kernel}.pickle", lambda: count_entries(setup, orders))
     if not counts or not counts[-1]:
-        raise FaultError(f"the golden flight never enters {kernel}")
+        raise FaultError(
+            f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
+            "world, seed or node"
+        )
     rng = generator(asked.seed, Stream.FAULT, "instruction")
     invocation = int(rng.integers(counts[-1])) + 1
     order = int(np.searchsorted(counts, invocation)) + 1

@@ -13,23 +13,30 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mavfi_cli.core.errors import FaultError, TargetError
-from mavfi_cli.fi.native.breakpoints import ExecutionCounter
+from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.fault import Stage
 from mavfi_cli.fi.native.image import Image, scope_of
-from mavfi_cli.fi.native.node import InvocationProfile, profile_invocation
+from mavfi_cli.fi.native.node import (
+    EntryCounter,
+    InvocationProfile,
+    count_executions,
+    profile_invocation,
+)
 from mavfi_cli.fi.native.profile import Profile, Segment, WindowTooLong, record_window
-from mavfi_cli.fi.native.tracee import Tracee, stack_word
-from mavfi_cli.mission.kernel_scope import KernelScope
+from mavfi_cli.fi.native.tracee import Tracee
+from mavfi_cli.fi.native.tracer import TracerThread
+from mavfi_cli.mission.kernel_scope import KernelScope, kernel_of_node
 from mavfi_cli.mission.node_process import NodeProcess
 from mavfi_cli.mission.node_server import Setup
-from mavfi_cli.mission.spawned_node import SpawnedNode, TracerThread
+from mavfi_cli.mission.spawned_node import SpawnedNode
 
 T = TypeVar("T")
 Order = tuple[Any, float]  # input, start stamp
 Armed = Callable[[], None]
 WHOLE_LIMIT = 600_000  # instructions; more are sampled, where the kernel has inner functions
-WINDOWS = 16
-_ALWAYS_SAMPLED = "octomap"
+# Always sampled, and how many windows: of some 300 instructions in OctoMap, 40,000 in RRT*.
+_WINDOWS = {"octomap": 16, "rrtstar": 4}
+_OTHER_WINDOWS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,25 +52,21 @@ def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
     """How often the kernel had been entered after each order.
 
     Raises:
-        FaultError: this system does not count executions for us.
+        TracingForbidden: the operating system neither counts nor lets us trace.
     """
-    spawned = SpawnedNode()
+    spawned, counter = SpawnedNode(), None
     counts = []
     try:
         scope = spawned.begin(setup)
         address = Image(spawned.pid, scope.regions).address(scope.entry)
-        try:
-            counter = ExecutionCounter(spawned.pid, address)
-        except OSError as error:
-            raise FaultError(
-                f"executions cannot be counted here ({error}): see mavfi doctor"
-            ) from None
+        counter = EntryCounter(spawned.pid, address)
         process = NodeProcess(spawned.connection, spawned.pid)
         for value, start_s in orders:
-            process.take(setup.node, process.order(setup.node, value, start_s))
+            process.take(process.order(setup.node, value, start_s))
             counts.append(counter.read())
-        counter.close()
     finally:
+        if counter is not None:
+            counter.close()
         spawned.kill()
     return counts
 
@@ -76,13 +79,14 @@ def profile_kernel(
     Raises:
         TargetError: too long to be stepped, and without inner functions.
     """
-    if setup.node != _ALWAYS_SAMPLED:
+    kernel = kernel_of_node(setup.node, setup.config.planner)
+    if kernel not in _WINDOWS:
         try:
             return _whole(setup, orders, invocation)
         except WindowTooLong as error:
             if setup.node != "planner":
                 raise error
-    return _sampled(setup, orders, invocation, rng)
+    return _sampled(setup, orders, invocation, _WINDOWS.get(kernel, _OTHER_WINDOWS), rng)
 
 
 def _traced(
@@ -92,11 +96,16 @@ def _traced(
     spawned = SpawnedNode()
     try:
         scope = spawned.begin(setup)
-        tracer = TracerThread(lambda armed: work(spawned.pid, scope, armed))
+
+        def trace(armed: Armed) -> T:
+            linux.share_processor(spawned.pid)
+            return work(spawned.pid, scope, armed)
+
+        tracer = TracerThread(trace)
         tracer.await_armed()
         process = NodeProcess(spawned.connection, spawned.pid)
         for value, start_s in orders[:-1]:
-            process.take(setup.node, process.order(setup.node, value, start_s))
+            process.take(process.order(setup.node, value, start_s))
         process.order(setup.node, *orders[-1])
         return tracer.result()
     finally:
@@ -121,17 +130,21 @@ def _whole(setup: Setup, orders: Sequence[Order], invocation: int) -> KernelProf
 
 
 def _sampled(
-    setup: Setup, orders: Sequence[Order], invocation: int, rng: np.random.Generator
+    setup: Setup, orders: Sequence[Order], invocation: int, windows: int, rng: np.random.Generator
 ) -> KernelProfile:
     """Step some invocations of one function of the kernel, drawn by how often it runs."""
     counts = _traced(
-        setup, orders, lambda pid, scope, armed: _count_inner(pid, scope, armed, invocation)
+        setup,
+        orders,
+        lambda pid, scope, armed: count_executions(
+            pid, scope.entry, invocation, scope.inner, regions=scope.regions, armed=armed
+        ),
     )
     total = sum(counts)
     if not total:
         raise FaultError(f"this invocation of {setup.node} calls none of its inner functions")
     which = int(np.searchsorted(np.cumsum(counts), rng.integers(total), side="right"))
-    number = min(WINDOWS, counts[which])
+    number = min(windows, counts[which])
     drawn = sorted(1 + rng.choice(counts[which], size=number, replace=False))
 
     def work(pid: int, scope: KernelScope, armed: Armed) -> list[InvocationProfile]:
@@ -142,26 +155,6 @@ def _sampled(
         segments=tuple(each.segment for each in found), windows_in_run=total, cost_s=0.0
     )
     return KernelProfile(profile=profile, first=found[0], windows=f"{number} of {total}")
-
-
-def _count_inner(pid: int, scope: KernelScope, armed: Armed, invocation: int) -> list[int]:
-    tracee = Tracee.attach(pid)
-    try:
-        image = Image(pid, scope.regions)
-        armed()
-        _reach(tracee, image, Stage(scope.entry, invocation))
-        tracee.registers.rearm()
-        back, top = stack_word(tracee), tracee.registers.sp
-        counters = [ExecutionCounter(tracee.tid, image.address(inner)) for inner in scope.inner]
-        while tracee.run_to(back) and tracee.registers.sp <= top:
-            tracee.step()
-        counts = [counter.read() for counter in counters]
-        for counter in counters:
-            counter.close()
-        return counts
-    finally:
-        if tracee.ended is None:
-            tracee.detach()
 
 
 def _windows(

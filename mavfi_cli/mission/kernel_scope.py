@@ -9,14 +9,15 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from elftools.elf.elffile import ELFFile
 
 from mavfi_cli.core.errors import FaultError, UnknownName
-from mavfi_cli.fi.native.image import Image, Location, Part, Region, elf_facts, executable_mapping
+from mavfi_cli.fi.native.elf import ElfFacts, Function, elf_facts
+from mavfi_cli.fi.native.image import Image, Location, Part, Region, executable_mapping
 
 PLANNERS = ("rrtstar", "rrt", "rrtconnect")
 KERNELS = ("point_cloud", "octomap", "collision_check", *PLANNERS, "control")
@@ -144,7 +145,8 @@ def _octomap() -> KernelScope:
 def _collision_check() -> KernelScope:
     image = Image(os.getpid())
     library = _object_of(image, "libfcl")
-    part = _part(image, library, _tests_spheres)
+    part = _part([f for f in _facts(image, library).functions_with("OcTree", *_FCL_USED)
+                  if _tests_spheres(f.name)])  # fmt: skip
     entry = image.function(_FCL_COLLIDE, [library])
     return KernelScope(
         kernel="collision_check", entry=entry, objects=(library,), regions={library: part}
@@ -164,7 +166,7 @@ def _planner(kernel: str) -> KernelScope:
     image = Image(os.getpid())
     library = _object_of(image, "libompl")
     wanted = (_OMPL_CLASS[kernel], _OMPL_MOTION[kernel], *_OMPL_SHARED)
-    part = _part(image, library, lambda symbol: any(name in symbol for name in wanted))
+    part = _part(_facts(image, library).functions_with(*wanted))
     segment, _, region = compiled_region(segment_free)
     return KernelScope(
         kernel=kernel,
@@ -177,17 +179,20 @@ def _planner(kernel: str) -> KernelScope:
 
 def _nearest(image: Image, library: str, kernel: str) -> tuple[Location, ...]:
     """The nearest-neighbour searches of a planner's tree, those that it may call."""
-    path = image.named(library).path
-    assert path is not None
     found = [
-        Location(library, start)
-        for start, _, name in elf_facts(path).functions
-        if "NearestNeighborsGNATNoThreadSafety" in name
-        and _OMPL_MOTION[kernel] in name
-        and ("E7nearestE" in name or "E8nearestKE" in name)
-        and "4Node" not in name
+        Location(library, function.start)
+        for function in _facts(image, library).functions_with(_OMPL_MOTION[kernel])
+        if "NearestNeighborsGNATNoThreadSafety" in function.name
+        and ("E7nearestE" in function.name or "E8nearestKE" in function.name)
+        and "4Node" not in function.name
     ]
     return tuple(found)
+
+
+def _facts(image: Image, library: str) -> ElfFacts:
+    path = image.named(library).path
+    assert path is not None
+    return elf_facts(path)
 
 
 def _package_of(module: str) -> str:
@@ -195,24 +200,21 @@ def _package_of(module: str) -> str:
 
 
 def _object_of(image: Image, prefix: str, folder: str = "") -> str:
-    for name, loaded in image.objects.items():
-        if name.startswith(prefix) and loaded.path is not None and folder in loaded.path:
+    for name in image.names:
+        if name.startswith(prefix) and folder in image.path_of(name):
             return name
     raise FaultError(f"{prefix} is not loaded: run the kernel once before asking for its scope")
 
 
-def _part(image: Image, library: str, wanted: Callable[[str], bool]) -> Part:
-    """The code of the wanted functions; what lies between two of them on a page counts too."""
-    path = image.named(library).path
-    assert path is not None
+def _part(functions: Iterable[Function]) -> Part:
+    """The code of functions; what lies between two of them on a page counts too."""
     spans: list[range] = []
-    for start, size, name in elf_facts(path).functions:
-        if not size or not wanted(name):
-            continue
-        if spans and start - spans[-1].stop < _PAGE:
-            spans[-1] = range(spans[-1].start, max(spans[-1].stop, start + size))
-        else:
-            spans.append(range(start, start + size))
+    for function in functions:
+        start, end = function.start, function.start + function.size
+        if spans and function.size and start - spans[-1].stop < _PAGE:
+            spans[-1] = range(spans[-1].start, max(spans[-1].stop, end))
+        elif function.size:
+            spans.append(range(start, end))
     return Part(text=tuple(spans))
 
 

@@ -164,20 +164,21 @@ def _physics() -> Check:
 
 def _injection() -> Iterator[Check]:
     """Tracing and counted breakpoints, tried on a real program."""
-    if platform.system() != "Linux" or platform.machine() != "x86_64":
+    from mavfi_cli.fi.native.arch import SUPPORTED
+    from mavfi_cli.fi.native.doctor import check_counting, check_tracing
+
+    if not SUPPORTED:
         yield Check(name="Tracing", verdict=Verdict.LIMITED, found="not Linux on x86-64",
                     remedy="instruction-level injection is not available here")  # fmt: skip
         return
-    from mavfi_cli.fi.native.doctor import check_counting, check_tracing
 
-    for capability, works in (
-        (check_tracing(), "a program was stopped, a register flipped and read back"),
-        (check_counting(), "executions are counted by the kernel"),
-    ):
-        limited = capability.problem is not None
+    for capability in (check_tracing(), check_counting()):
+        remedy = capability.remedy
+        if capability.problem is not None:
+            remedy = remedy or _ALLOW_PTRACE
         yield Check(
             name=capability.name,
-            verdict=Verdict.LIMITED if limited else Verdict.OK,
-            found=capability.problem or works,
-            remedy=(capability.remedy or _ALLOW_PTRACE) if limited else "",
+            verdict=Verdict.LIMITED if remedy else Verdict.OK,
+            found=capability.problem or capability.found,
+            remedy=remedy,
         )

@@ -22,8 +22,6 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
-from mavfi_cli.core.errors import NodeCrashed
-
 Run = Callable[[Any, float], Any]
 _LENGTH = 8
 
@@ -54,10 +52,11 @@ class _Answer:
 class NodeLost(Exception):
     """A node's process is gone, or had to be killed: what the executor makes the best of."""
 
-    def __init__(self, *, hung: bool, how: str) -> None:
+    def __init__(self, *, hung: bool, how: str, traceback: str = "") -> None:
         super().__init__(how)
         self.hung = hung
         self.how = how
+        self.traceback = traceback  # of an error in the kernel
 
 
 class NodeProcess:
@@ -68,7 +67,6 @@ class NodeProcess:
         pid: of the process, a child of ours.
         ending: tells how the process ended where somebody else heard of it first, else None.
         patient: a debugger may hold it, so it never hangs.
-        errors_kill: an exception in a kernel ends its node as a crash, instead of the mission.
     """
 
     def __init__(
@@ -77,13 +75,11 @@ class NodeProcess:
         pid: int,
         *,
         ending: Callable[[], str | None] = lambda: None,
-        errors_kill: bool = False,
         patient: bool = False,
     ) -> None:
         self._socket = connection
         self._pid = pid
         self._ending = ending
-        self._errors_kill = errors_kill
         self._patient = patient
         if not patient:
             connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in the middle of a word
@@ -122,12 +118,11 @@ class NodeProcess:
             send(self._socket, order)
         return order.number
 
-    def take(self, node: str, number: int) -> tuple[Any, float]:
+    def take(self, number: int) -> tuple[Any, float]:
         """Wait for the output of an order; the output and the host seconds it took.
 
         Raises:
-            NodeLost: the process ended, or hung and was killed.
-            NodeCrashed: the kernel raised an error.
+            NodeLost: the process ended, hung and was killed, or its kernel raised an error.
         """
         begun_s, used_s = time.monotonic(), self._cpu_s()
         try:
@@ -148,9 +143,8 @@ class NodeProcess:
             raise NodeLost(hung=False, how="garbled its output") from None
         answer = self._answers.pop(number)
         if answer.error is not None:
-            if self._errors_kill:
-                raise NodeLost(hung=False, how=answer.error.partition("\n")[0])
-            raise NodeCrashed(node, answer.error)
+            how, _, told = answer.error.partition("\n")
+            raise NodeLost(hung=False, how=how, traceback=told)
         return answer.output, answer.host_s
 
     def _cpu_s(self) -> float:

@@ -22,7 +22,7 @@ import numpy as np
 
 from mavfi_cli import __version__
 from mavfi_cli.autonomy import planners, warm_up
-from mavfi_cli.core.errors import MavfiError, NodeCrashed
+from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.mission import briefing, quality
@@ -150,9 +150,6 @@ def _fly(flight: Flight, folder: RunFolder) -> str | None:
     """Fly to the end. A crash of the companion's software is an outcome: returns its traceback."""
     try:
         flight.fly(folder.tlog)
-    except NodeCrashed as error:
-        flight.end(Outcome.CRASH, str(error).partition("\n")[0])
-        return str(error)
     except MavfiError:
         raise
     except Exception as error:  # the mission-process boundary: a crash is a result
@@ -271,8 +268,9 @@ def _write(
         "host": host,
     }
     write_trace(folder.trace, flight.trace.table(truth))
-    if crash is not None:
-        (folder.path / CRASH).write_text(crash)
+    told = [loss.traceback for loss in companion.executor.losses] if companion else []
+    if errors := [text for text in (*told, crash) if text]:
+        (folder.path / CRASH).write_text("\n".join(errors))
     folder.write_result(result)
 
 

@@ -7,9 +7,6 @@ import os
 import signal
 import socket
 import sys
-import threading
-from collections.abc import Callable
-from typing import Generic, TypeVar
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
@@ -17,7 +14,6 @@ from mavfi_cli.mission.kernel_scope import KernelScope
 from mavfi_cli.mission.node_process import receive, send
 from mavfi_cli.mission.node_server import Setup
 
-T = TypeVar("T")
 _CHANNEL = 3
 _KEPT = ("PATH", "HOME", "PYTHONPATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR")
 _FIXED = {"PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -63,40 +59,3 @@ class SpawnedNode:
             os.kill(self.pid, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(self.pid, 0)
-
-
-class TracerThread(Generic[T]):
-    """Work that traces a node, in a thread of its own: ptrace belongs to a thread.
-
-    Args:
-        work: gets a function to call once the node runs towards what is awaited.
-    """
-
-    def __init__(self, work: Callable[[Callable[[], None]], T]) -> None:
-        self._armed = threading.Event()
-        self._result: list[T] = []
-        self._error: BaseException | None = None
-
-        def run() -> None:
-            try:
-                self._result.append(work(self._armed.set))
-            except BaseException as error:
-                self._error = error
-            finally:
-                self._armed.set()
-
-        self._thread = threading.Thread(target=run, daemon=True)
-        self._thread.start()
-
-    def await_armed(self) -> None:
-        """Wait until the node runs towards what is awaited; raises what went wrong before."""
-        self._armed.wait()
-        if self._error is not None:
-            raise self._error
-
-    def result(self) -> T:
-        """Wait for the end of the work, and raise what it raised."""
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return self._result[0]

@@ -13,7 +13,7 @@ from mavfi_cli.campaign.kernels.place import Place, Template
 from mavfi_cli.campaign.kernels.profile import profile_kernel
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.isolated.outcome import Outcome
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.fault import InstructionFault, Role, Stage, explicit_corruption
 
 TEMPLATE = Path(__file__).parent / "known_template.py"

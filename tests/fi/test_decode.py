@@ -7,7 +7,7 @@ arch = pytest.importorskip("platform")
 if arch.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
-from mavfi_cli.fi.native.arch.decode import address_of, decode, widest_vector  # noqa: E402
+from mavfi_cli.fi.native.arch import address_of, decode, widest_vector  # noqa: E402
 
 FULL = (1 << 64) - 1
 
@@ -40,7 +40,7 @@ def test_implicit_operands_are_named():
     assert {"rax", "rdx", "cf", "of"} <= names(multiply.writes)
     copy = of("f348a5")  # rep movsq
     assert {"rsi", "rdi", "rcx", "df"} <= names(copy.reads)
-    assert copy.repeats
+    assert copy.run_over
 
 
 def test_flags_are_single_bits():
@@ -91,3 +91,10 @@ def test_push_pop_and_ret_use_the_stack(code, offset, reads):
 
 def test_no_instruction_is_none():
     assert of("0604") is None
+
+
+@pytest.mark.parametrize("code", ["f20f114570", "f20f104508", "f20f10c1"])
+def test_the_scalar_move_is_not_the_string_move_of_the_same_name(code):
+    assert of(code).mnemonic == of("a5").mnemonic == "movsd"
+    assert "df" not in names(of(code).reads)
+    assert "df" in names(of("a5").reads)

@@ -10,7 +10,7 @@ if platform.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.fault import FaultModel, Role, Site, draw_corruption
 from mavfi_cli.fi.sampling import strategy
 
@@ -105,3 +105,14 @@ def test_rosfi_2021_hits_the_low_byte_of_few_registers():
     assert all(plan.draw_at(mov, rng) is None for _ in range(50))
     high = of("4d01c1")  # add r9, r8
     assert {plan.draw_at(high, rng).operand for _ in range(50)} == {"r8", "r9"}
+
+
+def test_the_flags_of_an_instruction_are_one_operand():
+    add = decode(bytes.fromhex("4801d8"), 0)  # add rax, rbx
+    model = FaultModel(sites=frozenset((Site.FLAGS,)))
+    rng = np.random.default_rng(1)
+    found = [draw_corruption(add, model, rng) for _ in range(200)]
+    assert {(c.operand, c.register, c.role) for c in found} == {
+        ("rflags", "rflags", Role.DESTINATION)
+    }
+    assert {c.bits for c in found} == {(bit,) for bit in (0, 2, 4, 6, 7, 11)}

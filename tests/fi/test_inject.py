@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.fault import Corruption, Role, Site, explicit_corruption
 from mavfi_cli.fi.native.image import Image
 from mavfi_cli.fi.native.inject import Activation, apply, follow, instruction_at

@@ -17,7 +17,7 @@ from mavfi_cli.fi.isolated.campaign import Plan, csv_rows, run_campaign
 from mavfi_cli.fi.isolated.compare import Comparison, digest, magnitude
 from mavfi_cli.fi.isolated.outcome import Outcome, design_effect, shares, wilson
 from mavfi_cli.fi.isolated.program import ProgramTarget, Workplace, golden_run, profile_program
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.fault import (
     DATA_REGISTERS,

@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 
 from mavfi_cli.fi import record
-from mavfi_cli.fi.native.arch.decode import decode
+from mavfi_cli.fi.native import tracee
+from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.fault import InstructionFault, Role, Stage, explicit_corruption
 from mavfi_cli.fi.native.image import Image, Location, executable_mapping
 from mavfi_cli.fi.native.inject import Activation
-from mavfi_cli.fi.native.node import attack, count_executions, profile_invocation
+from mavfi_cli.fi.native.node import (
+    EntryCounter,
+    attack,
+    count_executions,
+    profile_invocation,
+)
 from mavfi_cli.fi.native.profile import Profile
 from mavfi_cli.fi.sampling import draw_fault, strategy
 
@@ -124,12 +130,32 @@ def test_an_invocation_is_profiled_and_the_node_goes_on(node):
     assert ask(node, 3, 4) == 25.0
 
 
+@pytest.fixture(params=[None, "refused"])
+def counting(request, monkeypatch):
+    """Executions are counted by the kernel, then by debug registers."""
+    if request.param is not None:
+        monkeypatch.setattr(tracee, "perf_allowed", lambda: request.param)
+
+
+@pytest.mark.usefixtures("counting")
+def test_entries_are_counted_while_the_node_works(node):
+    inner = Image(node.pid).function("inner", ["libkernel.so"])
+    counter = EntryCounter(node.pid, Image(node.pid).address(inner))
+    counts = []
+    for numbers in [(1, 2, 3), (1,), (4, 5, 6, 7)]:
+        ask(node, *numbers)
+        counts.append(counter.read())
+    counter.close()
+    assert counts == [3, 4, 8]
+
+
+@pytest.mark.usefixtures("counting")
 def test_a_large_kernel_is_profiled_by_sample(node):
     entry = entry_of(node)
     inner = Image(node.pid).function("inner", ["libkernel.so"])
-    tracer = Tracer(count_executions, node.pid, entry, 2, inner)
+    tracer = Tracer(count_executions, node.pid, entry, 2, [inner, entry])
     assert [ask(node, 1, 2, 3), ask(node, 1, 2, 3, 4)] == [14.0, 30.0]
-    assert tracer.result() == 4
+    assert tracer.result() == [4, 1]
     stages = (Stage(inner, 3),)
     tracer = Tracer(profile_invocation, node.pid, entry, 1, objects=("libkernel.so",), inner=stages)
     assert ask(node, 1, 2, 3) == 14.0

@@ -29,13 +29,13 @@ def flip_every_bit(tracee, name, width, others, step=1):
 
 
 def all_names():
-    from mavfi_cli.fi.native.arch.x86_64 import all_registers
+    from mavfi_cli.fi.native.arch import all_registers
 
     return all_registers()
 
 
 def test_every_bit_of_every_general_register(start):
-    from mavfi_cli.fi.native.arch.x86_64 import GENERAL
+    from mavfi_cli.fi.native.arch.x86_64.registers import GENERAL
 
     tracee = start("counting")
     for name in GENERAL:
@@ -44,7 +44,7 @@ def test_every_bit_of_every_general_register(start):
 
 @pytest.mark.parametrize("family", ["st", "xmm", "ymm", "zmm", "k"])
 def test_every_bit_of_every_wide_register(start, family):
-    from mavfi_cli.fi.native.arch.x86_64 import width_of
+    from mavfi_cli.fi.native.arch import width_of
 
     tracee = start("counting")
     known = all_names()
@@ -78,7 +78,7 @@ def test_a_part_of_a_vector_register_leaves_the_rest(start):
 
 
 def test_the_upper_half_of_ymm_is_written_while_its_component_is_unused(start):
-    from mavfi_cli.fi.native.arch.x86_64 import AVX, XSTATE_BV
+    from mavfi_cli.fi.native.arch.x86_64.registers import AVX, XSTATE_BV
 
     tracee = start("counting")
     area = tracee.registers.extended()

@@ -2,8 +2,9 @@
 
 import json
 import os
-import platform
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi import record as records
-from mavfi_cli.fi.native.breakpoints import perf_allowed
+from mavfi_cli.fi.native.arch import SUPPORTED
+from mavfi_cli.fi.native.doctor import check_tracing
 from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.replay import config_of
@@ -19,8 +21,7 @@ from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.run_folder import load_run
 
 traced = pytest.mark.skipif(
-    platform.machine() != "x86_64" or perf_allowed() is not None,
-    reason="executions cannot be counted here",
+    not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
 )
 OF_THE_FAULT = ("host", "fault", "config", "seeds")
 
@@ -152,3 +153,33 @@ def test_the_habits_of_another_injector_keep_a_moment_that_repeats():
     config = InstructionConfig(target="control", compat="rosfi-2021")
     assert config.strategy().refused
     assert config.sampling_name().startswith("instruction-uniform with")
+
+
+@pytest.fixture
+def without_perf(tmp_path):
+    """Run the command line where perf_event_open is refused."""
+    script = Path(__file__).parents[1] / "without_perf.py"
+
+    def run(*arguments):
+        line = [sys.executable, script, sys.executable, "-m", "mavfi_cli", *arguments]
+        return subprocess.run(
+            line, capture_output=True, text=True, timeout=120.0, check=False, cwd=tmp_path
+        )
+
+    return run
+
+
+@traced
+def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, tmp_path):
+    told = json.loads(without_perf("doctor", "--json").stdout)
+    (counting,) = [check for check in told if check["name"] == "counted breakpoints"]
+    assert counting["verdict"] == "limited"
+    assert "by debug registers" in counting["found"]
+
+    config = load_run(attacked.path).result["config"]
+    place = [f"--{n}={','.join(map(str, config[n]))}" for n in ("start", "goal")]
+    fault = ["--level", "instruction", "--inject", "control", "--fault-seed", "2"]
+    done = without_perf("fly", "--world", "farm", "--seed", "5", *place, *fault, "--json")
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs").glob("farm-5-*")
+    assert flown(load_run(folder).folder) == flown(attacked)

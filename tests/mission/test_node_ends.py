@@ -81,6 +81,24 @@ def test_a_crashed_node_is_restarted_and_the_mission_goes_on(fly_short, at_invoc
     assert result["outcome"] == "success"
 
 
+def broken():
+    raise IndexError("no such voxel")
+
+
+def test_an_error_in_an_isolated_kernel_ends_its_node_only(fly_short, at_invocation):
+    records = []
+    for _ in range(2):
+        at_invocation(*KERNELS["octomap"], 12, broken)
+        folder = fly_short(isolate=("octomap",))
+        records.append(record(folder))
+    assert records[0] == records[1]
+    result = records[0][1]
+    ends = result["nodes"]["octomap"]
+    assert [crash["how"] for crash in ends["crashes"]] == ["IndexError: no such voxel"]
+    assert (ends["restarts"], result["outcome"]) == (1, "success")
+    assert "Traceback" in (folder.path / "crash.txt").read_text()
+
+
 def test_a_hung_node_is_killed_by_the_watchdog(fly_short, at_invocation, monkeypatch, mavfi):
     monkeypatch.setattr(node_process, "HANG_CPU_S", 0.3)
     records, folder = [], None

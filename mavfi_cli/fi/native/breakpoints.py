@@ -8,18 +8,15 @@ debug register itself and counts, one stop a hit.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 import struct
 from enum import Enum
 
-from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.arch import TRAITS
 
 TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL = 1, 2, 4, 6, 0x80
 
-_PERF_EVENT_OPEN = {"x86_64": 298, "aarch64": 241}[os.uname().machine]
 _TYPE_BREAKPOINT, _EXECUTE, _CLOSE_ON_EXEC = 5, 4, 8
 _DISABLED_AT_EXEC_END = 1 << 36 | 1 << 37  # remove_on_exec, sigtrap
 _USER_ONLY = 1 << 5 | 1 << 6  # exclude_kernel, exclude_hv
@@ -35,13 +32,13 @@ class Mechanism(Enum):
     DEBUG = "debug-registers"
 
 
-def _open_event(tid: int, address: int, period: int, flags: int) -> int:
+def _open_event(tid: int, address: int, period: int, extra: int) -> int:
     attributes = _ATTRIBUTES.pack(
-        _TYPE_BREAKPOINT, 128, 0, period, 0, 0, _USER_ONLY | flags, 0, _EXECUTE, address, 8
-    )
-    fd = int(
-        _libc.syscall(_PERF_EVENT_OPEN, attributes, tid, -1, -1, ctypes.c_ulong(_CLOSE_ON_EXEC))
-    )
+        _TYPE_BREAKPOINT, 128, 0, period, 0, 0, _USER_ONLY | extra, 0, _EXECUTE, address,
+        TRAITS.breakpoint_length,
+    )  # fmt: skip
+    flags = ctypes.c_ulong(_CLOSE_ON_EXEC)
+    fd = int(_libc.syscall(TRAITS.perf_event_open, attributes, tid, -1, -1, flags))
     if fd < 0:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code))
@@ -72,24 +69,6 @@ class ExecutionCounter:
     def close(self) -> None:
         """Take the counter away."""
         os.close(self._fd)
-
-
-class DebugBreakpoint:
-    """Debug register 0 of a *stopped* thread: traps before every execution at `address`."""
-
-    def __init__(self, tid: int, address: int) -> None:
-        self._tid = tid
-        self._poke(7, 0)
-        self._poke(0, address)
-        self._poke(7, 1)  # enabled for the thread; type execute, length 1
-
-    def close(self) -> None:
-        """Take the breakpoint away; the thread must be stopped, or gone."""
-        with contextlib.suppress(ProcessLookupError):
-            self._poke(7, 0)
-
-    def _poke(self, register: int, value: int) -> None:
-        linux.request(linux.POKEUSER, self._tid, TRAITS.debug_registers + 8 * register, value)
 
 
 def perf_allowed() -> str | None:

@@ -10,7 +10,7 @@ import numpy as np
 from mavfi_cli.core.errors import BitOutsideWidth, FaultError
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.native.arch.decode import Instruction, RegisterUse
+from mavfi_cli.fi.native.arch import TRAITS, Instruction, RegisterUse, register_kind, width_of
 from mavfi_cli.fi.native.image import Location
 
 
@@ -126,15 +126,7 @@ def draw_corruption(
 
 def site_of(register: str) -> Site:
     """The class of a full register."""
-    if register == "rflags":
-        return Site.FLAGS
-    if register == "rip":
-        return Site.INSTRUCTION_POINTER
-    if register.startswith(("xmm", "ymm", "zmm")):
-        return Site.VECTOR
-    if register.startswith(("st", "mm")):
-        return Site.X87
-    return Site.MASK if register.startswith("k") else Site.GENERAL
+    return Site(register_kind(register))
 
 
 def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> Corruption:
@@ -144,8 +136,6 @@ def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> Co
         FaultError: no such register.
         BitOutsideWidth: the register has no such bit.
     """
-    from mavfi_cli.fi.native.arch.x86_64 import width_of
-
     try:
         width = width_of(register)
     except KeyError:
@@ -181,12 +171,12 @@ def _registers(
             continue
         if not (use.explicit or model.implicit):
             continue
-        mask = use.mask & _field_mask(instruction, model, site)
+        mask, operand = use.mask & _field_mask(instruction, model, site), use.operand
         known = merged.get(use.register)
         if known is not None:  # the flags of one instruction are one operand
-            mask |= known.mask
+            mask, operand = mask | known.mask, use.register
         merged[use.register] = _Candidate(
-            site=site, role=role, register=use.register, operand=use.operand, mask=mask
+            site=site, role=role, register=use.register, operand=operand, mask=mask
         )
     return [candidate for candidate in merged.values() if candidate.mask]
 
@@ -200,9 +190,9 @@ def _field_mask(instruction: Instruction, model: FaultModel, site: Site) -> int:
         return 0
     kind = bits.NUMPY_TYPES[instruction.element]
     lane = bits.mask_of(kind.field_bits(model.field), kind)
-    if instruction.mnemonic.endswith(("sd", "ss")):
+    if instruction.scalar:
         return lane
-    return sum(lane << shift for shift in range(0, 512, kind.width))
+    return sum(lane << shift for shift in range(0, TRAITS.vector_bits, kind.width))
 
 
 def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Candidate]:
@@ -225,13 +215,14 @@ def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Ca
 def _control(instruction: Instruction, model: FaultModel) -> list[_Candidate]:
     found = []
     if Site.INSTRUCTION_POINTER in model.sites:
+        pointer = TRAITS.instruction_pointer
         found.append(
             _Candidate(
                 site=Site.INSTRUCTION_POINTER,
                 role=Role.DESTINATION,
-                register="rip",
-                operand="rip",
-                mask=(1 << 64) - 1,
+                register=pointer,
+                operand=pointer,
+                mask=(1 << width_of(pointer)) - 1,
             )
         )
     if Site.OPCODE in model.sites:

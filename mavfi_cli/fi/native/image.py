@@ -8,18 +8,13 @@ code without a file (numba) is a named region, with offsets from its start.
 from __future__ import annotations
 
 import bisect
-import functools
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from elftools.common.exceptions import ELFError
-from elftools.elf.elffile import ELFFile
 
 from mavfi_cli.core.errors import FaultError, UnknownName
+from mavfi_cli.fi.native.elf import elf_facts
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -31,93 +26,6 @@ class Location:
 
     def __str__(self) -> str:
         return f"{self.object}+{self.offset:#x}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ElfFacts:
-    """What one ELF file says about itself."""
-
-    path: str
-    build_id: str
-    text: tuple[range, ...]  # linked addresses of its own code, without PLT and start-up stubs
-    first_segment: int  # linked address of file offset 0
-
-    @functools.cached_property
-    def functions(self) -> tuple[tuple[int, int, str], ...]:
-        """Start, size and name of all functions, ascending; read when first asked for.
-
-        Of all objects of a Python process that takes ten seconds, and few are asked.
-        """
-        try:
-            with open(self.path, "rb") as stream:
-                return tuple(sorted(set(_functions(ELFFile(stream)))))
-        except (OSError, ELFError) as error:
-            raise FaultError(f"{self.path}: not a readable ELF object ({error})") from None
-
-    @functools.cached_property
-    def starts(self) -> tuple[int, ...]:
-        """Where the functions begin."""
-        return tuple(start for start, _, _ in self.functions)
-
-
-@functools.lru_cache(maxsize=256)
-def elf_facts(path: str, _modified_ns: int = 0) -> ElfFacts:
-    """Read an ELF file; a file without build id is named by the hash of its contents.
-
-    Raises:
-        FaultError: not an ELF file.
-    """
-    try:
-        with open(path, "rb") as stream:
-            elf: Any = ELFFile(stream)
-            text = _text(elf)
-            loads = [s for s in elf.iter_segments() if s["p_type"] == "PT_LOAD"]
-            first = loads[0]["p_vaddr"] - loads[0]["p_offset"]
-            build_id = _build_id(elf)
-    except (OSError, ELFError) as error:
-        raise FaultError(f"{path}: not a readable ELF object ({error})") from None
-    if not build_id:
-        build_id = "sha256:" + hashlib.sha256(Path(path).read_bytes()).hexdigest()[:40]
-    return ElfFacts(path=path, build_id=build_id, text=text, first_segment=first)
-
-
-def _build_id(elf: Any) -> str:
-    section = elf.get_section_by_name(".note.gnu.build-id")
-    if section is None:
-        return ""
-    return next((str(n["n_desc"]) for n in section.iter_notes()), "")
-
-
-def _text(elf: Any) -> tuple[range, ...]:
-    section = elf.get_section_by_name(".text")
-    if section is not None:
-        return (range(section["sh_addr"], section["sh_addr"] + section["sh_size"]),)
-    return tuple(
-        range(segment["p_vaddr"], segment["p_vaddr"] + segment["p_memsz"])
-        for segment in elf.iter_segments()
-        if segment["p_type"] == "PT_LOAD" and segment["p_flags"] & 1
-    )
-
-
-# Elf64_Sym, and the symbol types of functions (STT_FUNC, and STT_LOOS for indirect ones). Read in
-# one piece: a library of 10 MB has tens of thousands of symbols.
-_SYMBOL = np.dtype(
-    [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("value", "<u8"),
-     ("size", "<u8")]
-)  # fmt: skip
-_FUNCTION_TYPES = (2, 10)
-
-
-def _functions(elf: Any) -> Iterable[tuple[int, int, str]]:
-    for name in (".symtab", ".dynsym"):
-        section = elf.get_section_by_name(name)
-        if section is None or not section["sh_size"]:
-            continue
-        names: bytes = elf.get_section(section["sh_link"]).data()
-        symbols = np.frombuffer(section.data(), _SYMBOL)
-        wanted = np.isin(symbols["info"] & 0xF, _FUNCTION_TYPES) & (symbols["value"] != 0)
-        for start, size, at in symbols[wanted][["value", "size", "name"]].tolist():
-            yield start, size, names[at : names.index(b"\0", at)].decode(errors="replace")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,26 +80,50 @@ class Image:
             regions: by name, addresses of compiled code without a file, and which part of a
                 loaded object counts as its text.
         """
-        self.objects: dict[str, LoadedObject] = {}
-        for path, mappings in _files(pid).items():
-            loaded = _load(path, mappings)
-            if loaded is not None:
-                self.objects.setdefault(loaded.name, loaded)
+        self._files = _files(pid)
+        self._paths: dict[str, str] = {}
+        for path in self._files:
+            self._paths.setdefault(Path(path).name, path)
+        self._loaded: dict[str, LoadedObject | None] = {}
         for name, what in (regions or {}).items():
             if isinstance(what, Part):
-                self.objects[name] = replace(self.named(name), text=what.text)
+                self._loaded[name] = replace(self.named(name), text=what.text)
             else:
                 region = what if isinstance(what, Region) else Region(span=what)
-                self.objects[name] = _region(pid, name, region)
-        self._sorted = sorted(self.objects.values(), key=lambda loaded: loaded.start)
-        self._starts = [loaded.start for loaded in self._sorted]
+                self._loaded[name] = _region(pid, name, region)
+        regions_of_code = [(o.start, o.end, name) for name, o in self._loaded.items() if o]
+        spans = [
+            (min(m.start for m in mappings), max(m.end for m in mappings), Path(path).name)
+            for path, mappings in self._files.items()
+        ]
+        self._sorted = sorted({*spans, *regions_of_code})
+        self._starts = [start for start, _, _ in self._sorted]
+
+    @property
+    def names(self) -> list[str]:
+        """Of all mapped files and regions; not every file needs to be an object."""
+        return [*self._loaded, *(name for name in self._paths if name not in self._loaded)]
+
+    def path_of(self, name: str) -> str:
+        """Where a mapped file is; empty for a region."""
+        return self._paths.get(name, "")
+
+    def find(self, name: str) -> LoadedObject | None:
+        """An object or region by its name; None where no such object is loaded.
+
+        An object is read when it is first asked for: a Python process has hundreds.
+        """
+        if name not in self._loaded:
+            path = self._paths.get(name)
+            self._loaded[name] = None if path is None else _load(path, self._files[path])
+        return self._loaded[name]
 
     def object_at(self, address: int) -> LoadedObject | None:
         """The object that holds an address."""
         index = bisect.bisect_right(self._starts, address) - 1
-        if index < 0 or address >= self._sorted[index].end:
+        if index < 0 or address >= self._sorted[index][1]:
             return None
-        return self._sorted[index]
+        return self.find(self._sorted[index][2])
 
     def named(self, name: str) -> LoadedObject:
         """An object by its file name.
@@ -199,10 +131,10 @@ class Image:
         Raises:
             UnknownName: no such object is loaded.
         """
-        try:
-            return self.objects[name]
-        except KeyError:
-            raise UnknownName("object", name, self.objects) from None
+        found = self.find(name)
+        if found is None:
+            raise UnknownName("object", name, [n for n in self.names if self.find(n) is not None])
+        return found
 
     def locate(self, address: int) -> Location:
         """The place of an address; unknown memory is the object `?`."""
@@ -221,17 +153,11 @@ class Image:
 
     def symbol(self, location: Location) -> str:
         """`function+offset` of a place, or the empty string."""
-        loaded = self.objects.get(location.object)
+        loaded = self.find(location.object)
         if loaded is None or loaded.path is None:
             return ""
-        facts = elf_facts(loaded.path)
-        index = bisect.bisect_right(facts.starts, location.offset) - 1
-        if index < 0:
-            return ""
-        start, size, name = facts.functions[index]
-        if size and location.offset >= start + size:
-            return ""
-        return f"{name}+{location.offset - start:#x}"
+        found = elf_facts(loaded.path).function_at(location.offset)
+        return "" if found is None else f"{found.name}+{location.offset - found.start:#x}"
 
     def function(self, name: str, objects: Iterable[str]) -> Location:
         """The entry of a function in one of the named objects.
@@ -240,14 +166,14 @@ class Image:
             UnknownName: none of them has it; names the nearest.
         """
         known: list[str] = []
-        for object_name in objects:
-            loaded = self.named(object_name)
+        for loaded in map(self.named, objects):
             if loaded.path is None:
                 continue
-            for start, _, symbol in elf_facts(loaded.path).functions:
-                if symbol == name:
-                    return Location(object_name, start)
-                known.append(symbol)
+            facts = elf_facts(loaded.path)
+            found = facts.function(name)
+            if found is not None:
+                return Location(loaded.name, found.start)
+            known += [function.name for function in facts.functions()]
         raise UnknownName("function", name, known[:200])
 
 

@@ -8,8 +8,14 @@ from enum import Enum
 
 from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi import bits
-from mavfi_cli.fi.native.arch.decode import Instruction, address_of, decode
-from mavfi_cli.fi.native.arch.x86_64 import TRAP_FLAG, width_of
+from mavfi_cli.fi.native.arch import (
+    TRAITS,
+    Instruction,
+    address_of,
+    decode,
+    erase_trap,
+    width_of,
+)
 from mavfi_cli.fi.native.fault import Corruption, InstructionFault, Role, Site
 from mavfi_cli.fi.native.image import Image
 from mavfi_cli.fi.native.tracee import Ended, Tracee, Trap
@@ -72,23 +78,14 @@ def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
 
 def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
     """Execute one whole instruction and leave no trace of the trap flag in the target."""
-    if instruction is not None and (instruction.repeats or instruction.restores_flags):
+    if instruction is not None and instruction.run_over:
         if tracee.run_to(instruction.next_address):
             return Trap(code=0)
         assert tracee.ended is not None
         return tracee.ended
     result = tracee.step()
-    if isinstance(result, Ended) or instruction is None:
-        return result
-    if instruction.saves_flags:
-        stack = tracee.registers.sp
-        size = 2 if instruction.mnemonic == "pushf" else 8
-        image = int.from_bytes(tracee.read_memory(stack, size), "little")
-        tracee.write_memory(stack, (image & ~TRAP_FLAG).to_bytes(size, "little"))
-    elif instruction.is_system_call:
-        saved = tracee.registers.read("r11")
-        if saved & TRAP_FLAG:
-            tracee.registers.write("r11", saved & ~TRAP_FLAG)
+    if not isinstance(result, Ended) and instruction is not None:
+        erase_trap(tracee, instruction)
     return result
 
 
@@ -177,7 +174,7 @@ def follow(
         return Followed(
             activation=Activation.READ, after_instructions=0, instruction=instruction.text
         )
-    remaining = bits.mask_of(corruption.bits, bits.raw(512))
+    remaining = bits.mask_of(corruption.bits, bits.raw(TRAITS.vector_bits))
     for distance in range(1, window + 1):
         current = instruction_at(tracee, tracee.registers.ip)
         if current is None:

@@ -10,21 +10,23 @@ while it is attached, the tracer hears of it first: take its end from the result
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi import record
-from mavfi_cli.fi.native.breakpoints import ExecutionCounter
+from mavfi_cli.fi.native.breakpoints import ExecutionCounter, Mechanism
 from mavfi_cli.fi.native.fault import InstructionFault, Stage
 from mavfi_cli.fi.native.image import Image, Location, Regions, scope_of
 from mavfi_cli.fi.native.inject import NOTHING, Followed, Injection, reach, strike
 from mavfi_cli.fi.native.profile import Segment, record_window
-from mavfi_cli.fi.native.tracee import Ended, Tracee, stack_word
+from mavfi_cli.fi.native.tracee import Ended, Tracee, best_mechanism
+from mavfi_cli.fi.native.tracer import TracerThread
 
 Notice = Callable[[], None]
 
@@ -107,16 +109,15 @@ def count_executions(
     pid: int,
     entry: Location,
     invocation: int,
-    what: Location,
+    what: Sequence[Location],
     *,
     regions: Regions | None = None,
     armed: Notice | None = None,
-) -> int:
-    """How often an instruction executes during one invocation of a kernel.
+) -> list[int]:
+    """How often each of some instructions executes during one invocation of a kernel.
 
     Raises:
         TargetError: the node ends before.
-        OSError: the system does not count executions for us.
     """
     tracee = Tracee.attach(pid)
     try:
@@ -124,18 +125,52 @@ def count_executions(
         if armed is not None:
             armed()
         _run_through(tracee, image, (Stage(entry, invocation),))
-        tracee.registers.rearm()
-        back, top = stack_word(tracee), tracee.registers.sp
-        counter = ExecutionCounter(tracee.tid, image.address(what))
-        try:
-            while tracee.run_to(back) and tracee.registers.sp <= top:
-                tracee.step()  # a deeper return to the same place
-            return counter.read()
-        finally:
-            counter.close()
+        return tracee.count_in_call([image.address(location) for location in what])
     finally:
         if tracee.ended is None:
             tracee.detach()
+
+
+class EntryCounter:
+    """Counts the executions of one instruction of a running node, which goes on meanwhile.
+
+    Where the operating system does not count, a tracer stops at each; the count is right whenever
+    the node has answered all the same, since it answers after its last stop.
+
+    Args:
+        pid: the node; closing the counter may end it.
+        address: of the instruction.
+    """
+
+    def __init__(self, pid: int, address: int) -> None:
+        self._pid, self._address, self._stops = pid, address, 0
+        self._counter: ExecutionCounter | None = None
+        self._tracer: TracerThread[None] | None = None
+        if best_mechanism() is Mechanism.PERF:
+            self._counter = ExecutionCounter(pid, address)
+        else:
+            self._tracer = TracerThread(self._count)
+            self._tracer.await_armed()
+
+    def read(self) -> int:
+        """Executions since the counter was made."""
+        return self._stops if self._counter is None else self._counter.read()
+
+    def close(self) -> None:
+        """Take the counter away, and with it a node that had to be traced."""
+        if self._counter is not None:
+            self._counter.close()
+        if self._tracer is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGKILL)
+            self._tracer.result()
+
+    def _count(self, armed: Notice) -> None:
+        tracee = Tracee.attach(self._pid)
+        tracee.breakpoint_at(self._address)
+        armed()
+        while not isinstance(tracee.resume(), Ended):
+            self._stops += tracee.registers.ip == self._address
 
 
 def _run_through(tracee: Tracee, image: Image, stages: tuple[Stage, ...]) -> None:

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
-from mavfi_cli.fi.native.arch import TRAITS
+from mavfi_cli.fi.native.arch import TRAITS, record_steps, return_address
+from mavfi_cli.fi.native.arch.traits import StepEnd
 from mavfi_cli.fi.native.fault import Stage
 from mavfi_cli.fi.native.image import Location, Scope
 from mavfi_cli.fi.native.inject import clean_step, instruction_at
-from mavfi_cli.fi.native.tracee import Ended, Tracee, stack_word
+from mavfi_cli.fi.native.tracee import Ended, Tracee
 
 _CHUNK = 16384
 
@@ -107,7 +108,7 @@ def record_window(
     """
     stop = np.array([-1, 0, *markers], np.int64)
     if until_return:
-        stop[:2] = stack_word(tracee), tracee.registers.sp
+        stop[:2] = return_address(tracee), tracee.registers.sp
     parts: list[NDArray[np.int64]] = []
     if tracee.registers.ip in markers:
         parts.append(np.array([tracee.registers.ip], np.int64))
@@ -122,25 +123,21 @@ def record_window(
 
 
 def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    from mavfi_cli.fi.native import stepper  # numba takes half a second to import
-
     spans = np.array([[span.start, span.stop] for span in scope.spans], np.int64)
-    offsets = np.array(TRAITS.user_offsets, np.int64)
-    status = np.zeros(1, np.int32)
     blanket = _Blanket(tracee, scope)
     while tracee.ended is None:
         trace = np.empty(_CHUNK, np.int64)
         tracee.registers.forget()
-        count, why = stepper.run(tracee.tid, spans, trace, stop, offsets, status)
-        yield trace[:count]
-        if why == stepper.WINDOW_END:
+        steps = record_steps(tracee.tid, spans, trace, stop)
+        yield trace[: steps.count]
+        if steps.why is StepEnd.WINDOW_END:
             return
-        if why == stepper.OTHER_STATUS:
-            tracee.handle(linux.Status(tracee.tid, int(status[0])), linux.SINGLESTEP)
-        elif why == stepper.NEEDS_CARE:
+        if steps.why is StepEnd.OTHER_STATUS:
+            tracee.handle(linux.Status(tracee.tid, steps.status), linux.SINGLESTEP)
+        elif steps.why is StepEnd.NEEDS_CARE:
             yield np.array([tracee.registers.ip], np.int64)
             clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
-        elif why == stepper.OUT_OF_SCOPE and not blanket.run_native(stop):
+        elif steps.why is StepEnd.OUT_OF_SCOPE and not blanket.run_native(stop):
             return
 
 

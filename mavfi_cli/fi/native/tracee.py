@@ -11,19 +11,19 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.alarm import Alarm
-from mavfi_cli.fi.native.arch import TRAITS, Registers
+from mavfi_cli.fi.native.arch import DebugBreakpoint, Registers, return_address
 from mavfi_cli.fi.native.breakpoints import (
     SI_KERNEL,
     TRAP_BRKPT,
     TRAP_HWBKPT,
     TRAP_PERF,
     TRAP_TRACE,
-    DebugBreakpoint,
     ExecutionCounter,
     Mechanism,
     PerfBreakpoint,
@@ -160,6 +160,44 @@ class Tracee:
             return count
         finally:
             breakpoint_.close()
+
+    def count_in_call(self, addresses: Sequence[int]) -> list[int]:
+        """From a function's entry, run until it has returned, or to the end of the process.
+
+        Args:
+            addresses: whose executions on the way are counted; three at most where debug
+                registers count.
+        """
+        self.registers.rearm()
+        back, top = return_address(self), self.registers.sp
+        if self.mechanism is Mechanism.DEBUG:
+            return self._count_stopping(addresses, back, top)
+        counters = [ExecutionCounter(self.tid, address) for address in addresses]
+        try:
+            while self.run_to(back) and self.registers.sp <= top:
+                self.step()  # a deeper return to the same place
+            return [counter.read() for counter in counters]
+        finally:
+            for counter in counters:
+                counter.close()
+
+    def _count_stopping(self, addresses: Sequence[int], back: int, top: int) -> list[int]:
+        counts = [0] * len(addresses)
+        stops = [
+            DebugBreakpoint(self.tid, address, slot)
+            for slot, address in enumerate((back, *addresses))
+        ]
+        try:
+            while not isinstance(self.resume(), Ended):
+                ip = self.registers.ip
+                if ip == back and self.registers.sp > top:
+                    break
+                for index, address in enumerate(addresses):
+                    counts[index] += ip == address
+            return counts
+        finally:
+            for stop in stops:
+                stop.close()
 
     def breakpoint_at(self, address: int) -> PerfBreakpoint | DebugBreakpoint:
         """A breakpoint that stops at the next execution of `address`, until it is closed."""
@@ -356,13 +394,3 @@ def best_mechanism() -> Mechanism:
 
 
 ENTRY_ADDRESS = 9  # AT_ENTRY of the auxiliary vector
-
-
-def word_at(tracee: Tracee, address: int) -> int:
-    """The 8-byte word at an address of the target."""
-    return int.from_bytes(tracee.read_memory(address, 8), "little")
-
-
-def stack_word(tracee: Tracee) -> int:
-    """The word that the stack pointer points at."""
-    return word_at(tracee, tracee.registers.read(TRAITS.stack_pointer))

@@ -10,90 +10,16 @@ from __future__ import annotations
 
 import functools
 import re
-from dataclasses import dataclass
 from typing import Any
 
 import capstone
 from capstone import x86
 
-from mavfi_cli.fi.native.arch.cpuid import xsave_components
-from mavfi_cli.fi.native.arch.x86_64 import AVX, FLAG_BITS, GENERAL, ZMM_HIGH
+from mavfi_cli.fi.native.arch.instruction import Instruction, MemoryUse, RegisterUse
+from mavfi_cli.fi.native.arch.x86_64.cpuid import xsave_components
+from mavfi_cli.fi.native.arch.x86_64.registers import AVX, FLAG_BITS, GENERAL, ZMM_HIGH
 
 _FULL = (1 << 64) - 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegisterUse:
-    """Bits of a full register that an instruction reads or writes."""
-
-    register: str
-    mask: int  # the operand's bits
-    clears: int  # for a write: every bit that gets a new value
-    explicit: bool
-    operand: str  # as the assembler names it: eax, xmm1, zf
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MemoryUse:
-    """Bytes that an instruction reads or writes: base + index * scale + displacement."""
-
-    base: str | None
-    index: str | None
-    scale: int
-    displacement: int
-    segment: str | None
-    size: int
-    reads: bool
-    writes: bool
-
-    @property
-    def operand(self) -> str:
-        """The operand in words, for a record."""
-        parts = [part for part in (self.segment, self.base, self.index) if part]
-        return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Instruction:
-    """One decoded instruction."""
-
-    address: int
-    raw: bytes
-    mnemonic: str
-    text: str
-    reads: tuple[RegisterUse, ...]
-    writes: tuple[RegisterUse, ...]
-    memory: tuple[MemoryUse, ...]
-    element: str | None  # float64 or float32 where the instruction computes with them
-
-    @property
-    def next_address(self) -> int:
-        """Where the following instruction starts."""
-        return self.address + len(self.raw)
-
-    @property
-    def repeats(self) -> bool:
-        """A repeated string instruction: one single step is one iteration only."""
-        return self.mnemonic.startswith("rep")
-
-    @property
-    def restores_flags(self) -> bool:
-        """It pops the flags.
-
-        Linux takes the trap flag for the program's own once such an instruction was stepped
-        (`enable_single_step` in arch/x86/kernel/step.c), and would leave it set.
-        """
-        return self.mnemonic in ("popfq", "popf")
-
-    @property
-    def saves_flags(self) -> bool:
-        """It pushes the flags, the trap flag of a single step included."""
-        return self.mnemonic in ("pushfq", "pushf")
-
-    @property
-    def is_system_call(self) -> bool:
-        """It enters the operating system."""
-        return self.mnemonic == "syscall"
 
 
 @functools.lru_cache(maxsize=1)
@@ -170,7 +96,19 @@ def _decode(code: bytes, address: int) -> Instruction | None:
         writes=tuple(use for use in writes if use is not None),
         memory=(*_memory(found), *_stack(found)),
         element=_element(found.mnemonic),
+        scalar=found.mnemonic.endswith(("sd", "ss")),
+        run_over=_run_over(found.mnemonic),
     )
+
+
+def _run_over(mnemonic: str) -> bool:
+    """Whether one single step is not enough, or leaves a trace.
+
+    Of a repeated string instruction it is one iteration only. After one of a pop of the flags
+    Linux takes the trap flag for the program's own (`enable_single_step` in
+    arch/x86/kernel/step.c), and would leave it set.
+    """
+    return mnemonic.startswith("rep") or mnemonic in ("popfq", "popf")
 
 
 def _element(mnemonic: str) -> str | None:
@@ -219,6 +157,8 @@ def _legacy_cover(found: Any) -> int:
 def _flags(found: Any, table: dict[str, int]) -> list[RegisterUse | None]:
     if x86.X86_GRP_FPU in found.groups:
         return []
+    # Capstone takes the scalar SSE `movsd` for the string instruction of the same name.
+    vector = any(_VECTOR.match(found.reg_name(r)) for ids in found.regs_access() for r in ids)
     return [
         RegisterUse(
             register="rflags",
@@ -228,7 +168,7 @@ def _flags(found: Any, table: dict[str, int]) -> list[RegisterUse | None]:
             operand=name,
         )
         for name, test in table.items()
-        if found.eflags & test
+        if found.eflags & test and not (name == "df" and vector)
     ]
 
 

@@ -11,7 +11,8 @@ import re
 from dataclasses import dataclass
 
 from mavfi_cli.fi.native import linux
-from mavfi_cli.fi.native.arch.cpuid import xsave_components
+from mavfi_cli.fi.native.arch.traits import Traits
+from mavfi_cli.fi.native.arch.x86_64.cpuid import xsave_components
 
 NT_PRSTATUS, NT_X86_XSTATE = 1, 0x202
 XSTATE_BV = 512
@@ -32,33 +33,14 @@ _VECTOR = re.compile(r"(xmm|ymm|zmm)(\d+)$")
 _X87 = re.compile(r"(st|mm|k)(\d)$")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Traits:
-    """Names and numbers that the rest of the injector asks of an architecture."""
-
-    instruction_pointer: str
-    flags: str
-    stack_pointer: str
-    general: tuple[str, ...]
-    longest_instruction: int
-    breakpoint: bytes  # software breakpoint instruction
-    breakpoint_advance: int  # how far the instruction pointer is past it when it traps
-    user_offsets: tuple[int, int]  # of instruction and stack pointer in `struct user`
-    debug_registers: int  # offset of debug register 0 in `struct user`
-    step_after_breakpoint: bool  # a single step works right after a perf breakpoint stop
-
-
 TRAITS = Traits(
     instruction_pointer="rip",
-    flags="rflags",
     stack_pointer="rsp",
-    general=GENERAL,
-    longest_instruction=15,
+    vector_bits=512,
     breakpoint=b"\xcc",
     breakpoint_advance=1,
-    user_offsets=(128, 152),
-    debug_registers=848,
-    step_after_breakpoint=True,
+    breakpoint_length=8,
+    perf_event_open=298,
 )
 
 
@@ -84,6 +66,19 @@ def width_of(name: str) -> int:
     if match := _X87.match(name):
         return 80 if match[1] == "st" else 64
     raise KeyError(name)
+
+
+def register_kind(name: str) -> str:
+    """The class of a full register: the value of its `Site`."""
+    if name == "rflags":
+        return "flags"
+    if name == "rip":
+        return "instruction-pointer"
+    if name.startswith(("xmm", "ymm", "zmm")):
+        return "vector"
+    if name.startswith(("st", "mm")):
+        return "x87"
+    return "mask" if name.startswith("k") else "general"
 
 
 def _vector_spans(kind: str, index: int) -> list[_Span]:

@@ -1,0 +1,60 @@
+"""What one instruction reads and writes, as bits of full registers and bytes of memory.
+
+The same on every processor; a decoder of `arch` fills it in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisterUse:
+    """Bits of a full register that an instruction reads or writes."""
+
+    register: str
+    mask: int  # the operand's bits
+    clears: int  # for a write: every bit that gets a new value
+    explicit: bool
+    operand: str  # as the assembler names it: eax, xmm1, zf
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MemoryUse:
+    """Bytes that an instruction reads or writes: base + index * scale + displacement."""
+
+    base: str | None
+    index: str | None
+    scale: int
+    displacement: int
+    segment: str | None
+    size: int
+    reads: bool
+    writes: bool
+
+    @property
+    def operand(self) -> str:
+        """The operand in words, for a record."""
+        parts = [part for part in (self.segment, self.base, self.index) if part]
+        return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instruction:
+    """One decoded instruction."""
+
+    address: int
+    raw: bytes
+    mnemonic: str
+    text: str
+    reads: tuple[RegisterUse, ...]
+    writes: tuple[RegisterUse, ...]
+    memory: tuple[MemoryUse, ...]
+    element: str | None  # float64 or float32 where the instruction computes with them
+    scalar: bool  # of the elements of its registers it computes with the lowest only
+    run_over: bool  # one single step does not execute it whole and without a trace: run past it
+
+    @property
+    def next_address(self) -> int:
+        """Where the following instruction starts."""
+        return self.address + len(self.raw)
