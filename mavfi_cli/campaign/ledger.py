@@ -240,6 +240,15 @@ class Ledger:
             if not rows:
                 return
 
+    def cell_of_each(self) -> list[int]:
+        """The setting of each mission, in the order of the list."""
+        return [cell for (cell,) in self._db.execute("SELECT cell FROM missions ORDER BY number")]
+
+    def fates(self) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
+        """Number, outcome and fate of the fault of every mission that is over."""
+        for number, *fate in self._db.execute("SELECT number, outcome, injected FROM results"):
+            yield number, (fate[0], fate[1])
+
     def over(self) -> int:
         """How many missions have a row."""
         return int(self._db.execute("SELECT count(*) FROM results").fetchone()[0])

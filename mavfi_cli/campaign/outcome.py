@@ -24,7 +24,7 @@ class Injected(Enum):
     GOLDEN = "golden"  # none was asked for
     ACTIVE = "active"  # it struck, and what it struck was read afterwards
     UNREAD = "unread"  # it struck, and nothing read it as long as it was followed
-    NOT_ACTIVATED = "not_activated"  # it struck what nothing read before it was overwritten
+    NOT_ACTIVATED = "not_activated"  # it struck what nothing read before it was over
     NOT_INJECTED = "not_injected"  # the mission ended, or the run parted, before the trigger
     NULL = "null"  # everything but the flip, as was asked for
 
@@ -56,7 +56,11 @@ class MissionResult:
     path: Path | None
 
 
-_WITHOUT_EFFECT = {
+_BY_ACTIVATION = {
+    "read": Injected.ACTIVE,
+    "unchanged": Injected.NOT_ACTIVATED,
+    "not_read": Injected.NOT_ACTIVATED,
+    "not_injected": Injected.NOT_INJECTED,
     "overwritten": Injected.NOT_ACTIVATED,
     "ended_before_read": Injected.NOT_ACTIVATED,
     "not_read_in_window": Injected.UNREAD,
@@ -77,5 +81,6 @@ def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
         return Injected.NOT_INJECTED
     if fault["state"] == "null":
         return Injected.NULL
-    activation = fault.get("activation") or {}
-    return _WITHOUT_EFFECT.get(activation.get("activation", ""), Injected.ACTIVE)
+    told = fault.get("activation")  # a table at instruction level, a word at source level
+    word = told["activation"] if isinstance(told, Mapping) else told
+    return _BY_ACTIVATION.get(word or "read", Injected.ACTIVE)

@@ -19,6 +19,8 @@ from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, c
 from mavfi_cli.campaign.outcome import State, injected_of
 from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.slots import TASK, Ended, Slots
+from mavfi_cli.campaign.spec import Stop
+from mavfi_cli.campaign.stopping import Entry, Gate, Queue
 from mavfi_cli.campaign.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
 from mavfi_cli.mission.replay import version_differences
@@ -56,6 +58,7 @@ def run_campaign(
     spectator: Spectator | None = None,
     *,
     append: bool = False,
+    stop: Stop | None = None,
 ) -> Ledger:
     """Fly a list of missions into a folder; what is there already is not flown again.
 
@@ -65,6 +68,7 @@ def run_campaign(
         options: how to run them.
         spectator: hears of progress.
         append: missions that the folder does not know are added to its list.
+        stop: ends settings early.
 
     Returns:
         The ledger, open for reading; `results()` come in the order of the list.
@@ -77,26 +81,33 @@ def run_campaign(
     """
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, missions, append=append)
-        fly_missing(ledger, options or Options(), spectator or Spectator())
+        fly_missing(ledger, options or Options(), spectator or Spectator(), stop)
     return Ledger(folder)
 
 
 def store_plan(ledger: Ledger, missions: Sequence[PlannedMission], *, append: bool = False) -> None:
     """Write the list down before anything flies, or compare it with the one that is there.
 
+    Args:
+        append: missions that are not among the stored ones are added; those that are only there
+            stay.
+
     Raises:
         ConfigError: it is another list; says the first difference.
     """
     require_versions(ledger)
-    stored = {row[1:]: row[0] for row in ledger.rows()}
-    if not stored:
-        ledger.plan(missions)
-        return
-    new = [mission for mission in missions if _row(mission) not in stored]
-    if not append and (new or len(missions) != len(stored)):
-        raise ConfigError(_difference(missions, new, len(stored)), path=ledger.folder)
-    if append:
-        ledger.plan(new)
+    left = Counter(row[1:] for row in ledger.rows())
+    stored = left.total()
+    new = []
+    for mission in missions:
+        row = _row(mission)
+        if left[row]:
+            left[row] -= 1
+        else:
+            new.append(mission)
+    if stored and not append and (new or left.total()):
+        raise ConfigError(_difference(stored, len(missions), new, +left), path=ledger.folder)
+    ledger.plan(new)
 
 
 def _row(mission: PlannedMission) -> tuple[str, str, str]:
@@ -104,12 +115,15 @@ def _row(mission: PlannedMission) -> tuple[str, str, str]:
 
 
 def _difference(
-    missions: Sequence[PlannedMission], new: Sequence[PlannedMission], stored: int
+    stored: int, count: int, new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]
 ) -> str:
-    parts = [f"holds another campaign: {stored} missions, now there are {len(missions)}"]
+    parts = [f"holds another campaign: {stored} missions, now there are {count}"]
     if new:
         labels, _, changes = _row(new[0])
-        parts.append(f"{len(new)} are not among them, the first is {labels} {changes}")
+        parts.append(f"{len(new)} are new, the first is {labels} {changes}")
+    if gone:
+        labels, _, changes = next(iter(gone))
+        parts.append(f"{gone.total()} are gone, the first is {labels} {changes}")
     return "; ".join([*parts, "--append adds what is new, another folder starts anew"])
 
 
@@ -128,9 +142,15 @@ def require_versions(ledger: Ledger) -> None:
         raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
 
 
-def fly_missing(ledger: Ledger, options: Options, spectator: Spectator) -> None:
-    """Fly every mission without a result; see `run_campaign`."""
-    run = _Run(ledger, options, spectator)
+def fly_missing(
+    ledger: Ledger, options: Options, spectator: Spectator, stop: Stop | None = None
+) -> None:
+    """Fly every mission without a result, or as many as the stopping rule takes.
+
+    Raises:
+        MavfiError: as `run_campaign`.
+    """
+    run = _Run(ledger, options, spectator, stop)
     with _prepared(ledger.folder), interruptible() as asked:
         run.fly(asked)
 
@@ -154,14 +174,17 @@ def _prepared(folder: Path) -> Iterator[None]:
 class _Run:
     """One go at what is missing."""
 
-    def __init__(self, ledger: Ledger, options: Options, spectator: Spectator) -> None:
+    def __init__(
+        self, ledger: Ledger, options: Options, spectator: Spectator, stop: Stop | None
+    ) -> None:
         self._ledger = ledger
         self._options = options
         self._spectator = spectator
         self._folder = ledger.folder.absolute()
-        self._missing = ledger.missing(errors=options.errors)
-        self._again: list[tuple[int, dict[str, Any]]] = []
-        self._flying: dict[int, dict[str, Any]] = {}
+        self._gate = None if stop is None else Gate(stop, ledger.cell_of_each(), ledger.fates())
+        self._queue = Queue(ledger.missing(errors=options.errors), self._gate)
+        self._again: list[Entry] = []
+        self._flying: dict[int, Entry] = {}
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
         self._outcomes: Counter[str] = Counter()
@@ -176,8 +199,8 @@ class _Run:
         jobs = self._options.jobs or len(os.sched_getaffinity(0))
         with Slots(jobs, self._options.task) as slots:
             while len(asked) < 2:
-                while slots.free and not asked and (order := self._next()) is not None:
-                    self._start(slots, *order)
+                while slots.free and not asked and (entry := self._next()) is not None:
+                    self._start(slots, entry)
                 if not self._flying:
                     break
                 for ended in slots.wait(_LOOK_S):
@@ -192,13 +215,11 @@ class _Run:
                 f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
             )
 
-    def _next(self) -> tuple[int, dict[str, Any]] | None:
-        if self._again:
-            return self._again.pop()
-        entry = next(self._missing, None)
-        return None if entry is None else (entry[0], entry[2])
+    def _next(self) -> Entry | None:
+        return self._again.pop() if self._again else self._queue.next()
 
-    def _start(self, slots: Slots, number: int, changes: dict[str, Any]) -> None:
+    def _start(self, slots: Slots, entry: Entry) -> None:
+        number, _, changes = entry
         self._attempts[number] += 1
         out = self._out(number)
         try:
@@ -207,7 +228,7 @@ class _Run:
         except OSError as error:
             raise RecordError(f"{out}: {error.strerror or error}") from None
         slots.start(number, changes, str(out), self._options.limit_s)
-        self._flying[number] = changes
+        self._flying[number] = entry
 
     def _out(self, number: int) -> Path:
         return self._folder / WORK / f"{number}-{self._attempts[number]}"
@@ -215,16 +236,16 @@ class _Run:
     def _take(self, ended: Ended) -> None:
         """Settle one attempt that is over."""
         number = ended.number
-        changes = self._flying.pop(number)
+        entry = self._flying.pop(number)
         self._inside_s += ended.wall_s
-        config = config_from(changes).to_dict()
+        config = config_from(entry[2]).to_dict()
         out = self._out(number)
         verdict = judge(ended, out, config, self._options.limit_s)
         last = self._attempts[number] >= ATTEMPTS
         if (verdict.state is None or verdict.doubtful) and not last:
             self._repeated += 1
             self._spectator.on_note(f"mission {number}: {verdict.reason}; begun again")
-            self._again.append((number, changes))
+            self._again.append(entry)
         elif verdict.state is None:
             self._given_up[number] = verdict.reason
         else:
@@ -241,17 +262,21 @@ class _Run:
             path = str(place.relative_to(self._folder))
         flown = verdict.state is State.FLOWN
         asked = bool(config.get("fault") or config.get("instruction"))
+        injected = injected_of(result, asked=asked) if flown else None
         self._ledger.add(
             number,
             state=verdict.state,
             result=result,
             reason=verdict.reason,
-            injected=injected_of(result, asked=asked) if flown else None,
+            injected=injected,
             wall_s=ended.wall_s,
             attempts=self._attempts.pop(number),
             path=path,
         )
         self._over += 1
+        if self._gate is not None:
+            fate = None if injected is None else injected.value
+            self._gate.record(number, (result.get("outcome"), fate))
         if flown:
             self._outcomes[str(result["outcome"])] += 1
             return

@@ -54,9 +54,9 @@ class Campaign:
         self.notes = Notes()
         self.options = Options(jobs=2, keep=Keep.NONE, task="fake_task")
 
-    def run(self, missions, *, append=False, **options):
+    def run(self, missions, *, append=False, stop=None, **options):
         changed = replace(self.options, **options)
-        return run_campaign(missions, self.folder, changed, self.notes, append=append)
+        return run_campaign(missions, self.folder, changed, self.notes, append=append, stop=stop)
 
 
 @pytest.fixture

@@ -168,14 +168,25 @@ def test_the_folder_of_a_mission_that_was_cut_off_is_kept_with_its_last_words(ca
 
 def test_another_list_is_refused_and_its_first_difference_shown(campaign):
     campaign.run(planned("fly")).close()
-    with pytest.raises(ConfigError, match=r'1 missions, now there are 2; 1 are not.*"seed":1'):
+    with pytest.raises(ConfigError, match=r'1 missions, now there are 2; 1 are new.*"seed":1'):
         campaign.run(planned("fly", "fly"))
+    with pytest.raises(ConfigError, match=r'1 are new.*"seed":0,.*; 1 are gone.*"fly"'):
+        campaign.run(planned("exit:1"))
 
 
 def test_append_adds_what_is_new(campaign):
     campaign.run(planned("fly")).close()
     with campaign.run(planned("fly", "end:crash"), append=True) as ledger:
         assert [(r.number, r.outcome) for r in ledger.results()] == [(0, "success"), (1, "crash")]
+    with campaign.run(planned("fly"), append=True) as ledger:
+        assert ledger.planned() == 2
+
+
+def test_a_mission_that_is_listed_twice_is_flown_twice(campaign):
+    missions = planned("fly") * 2
+    for _ in range(2):
+        with campaign.run(missions) as ledger:
+            assert [result.number for result in ledger.results()] == [0, 1]
 
 
 def test_only_one_process_runs_a_campaign(campaign):

@@ -1,0 +1,126 @@
+"""From what a user names to a campaign's folder with its list, ready to be flown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.factors import check_names
+from mavfi_cli.campaign.ledger import LEDGER, Ledger
+from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaign.preflight import ask_vehicle
+from mavfi_cli.campaign.run import require_versions, store_plan
+from mavfi_cli.campaign.spec import Spec, load_spec, parse_spec, presets
+from mavfi_cli.campaign.spec_text import to_toml
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import write_text
+
+DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
+# Missions that differ in these only are checked once.
+_ALIKE = ("seed", "time_limit_s", "isolate")
+
+
+def chosen(what: str, out: Path | None, scale: float | None) -> tuple[Spec, Path]:
+    """The campaign that is named, and its folder.
+
+    Args:
+        what: a preset, a TOML file, or the folder of a campaign that was begun.
+        out: the folder; None: campaigns/NAME, or the one that is named.
+        scale: of the repetitions; of a folder, only what it was begun with.
+
+    Raises:
+        ConfigError: the specification, or the scale, cannot be used.
+        UnknownName: neither of them exists.
+    """
+    folder = Path(what)
+    if what not in presets() and (folder / LEDGER).is_file():
+        if scale is not None or out is not None:
+            raise ConfigError("goes without --scale and --out: it has both", path=folder)
+        with Ledger(folder) as ledger:
+            return _stored_spec(ledger), folder
+    spec = load_spec(what)
+    return spec if scale is None else spec.scaled(scale), out or DEFAULT / spec.name
+
+
+def _stored_spec(ledger: Ledger) -> Spec:
+    text = ledger.meta("spec")
+    if text is None:
+        raise ConfigError("has no specification: a program made its list", path=ledger.folder)
+    return parse_spec(text, ledger.folder / SPEC)
+
+
+def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool = False) -> Ledger:
+    """Open the folder of a campaign for flying, its list stored.
+
+    Raises:
+        ConfigError: the folder holds another campaign, or none with `missing_only`.
+        MavfiError: a world, vehicle, planner ... that no mission could be flown with.
+    """
+    if missing_only and not (folder / LEDGER).is_file():
+        raise ConfigError("no campaign was begun there", path=folder)
+    text = to_toml(spec)
+    if (folder / LEDGER).is_file():
+        ledger = Ledger(folder, writing=True)
+        try:
+            if ledger.meta("spec") == text:  # the list is what it would expand to
+                require_versions(ledger)
+                return ledger
+            return _planned(ledger, spec, text, append=append)
+        except BaseException:
+            ledger.close()
+            raise
+    missions = spec.missions()
+    _check(missions)
+    ledger = Ledger(folder, writing=True)
+    try:
+        return _planned(ledger, spec, text, append=append, missions=missions)
+    except BaseException:
+        ledger.close()
+        raise
+
+
+def _planned(
+    ledger: Ledger,
+    spec: Spec,
+    text: str,
+    *,
+    append: bool,
+    missions: list[PlannedMission] | None = None,
+) -> Ledger:
+    if missions is None:
+        missions = spec.missions()
+        _check(missions)
+    store_plan(ledger, missions, append=append)
+    ledger.set_meta({"spec": text, "name": spec.name})
+    write_text(ledger.folder / SPEC, text)
+    return ledger
+
+
+def _check(missions: list[PlannedMission]) -> None:
+    """Ask once for each kind of mission, and once for each kind of vehicle process."""
+    seen: set[str] = set()
+    asked: set[str] = set()
+
+    def vehicle(config: Any) -> None:
+        simple = replace(config, fault=None, instruction=None, seed=0)
+        key = canonical({**changes_of(simple), "planner": None, "platform": None})
+        if key not in asked:
+            asked.add(key)
+            ask_vehicle(config)
+
+    for mission in missions:
+        key = canonical(_kind(changes_of(mission.config)))
+        if key not in seen:
+            seen.add(key)
+            check_names(mission.config, vehicle)
+
+
+def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """What can be wrong with a mission whatever its seeds."""
+    kind = {name: value for name, value in changes.items() if name not in _ALIKE}
+    for name in ("fault", "instruction"):
+        if kind.get(name) is not None:
+            kind[name] = {**kind[name], "seed": 0}
+    return kind

@@ -1,0 +1,115 @@
+"""The factors of a campaign: what may differ from mission to mission, and where it goes.
+
+Adding one is a line in the table: the name under which a specification writes it, and the record
+that has it as a field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from enum import Enum
+from typing import Any
+
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+
+
+class Level(Enum):
+    """Where faults strike."""
+
+    SOURCE = "source"
+    INSTRUCTION = "instruction"
+
+
+_RECORDS = {Level.SOURCE: FaultConfig, Level.INSTRUCTION: InstructionConfig}
+# What a specification may call a field of the mission, and of either level's fault, otherwise.
+_ALIASES = {"stage": "target", "site": "target"}
+_NEVER = {"fault", "instruction", "link", "realtime"}  # campaigns fly the simulated vehicle
+_MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NEVER)
+_FAULT = {
+    level: tuple(each.name for each in fields(record) if each.name != "seed")
+    for level, record in _RECORDS.items()
+}
+
+
+def _names() -> tuple[str, ...]:
+    fault = dict.fromkeys((*_ALIASES, "level", *_FAULT[Level.SOURCE], *_FAULT[Level.INSTRUCTION]))
+    return (*_MISSION, *(name for name in fault if name != "target"))
+
+
+NAMES = _names()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """One combination of factors, and the mission that it stands for but for its seeds."""
+
+    values: Mapping[str, Any]
+
+    def mission(self, seed: int, fault_seed: int) -> MissionConfig:
+        """The mission.
+
+        Raises:
+            ConfigError: factors that do not go together, values of the wrong type.
+        """
+        mission = {name: self.values[name] for name in _MISSION if name in self.values}
+        mission["seed"] = self.values.get("seed", seed)
+        fault = self._fault(fault_seed)
+        if fault:
+            level, values = fault
+            mission["fault" if level is Level.SOURCE else "instruction"] = values
+        return structure(mission, MissionConfig)
+
+    def _fault(self, seed: int) -> tuple[Level, dict[str, Any]] | None:
+        asked = {name: value for name, value in self.values.items() if name not in _MISSION}
+        level_name = asked.pop("level", Level.SOURCE.value)
+        targets = [name for name in _ALIASES if name in asked]
+        if not targets:
+            if asked or "level" in self.values:
+                named = sorted({*asked, *({"level"} & set(self.values))})
+                raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
+            return None
+        if len(targets) > 1:
+            raise ConfigError("a fault strikes a stage or a site, not both")
+        level = _member(level_name)
+        values = {_ALIASES.get(name, name): value for name, value in asked.items()}
+        for name in values:
+            if name not in _FAULT[level]:
+                raise ConfigError(f"no factor of faults at {level.value} level", key=name)
+        return level, {**values, "seed": seed}
+
+
+def _member(name: Any) -> Level:
+    try:
+        return Level(name)
+    except ValueError:
+        known = " or ".join(level.value for level in Level)
+        raise ConfigError(f"expected {known}, got {name!r}", key="level") from None
+
+
+def check_names(config: MissionConfig, simulator: Callable[[MissionConfig], None]) -> None:
+    """Say now what would keep every mission like this one from being flown.
+
+    Args:
+        config: one mission of them.
+        simulator: raises what the simulated vehicle says to it.
+
+    Raises:
+        MavfiError: a world, vehicle, planner, platform or target that does not exist, values
+            that make no fault, a start that is blocked.
+    """
+    from mavfi_cli.autonomy import planners
+    from mavfi_cli.mission.platform import load_platform
+
+    planners.find(config.planner)
+    load_platform(config.platform)
+    if config.fault is not None:
+        config.fault.draw()
+    if config.instruction is not None:
+        config.instruction.strategy()
+        config.instruction.node()
+    simulator(config)

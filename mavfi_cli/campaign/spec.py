@@ -1,0 +1,282 @@
+"""The specification of a campaign: campaign.toml, and the presets."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.factors import NAMES, Point
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import Label, PlannedMission
+from mavfi_cli.core.config import syntax_error
+from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
+from mavfi_cli.core.seeds import Stream, derive
+
+Axes = Mapping[str, tuple[Any, ...]]
+_TOP = ("name", "about", "seed", "first_seed", "repetitions", "keep", "mission", "factors",
+        "setting", "stop")  # fmt: skip
+_SETTING = ("name", "repetitions")
+# Factors whose value is a list already: a list of lists crosses several.
+_LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """Missions that are listed together: their own factors, crossed with the common ones."""
+
+    name: str = ""
+    axes: Axes = field(default_factory=dict)
+    repetitions: int | None = None  # None: as many as the campaign says
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stop:
+    """When a setting has been flown often enough.
+
+    Attributes:
+        margin: half of the Wilson interval of the success rate, at most.
+        confidence: of that interval.
+        batch: the interval is looked at after every so many missions of a setting.
+    """
+
+    margin: float
+    confidence: float = 0.95
+    batch: int = 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spec:
+    """One campaign.
+
+    Attributes:
+        seed: root of the seeds of all faults.
+        first_seed: of the missions; repetition r flies with first_seed + r.
+        repetitions: missions for each combination of factors.
+        fixed: what all missions have.
+        axes: factors that are crossed, each with its values.
+        settings: lists of missions, each crossed with `axes`.
+        stop: ends settings early; None flies everything.
+    """
+
+    name: str
+    about: str = ""
+    seed: int = 1
+    first_seed: int = 1
+    repetitions: int = 1
+    keep: Keep = Keep.FAILURES
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    axes: Axes = field(default_factory=dict)
+    settings: tuple[Setting, ...] = (Setting(),)
+    stop: Stop | None = None
+
+    def scaled(self, scale: float) -> Spec:
+        """The same campaign with so much of its repetitions, at least one each.
+
+        Raises:
+            ConfigError: a scale that leaves nothing.
+        """
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
+
+        def share(count: int) -> int:
+            return max(1, round(count * scale))
+
+        settings = tuple(
+            setting
+            if setting.repetitions is None
+            else replace(setting, repetitions=share(setting.repetitions))
+            for setting in self.settings
+        )
+        return replace(self, repetitions=share(self.repetitions), settings=settings)
+
+    def missions(self) -> list[PlannedMission]:
+        """The list: repetition by repetition, so that pairs and settings grow together.
+
+        Raises:
+            ConfigError: nothing to fly, or a combination that makes no mission.
+        """
+        points = [
+            (setting, Point(values={**self.fixed, **values}), labels)
+            for setting in self.settings
+            for values, labels in self._combinations(setting)
+        ]
+        counts = [
+            self.repetitions if setting.repetitions is None else setting.repetitions
+            for setting, _, _ in points
+        ]
+        if not points or not max(counts):
+            raise ConfigError(f"campaign {self.name!r} has no mission: an empty list of values")
+        return [
+            self._mission(point, labels, repetition)
+            for repetition in range(max(counts))
+            for (_, point, labels), count in zip(points, counts, strict=True)
+            if repetition < count
+        ]
+
+    def _combinations(self, setting: Setting) -> Iterator[tuple[dict[str, Any], dict[str, Label]]]:
+        axes = {**self.axes, **setting.axes}
+        named = {"setting": setting.name} if setting.name else {}
+        for values in itertools.product(*axes.values()):
+            chosen = dict(zip(axes, values, strict=True))
+            varied = {name: value for name, value in chosen.items() if name != "seed"}
+            yield chosen, {**named, **{name: _label(value) for name, value in varied.items()}}
+
+    def _mission(
+        self, point: Point, labels: Mapping[str, Label], repetition: int
+    ) -> PlannedMission:
+        seed = point.values.get("seed", self.first_seed + repetition)
+        # Neither stage nor detector has a part in it: settings differ in nothing but themselves.
+        fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition)
+        return PlannedMission(config=point.mission(seed, fault_seed), labels=labels)
+
+
+def _label(value: Any) -> Label:
+    return "+".join(map(str, value)) if isinstance(value, list | tuple) else value
+
+
+def presets() -> tuple[str, ...]:
+    """The names of the campaigns that come with mavfi."""
+    folder = resources.files("mavfi_cli.campaign.presets")
+    return tuple(
+        sorted(each.name.removesuffix(".toml") for each in folder.iterdir()
+               if each.name.endswith(".toml"))
+    )  # fmt: skip
+
+
+def load_spec(name: str) -> Spec:
+    """A preset, or the specification in a TOML file.
+
+    Raises:
+        UnknownName: neither a preset nor a file.
+        ConfigError: the file cannot be used; says where and why.
+    """
+    path = Path(name)
+    if path.suffix != ".toml":
+        if name not in presets():
+            raise UnknownName("campaign", name, presets())
+        text = (resources.files("mavfi_cli.campaign.presets") / f"{name}.toml").read_text("utf-8")
+        return parse_spec(text, Path(f"{name}.toml"))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(error.strerror or str(error), path=path) from None
+    except UnicodeDecodeError:
+        raise ConfigError("not a UTF-8 text file", path=path) from None
+    return parse_spec(text, path)
+
+
+def parse_spec(text: str, path: Path) -> Spec:
+    """The specification in a TOML text; `path` is for messages and the default name."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise syntax_error(error, path) from None
+    return _Reader(path).spec(data)
+
+
+class _Reader:
+    """Reads the tables of one file, and says in which of them something is wrong."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def spec(self, data: Mapping[str, Any]) -> Spec:
+        self._known(data, _TOP, "")
+        settings = data.get("setting", [{}])
+        if not isinstance(settings, list):
+            raise ConfigError("expected tables [[setting]]", path=self._path, key="setting")
+        fixed = self._table(data, "mission")
+        self._known(fixed, NAMES, "mission.")
+        return Spec(
+            name=self._text(data, "name", self._path.stem),
+            about=self._text(data, "about", ""),
+            seed=self._count(data, "seed", 1, least=0),
+            first_seed=self._count(data, "first_seed", 1, least=0),
+            repetitions=self._count(data, "repetitions", 1),
+            keep=self._keep(data),
+            fixed=fixed,
+            axes=self._axes(self._table(data, "factors"), "factors."),
+            settings=tuple(self._setting(each, i) for i, each in enumerate(settings)),
+            stop=self._stop(data),
+        )
+
+    def _setting(self, data: Any, index: int) -> Setting:
+        prefix = f"setting[{index}]."
+        if not isinstance(data, dict):
+            raise ConfigError("expected a table", path=self._path, key=prefix.rstrip("."))
+        axes = {name: value for name, value in data.items() if name not in _SETTING}
+        count = "repetitions" in data
+        return Setting(
+            name=self._text(data, "name", ""),
+            axes=self._axes(axes, prefix, also=_SETTING),
+            repetitions=self._count(data, "repetitions", 1) if count else None,
+        )
+
+    def _axes(self, data: Mapping[str, Any], prefix: str, also: tuple[str, ...] = ()) -> Axes:
+        self._known(data, (*NAMES, *also), prefix)
+        return {name: self._values(name, value, prefix) for name, value in data.items()}
+
+    def _values(self, name: str, value: Any, prefix: str) -> tuple[Any, ...]:
+        if name in _LISTS:
+            several = isinstance(value, list) and any(isinstance(each, list) for each in value)
+            return tuple(value) if several else (value,)
+        values = tuple(value) if isinstance(value, list) else (value,)
+        if not values:
+            raise ConfigError("an empty list of values", path=self._path, key=f"{prefix}{name}")
+        if len({repr(each) for each in values}) < len(values):
+            raise ConfigError("a value is listed twice", path=self._path, key=f"{prefix}{name}")
+        return values
+
+    def _known(self, data: Mapping[str, Any], names: tuple[str, ...], prefix: str) -> None:
+        for key in data:
+            if key not in names:
+                raise UnknownKey(f"{prefix}{key}", names, path=self._path)
+
+    def _table(self, data: Mapping[str, Any], key: str) -> dict[str, Any]:
+        value = data.get(key, {})
+        if not isinstance(value, dict):
+            raise ConfigError("expected a table", path=self._path, key=key)
+        return value
+
+    def _text(self, data: Mapping[str, Any], key: str, default: str) -> str:
+        value = data.get(key, default)
+        if not isinstance(value, str):
+            raise ConfigError(f"expected a text, got {value!r}", path=self._path, key=key)
+        return value
+
+    def _count(self, data: Mapping[str, Any], key: str, default: int, least: int = 1) -> int:
+        value = data.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ConfigError(
+                f"expected a whole number from {least}, got {value!r}", path=self._path, key=key
+            )
+        return value
+
+    def _keep(self, data: Mapping[str, Any]) -> Keep:
+        name = data.get("keep", Keep.FAILURES.value)
+        try:
+            return Keep(name)
+        except ValueError:
+            raise UnknownName(
+                "policy of keeping runs", str(name), [k.value for k in Keep]
+            ) from None
+
+    def _stop(self, data: Mapping[str, Any]) -> Stop | None:
+        if "stop" not in data:
+            return None
+        from mavfi_cli.core.config import structure
+
+        stop = structure(self._table(data, "stop"), Stop, path=self._path)
+        if not (0.0 < stop.margin < 0.5 and 0.0 < stop.confidence < 1.0 and stop.batch >= 1):
+            raise ConfigError(
+                "needs a margin between 0 and 0.5, a confidence between 0 and 1, a batch from 1",
+                path=self._path,
+                key="stop",
+            )
+        return stop

@@ -1,0 +1,192 @@
+"""`mavfi campaign`: plan, run, watch and export thousands of missions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from mavfi_cli.campaign.ledger import Ledger
+    from mavfi_cli.campaign.spec import Spec
+
+_FOLDER = click.Path(path_type=Path, file_okay=False)
+_KEEP = ("none", "failures", "sampled", "all")
+
+
+@click.group()
+def campaign() -> None:
+    """Thousands of missions: planned, paired, resumable, counted.
+
+    WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16), a campaign.toml, or the
+    folder of a campaign that was begun.
+    """
+
+
+@campaign.command()
+@click.argument("what", metavar="WHAT")
+@click.option("--out", type=_FOLDER, help="Folder of the campaign  [campaigns/NAME].")
+@click.option("--scale", type=float, help="So much of the repetitions: 0.1 runs a tenth.")
+@click.option("--jobs", type=click.IntRange(min=1),
+              help="Missions at the same time  [one a core].")  # fmt: skip
+@click.option("--keep", type=click.Choice(_KEEP),
+              help="Run folders that are kept  [as the campaign says].")  # fmt: skip
+@click.option("--limit", "limit_s", type=click.FloatRange(min=0.0, min_open=True), default=900.0,
+              show_default=True, help="Wall time of a mission, s; a longer one hangs.")  # fmt: skip
+@click.option("--missing-only", is_flag=True,
+              help="Go on with a campaign that was begun; refuse to begin one.")  # fmt: skip
+@click.option("--append", is_flag=True,
+              help="Add the missions that the folder's list does not have.")  # fmt: skip
+@click.option("--retry-errors", is_flag=True, help="Fly those again that could not begin.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Fly what is missing of a campaign: all of it, or what an earlier run left.
+
+    Ctrl-C lets the missions that are flying finish; a second one kills them. Either way the next
+    run goes on.
+    """
+    from mavfi_cli.campaign.begin import begin, chosen
+    from mavfi_cli.campaign.keep import Keep
+    from mavfi_cli.campaign.run import Options, fly_missing
+    from mavfi_cli.cli.campaign_progress import progress_view
+
+    spec, folder = chosen(what, options["out"], options["scale"])
+    with (
+        begin(
+            spec, folder, append=options["append"], missing_only=options["missing_only"]
+        ) as ledger,
+        progress_view(ledger, quiet=quiet) as view,
+    ):
+        flying = Options(
+            jobs=options["jobs"] or 0,
+            keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
+            limit_s=options["limit_s"],
+            errors=options["retry_errors"],
+        )
+        fly_missing(ledger, flying, view, spec.stop)
+        _show(ledger, as_json=as_json)
+
+
+@campaign.command()
+@click.argument("folder", type=_FOLDER)
+@click.option("--by", metavar="LABEL,LABEL", help="Gather settings by these labels  [all].")
+@click.option("--confidence", default=0.95, show_default=True,
+              type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True))  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def status(folder: Path, by: str | None, confidence: float, as_json: bool) -> None:
+    """What a campaign has found so far; also while it runs."""
+    from mavfi_cli.campaign.ledger import Ledger
+
+    with Ledger(folder) as ledger:
+        names = [name for name in (by or "").split(",") if name]
+        _show(ledger, names, confidence, as_json=as_json)
+
+
+@campaign.command()
+@click.argument("folder", type=_FOLDER)
+@click.argument("path", type=click.Path(path_type=Path, dir_okay=False))
+def export(folder: Path, path: Path) -> None:
+    """Write one row a mission to PATH, a .parquet or .csv file."""
+    from mavfi_cli.campaign.export import export as write
+    from mavfi_cli.campaign.ledger import Ledger
+
+    with Ledger(folder) as ledger:
+        click.echo(f"{write(ledger, path)} missions in {path}")
+
+
+@campaign.command()
+@click.argument("what", metavar="[WHAT]", required=False)
+@click.option("--scale", type=float, help="So much of the repetitions.")
+@click.option("--margin", type=float,
+              help="How many missions a setting needs for an interval of so much to either "
+                   "side.")  # fmt: skip
+@click.option("--expect", "expected", default=0.5, show_default=True,
+              help="With --margin: the success rate that is expected.")  # fmt: skip
+@click.option("--difference", type=float,
+              help="How many pairs of missions find such a difference of rates.")  # fmt: skip
+@click.option("--discordant", default=0.2, show_default=True,
+              help="With --difference: the share of pairs whose outcomes differ.")  # fmt: skip
+@click.option("--power", default=0.8, show_default=True,
+              help="With --difference: how surely it is found.")  # fmt: skip
+@click.option("--confidence", default=0.95, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -> None:
+    """What a campaign would fly, without flying; or how many missions a question needs."""
+    from mavfi_cli.campaign.statistics.proportions import (
+        missions_for_margin,
+        pairs_for_difference,
+    )
+
+    told: dict[str, Any] = {}
+    confidence = options["confidence"]
+    if options["margin"] is not None:
+        told["missions"] = missions_for_margin(
+            options["margin"], expected=options["expected"], confidence=confidence
+        )
+    if options["difference"] is not None:
+        told["pairs"] = pairs_for_difference(
+            options["difference"], options["discordant"], confidence=confidence,
+            power=options["power"],
+        )  # fmt: skip
+    if what is not None:
+        told["campaign"] = _planned(what, scale)
+    if not told:
+        raise click.UsageError("name a campaign, --margin or --difference")
+    click.echo(json.dumps(told, indent=2) if as_json else "\n".join(_plan_lines(told, options)))
+
+
+def _planned(what: str, scale: float | None) -> dict[str, Any]:
+    from collections import Counter
+
+    from mavfi_cli.campaign.begin import chosen
+    from mavfi_cli.campaign.summary import label_text
+
+    spec: Spec
+    spec, _ = chosen(what, None, scale)
+    missions = spec.missions()
+    cells = Counter(label_text(mission.labels) for mission in missions)
+    return {
+        "name": spec.name,
+        "about": spec.about,
+        "missions": len(missions),
+        "pairs": len({mission.pair for mission in missions}),
+        "settings": dict(cells),
+    }
+
+
+def _plan_lines(told: dict[str, Any], options: dict[str, Any]) -> list[str]:
+    lines = []
+    sure = f"{100 * options['confidence']:g} % confidence"
+    if "missions" in told:
+        lines.append(
+            f"{told['missions']} missions a setting: Wilson interval of +-{options['margin']:g} "
+            f"at a rate of {options['expected']:g}, {sure}"
+        )
+    if "pairs" in told:
+        lines.append(
+            f"{told['pairs']} pairs: a difference of {options['difference']:g} found with "
+            f"{100 * options['power']:g} % power, {sure}"
+        )
+    if "campaign" in told:
+        found = told["campaign"]
+        lines.append(f"{found['name']}: {found['about']}" if found["about"] else found["name"])
+        lines += [f"{count:>7}  {labels}" for labels, count in found["settings"].items()]
+        lines.append(f"{found['missions']:>7}  missions of {found['pairs']} pairs")
+    return lines
+
+
+def _show(
+    ledger: Ledger, by: list[str] | None = None, confidence: float = 0.95, *, as_json: bool
+) -> None:
+    from mavfi_cli.campaign.summary import summarise, table
+    from mavfi_cli.core.files import plain
+
+    summary = summarise(ledger, by or [], confidence)
+    if as_json:
+        click.echo(json.dumps(plain(summary.to_dict()), indent=2))
+        return
+    click.echo(f"{summary.name}: {summary.over} of {summary.missions} missions")
+    click.echo("\n".join(table(summary)))

@@ -1,0 +1,180 @@
+"""Specifications: what they expand to, and what they refuse."""
+
+from collections import Counter
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.spec import Stop, load_spec, parse_spec, presets
+from mavfi_cli.campaign.spec_text import to_toml
+from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey, UnknownName
+from mavfi_cli.mission.config import MissionConfig
+
+DETECTION = "detector" in {each.name for each in fields(MissionConfig)}
+
+
+def spec_of(text):
+    return parse_spec(text, Path("mine.toml"))
+
+
+CROSSED = """
+repetitions = 3
+seed = 7
+first_seed = 11
+keep = "sampled"
+[mission]
+time_limit_s = 120
+[factors]
+world = ["farm", "dense"]
+[[setting]]
+name = "golden"
+[[setting]]
+name = "FI"
+repetitions = 2
+stage = ["planning", "control"]
+bits = [1, 3]
+[stop]
+margin = 0.1
+"""
+
+
+def test_factors_are_crossed_and_settings_listed():
+    spec = spec_of(CROSSED)
+    assert (spec.name, spec.keep, spec.stop) == ("mine", Keep.SAMPLED, Stop(margin=0.1))
+    missions = spec.missions()
+    cells = Counter(tuple(mission.labels.items()) for mission in missions)
+    assert len(cells) == 2 + 2 * 2 * 2
+    assert cells[("setting", "golden"), ("world", "farm")] == 3
+    assert cells[("setting", "FI"), ("world", "dense"), ("stage", "control"), ("bits", 3)] == 2
+    assert {mission.config.time_limit_s for mission in missions} == {120.0}
+    assert [m.config.seed for m in missions] == sorted([11] * 10 + [12] * 10 + [13] * 2)
+
+
+def test_golden_faulty_and_other_faulty_flights_of_a_repetition_are_pairs():
+    missions = [m for m in spec_of(CROSSED).missions() if m.config.world == "farm"]
+    by_seed = {}
+    for mission in missions:
+        by_seed.setdefault(mission.config.seed, []).append(mission)
+    assert [len(each) for each in by_seed.values()] == [5, 5, 1]
+    for each in by_seed.values():
+        assert len({mission.pair for mission in each}) == 1
+        assert len({m.config.fault.seed for m in each if m.config.fault}) <= 1
+    seeds = [m.config.fault.seed for m in missions if m.config.fault]
+    assert len(set(seeds)) == 2
+    assert len({mission.pair for mission in missions}) == 3
+
+
+def test_the_list_is_a_function_of_the_specification():
+    assert spec_of(CROSSED).missions() == spec_of(CROSSED).missions()
+    other = spec_of(CROSSED.replace("seed = 7", "seed = 8", 1)).missions()
+    assert other != spec_of(CROSSED).missions()
+    assert [m.pair for m in other] == [m.pair for m in spec_of(CROSSED).missions()]
+
+
+def test_more_repetitions_begin_with_the_same_missions():
+    some = {(m.pair, str(m)) for m in spec_of(CROSSED).missions()}
+    more = {(m.pair, str(m)) for m in spec_of(CROSSED.replace("= 3\nseed", "= 5\nseed")).missions()}
+    assert some < more
+
+
+@pytest.mark.parametrize("text", [CROSSED, "", "[factors]\nsites = [['flags'], []]\nsite = 'x'"])
+def test_a_specification_comes_back_as_it_was(text):
+    spec = spec_of(text)
+    assert spec_of(to_toml(spec)) == spec
+
+
+def test_scale_leaves_at_least_one_of_each():
+    spec = spec_of(CROSSED)
+    assert len(spec.scaled(2.0).missions()) == 2 * len(spec.missions())
+    assert len(spec.scaled(0.01).missions()) == 10
+    with pytest.raises(ConfigError, match="scale"):
+        spec.scaled(0.0)
+
+
+def test_instruction_level_and_lists_of_values():
+    text = """
+    [factors]
+    level = "instruction"
+    site = "octomap"
+    sites = [["general"], ["general", "flags"]]
+    start = [1.0, 2.0, 0.0]
+    """
+    missions = spec_of(text).missions()
+    assert [m.config.instruction.sites for m in missions] == [("general",), ("general", "flags")]
+    assert {m.config.instruction.target for m in missions} == {"octomap"}
+    assert {m.config.start for m in missions} == {(1.0, 2.0, 0.0)}
+    assert missions[1].labels["sites"] == "general+flags"
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "problem"),
+    [
+        ("[factors]\nwrld = ['farm']", UnknownKey, r"factors.wrld: .*did you mean 'world'"),
+        ("[[setting]]\nstgae = 'control'", UnknownKey, r"did you mean 'stage'"),
+        ("[mission]\ntime_limit = 3", UnknownKey, r"did you mean 'time_limit_s'"),
+        ("repetition = 3", UnknownKey, r"did you mean 'repetitions'"),
+        ("[factors]\nlink = 'udpin:1'", UnknownKey, r"link: unknown key"),
+        ("[factors]\nworld = []", ConfigError, r"factors.world: an empty list of values"),
+        ("[factors]\nbits = [1, 1]", ConfigError, r"factors.bits: a value is listed twice"),
+        ("repetitions = 0", ConfigError, r"repetitions: expected a whole number from 1, got 0"),
+        ("repetitions = true", ConfigError, r"repetitions: expected a whole number"),
+        ("keep = 'some'", UnknownName, r"Known: all, failures, none, sampled"),
+        ("setting = 3", ConfigError, r"setting: expected tables"),
+        ("setting = []", ConfigError, r"has no mission"),
+        ("factors = 3", ConfigError, r"factors: expected a table"),
+        ("name = 3", ConfigError, r"name: expected a text"),
+        ("seed =\nname = 'x'", ConfigError, r"mine.toml:1: "),
+        ("[factors]\nbits = [{}, {}]", ConfigError, r"factors.bits: a value is listed twice"),
+        ("[stop]\nmargin = 0.7", ConfigError, r"stop: needs a margin between"),
+        ("[stop]\nmargn = 0.1", UnknownKey, r"did you mean 'margin'"),
+    ],
+)  # fmt: skip
+def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
+    with pytest.raises(error, match=problem):
+        spec_of(text).missions()
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("seed = ['a']", r"seed"),
+        ("seed = [-1]", r"seed: must be within 0 and 2\^31"),
+        ("bits = [1]", r"bits: a fault needs a stage or a site"),
+        ("level = 'source'", r"level: a fault needs a stage or a site"),
+        ("stage = 'control'\nsite = 'command_yaw'", r"a stage or a site, not both"),
+        ("stage = 'control'\nlevel = 'sauce'", r"level: expected source or instruction"),
+        ("stage = 'control'\nsampling = 'cpu-time'", r"sampling: no factor of faults at source"),
+        ("stage = 'control'\nlevel = 'instruction'\nat = 'random'", r"at: no factor of faults at"),
+        ("stage = 'control'\nbits = ['one']", r"bits: expected int"),
+        ("v_max_mps = [99.0]", r"v_max_mps: must be within"),
+    ],
+)
+def test_a_combination_that_makes_no_mission_is_refused(text, problem):
+    with pytest.raises(MavfiError, match=problem):
+        spec_of(f"[factors]\n{text}").missions()
+
+
+@pytest.mark.parametrize("name", presets())
+def test_every_preset_expands_to_the_papers_numbers(name):
+    if not DETECTION and name in ("table4", "fig13", "fig14", "fig16"):
+        with pytest.raises(UnknownKey, match="detector"):
+            load_spec(name)
+        return
+    missions = load_spec(name).missions()
+    cells = Counter(tuple(sorted(m.labels.items())) for m in missions)
+    assert set(cells.values()) == {20 if name == "fig13" else 100}
+    sizes = {
+        "fig7": 10, "fig8": 9, "fig9": 4, "table3": 4, "table4": 40, "fig13": 5, "fig14": 136,
+        "fig16": 20,
+    }  # fmt: skip
+    assert len(cells) == sizes[name]
+    assert len(load_spec(name).scaled(0.1).missions()) == len(missions) // 10
+
+
+def test_an_unknown_preset_gets_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'table4'"):
+        load_spec("tabel4")
+    with pytest.raises(ConfigError, match="No such file"):
+        load_spec("none.toml")

@@ -1,0 +1,81 @@
+"""Sequential stopping: by the first missions of the list, whatever order they end in."""
+
+import random
+
+import pytest
+from conftest import planned
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.campaign.spec import Stop
+from mavfi_cli.campaign.statistics.proportions import half_width, rate
+from mavfi_cli.campaign.stopping import Gate, Queue
+
+STOP = Stop(margin=0.12, batch=10)
+
+
+def fly(outcomes, cells, slots, seed):
+    """Which missions are flown where `slots` of them fly at a time and end in a random order."""
+    gate = Gate(STOP, cells)
+    queue = Queue(((n, cell, {}) for n, cell in enumerate(cells)), gate)
+    rng = random.Random(seed)
+    flying, flown = [], []
+    while True:
+        while len(flying) < slots and (entry := queue.next()) is not None:
+            flying.append(entry[0])
+        if not flying:
+            return sorted(flown), gate
+        number = flying.pop(rng.randrange(len(flying)))
+        flown.append(number)
+        gate.record(number, (outcomes[number], "golden"))
+
+
+@given(
+    st.lists(st.sampled_from(["success", "collision"]), min_size=120, max_size=120),
+    st.integers(0, 9),
+)
+def test_slots_and_order_make_no_difference(outcomes, seed):
+    cells = [number % 2 for number in range(120)]
+    flown, gate = fly(outcomes, cells, 1, seed)
+    again, same = fly(outcomes, cells, 7, seed + 1)
+    assert flown == again
+    assert gate.stopped == same.stopped
+    for cell in (0, 1):
+        mine = [outcomes[number] for number in flown if cells[number] == cell]
+        width = half_width(rate(mine.count("success"), len(mine)))
+        assert len(mine) % STOP.batch == 0
+        assert len(mine) == 60 or width <= STOP.margin
+        if len(mine) > STOP.batch:
+            before = mine[: -STOP.batch]
+            assert half_width(rate(before.count("success"), len(before))) > STOP.margin
+
+
+def test_faults_that_did_nothing_make_no_interval_narrow():
+    gate = Gate(STOP, [0] * 100)
+    for number in range(20):
+        gate.record(number, ("success", Injected.NOT_ACTIVATED.value))
+    assert not gate.stopped
+    for number in range(20, 50):
+        gate.record(number, ("success", Injected.ACTIVE.value))
+    assert gate.stopped == {0}
+
+
+def test_what_was_flown_before_counts():
+    cells = [0] * 100
+    outcomes = dict(zip(range(100), ["success"] * 100, strict=True))
+    flown, _ = fly(outcomes, cells, 1, 0)
+    gate = Gate(STOP, cells, [(n, ("success", "golden")) for n in flown])
+    assert Queue(((n, 0, {}) for n in range(100) if n not in flown), gate).next() is None
+
+
+def test_without_a_rule_everything_is_flown():
+    queue = Queue(((n, 0, {}) for n in range(3)), None)
+    assert [queue.next() for _ in range(4)] == [(0, 0, {}), (1, 0, {}), (2, 0, {}), None]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_campaign_stops_where_it_is_sure_enough(campaign, jobs):
+    missions = planned(*["fly"] * 60)
+    with campaign.run(missions, jobs=jobs, stop=STOP) as ledger:
+        assert [result.number for result in ledger.results()] == list(range(20))
