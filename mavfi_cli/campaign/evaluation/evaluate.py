@@ -15,7 +15,7 @@ from mavfi_cli.campaign.evaluation.metrics import (
     fault_metrics,
     recoveries_compared,
 )
-from mavfi_cli.campaign.evaluation.pairs import ErrorFree, FaultPair, Flights, Harm
+from mavfi_cli.campaign.evaluation.pairs import ErrorFree, FaultPair, Harm
 from mavfi_cli.campaign.evaluation.plan import NONE, EvaluationPlan
 from mavfi_cli.campaign.evaluation.scores import Scores
 from mavfi_cli.campaign.missions import changes_of
@@ -44,19 +44,23 @@ def evaluate(
     """
     fly(plan, folder, options, spectator)
     flights, errors = read(plan, folder)
-    pairs = flights.error_free(plan.everyone), flights.faults(plan.everyone)
+    pairs = flights.error_free(plan.everyone), flights.faults(plan.everyone, plan.complete)
     scores = Scores(plan, folder)
     spectator.on_note("counting")
-    return summarise(plan, *pairs, errors, _scored(scores, flights, spectator)), pairs
+    return summarise(plan, *pairs, errors, _scored(scores, *pairs, spectator)), pairs
 
 
 def _scored(
-    scores: Scores, flights: Flights, spectator: Spectator
+    scores: Scores,
+    error_free: Sequence[ErrorFree],
+    faults: Sequence[FaultPair],
+    spectator: Spectator,
 ) -> Callable[[str], tuple[list[tuple[FaultPair, float]], list[float]]]:
     """Scores of the harmful faults and of the error-free flights, by detector."""
-    bare, error_free = flights.faults([NONE]), flights.error_free([NONE])
+    bare = [pair for pair in faults if pair.detector == NONE]
     harmful = [pair for pair in bare if pair.active and pair.harm is not Harm.NONE]
-    wanted = [pair.faulty for pair in harmful], [pair.golden for pair in error_free]
+    golden = [pair.golden for pair in error_free if pair.detector == NONE]
+    wanted = [pair.faulty for pair in harmful], golden
     scores.score_all(itertools.chain(*wanted), spectator.on_note)
 
     def of(detector: str) -> tuple[list[tuple[FaultPair, float]], list[float]]:
@@ -98,7 +102,9 @@ def summarise(
                 "by": by,
                 "value": value,
                 "detector": detector,
-                **asdict(fault_metrics(chosen, _of_worlds(golden, chosen))),
+                **asdict(
+                    fault_metrics(_bare(faults, by, value), chosen, _of_worlds(golden, chosen))
+                ),
             }
             for by, value, detector, chosen in _grouped(plan, faults, GROUPS)
         ],
@@ -123,6 +129,7 @@ def _plan(plan: EvaluationPlan) -> dict[str, Any]:
         "level": plan.level,
         "places": [asdict(place) for place in plan.places()],
         "flights": plan.flights,
+        "harmless_flights": plan.harmless_flights,
         "golden_flights": plan.golden_flights,
         "first_seed": plan.first_seed,
         "seed": plan.seed,
@@ -158,12 +165,17 @@ def _grouped(
     for by in groups:
         values = dict.fromkeys(ALL if by == ALL else str(getattr(pair, by)) for pair in pairs)
         for value, detector in itertools.product(values, plan.everyone):
-            chosen = [
-                pair
-                for pair in pairs
-                if pair.detector == detector and (by == ALL or str(getattr(pair, by)) == value)
-            ]
+            chosen = [pair for pair in pairs if pair.detector == detector and _in(pair, by, value)]
             yield by, value, detector, chosen
+
+
+def _in(pair: Any, by: str, value: str) -> bool:
+    return by == ALL or str(getattr(pair, by)) == value
+
+
+def _bare(faults: Sequence[FaultPair], by: str, value: str) -> list[FaultPair]:
+    """The faults of a group without a detector."""
+    return [pair for pair in faults if pair.detector == NONE and _in(pair, by, value)]
 
 
 def _comparisons(plan: EvaluationPlan, faults: Sequence[FaultPair]) -> list[dict[str, Any]]:
@@ -171,16 +183,16 @@ def _comparisons(plan: EvaluationPlan, faults: Sequence[FaultPair]) -> list[dict
     by_name = {name: [pair for pair in faults if pair.detector == name] for name in plan.everyone}
     rows: list[dict[str, Any]] = []
     for first, second in itertools.combinations(plan.everyone, 2):
-        recovered, succeeded = recoveries_compared(by_name[first], by_name[second])
+        recovered, undone = recoveries_compared(by_name[first], by_name[second])
         rows.append(
             {
                 "first": first,
                 "second": second,
-                "recovered": asdict(recovered),
-                "success": {**asdict(succeeded), "difference": succeeded.difference},
+                "recovered": {**asdict(recovered), "difference": recovered.difference},
+                "undone": {**asdict(undone), "difference": undone.difference},
             }
         )
-    for what in ("recovered", "success"):
+    for what in ("recovered", "undone"):
         corrected = holm([row[what]["p_value"] for row in rows])
         for row, p_value in zip(rows, corrected, strict=True):
             row[what]["corrected_p"] = p_value

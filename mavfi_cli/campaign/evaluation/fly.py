@@ -1,7 +1,8 @@
 """Fly what an evaluation needs, and read what came of it.
 
 Two campaigns lie in the folder: `bare` without detectors, whose traces are kept because detectors
-are replayed on them, and `protected`, of which only the records are kept.
+are replayed on them, and `protected`, of which only the records are kept. What is flown with
+detectors depends on which faults turned out to do harm without.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.campaign.evaluation.pairs import Flights, flown_of
-from mavfi_cli.campaign.evaluation.plan import EvaluationPlan, require_held_out
+from mavfi_cli.campaign.evaluation.pairs import Flights, Harm, flown_of
+from mavfi_cli.campaign.evaluation.plan import NONE, EvaluationPlan, Fault, require_held_out
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
@@ -39,10 +40,11 @@ def fly(plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectat
         fly_missing(ledger, replace(options, keep=Keep.ALL), spectator)
     if not plan.protectors:
         return
+    harmful = harmful_faults(plan, read_bare(plan, folder)[0])
     spectator.on_note(f"the same with {', '.join(plan.protectors)}")
     with Ledger(folder / PROTECTED, writing=True) as ledger:
         _require_models(plan, ledger)
-        store_plan(ledger, plan.protected(), append=True)
+        store_plan(ledger, plan.protected(harmful), append=True)
         fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
 
 
@@ -64,6 +66,23 @@ def model_digest(plan: EvaluationPlan, detector: str) -> str:
     return "none" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def harmful_faults(plan: EvaluationPlan, flights: Flights) -> set[Fault]:
+    """Faults that did harm without a detector."""
+    places = {(place.target, place.field): place for place in plan.places()}
+    return {
+        (pair.world, pair.seed, places[pair.target, pair.field])
+        for pair in flights.faults([NONE], plan.complete)
+        if pair.active and pair.harm is not Harm.NONE
+    }
+
+
+def read_bare(plan: EvaluationPlan, folder: Path) -> tuple[Flights, list[str]]:
+    """The flights without detectors; see `read`."""
+    flights, errors = Flights(), list[str]()
+    _read(folder / BARE, plan.bare(), flights, errors)
+    return flights, errors
+
+
 def read(plan: EvaluationPlan, folder: Path) -> tuple[Flights, list[str]]:
     """The flights of a plan as far as they are there.
 
@@ -73,16 +92,22 @@ def read(plan: EvaluationPlan, folder: Path) -> tuple[Flights, list[str]]:
     Raises:
         RecordError: nothing was flown there.
     """
-    flights, errors = Flights(), []
-    parts = [(BARE, plan.bare())] + ([(PROTECTED, plan.protected())] if plan.protectors else [])
-    for name, missions in parts:
-        with Ledger(folder / name) as ledger:
-            for entry in _chosen(ledger, missions):
-                if entry.state is State.ERROR:
-                    errors.append(f"{canonical(dict(entry.mission.labels))}: {entry.reason}")
-                else:
-                    flights.add(entry.mission.labels, flown_of(entry))
+    flights, errors = read_bare(plan, folder)
+    if plan.protectors:
+        missions = plan.protected(harmful_faults(plan, flights))
+        _read(folder / PROTECTED, missions, flights, errors)
     return flights, errors
+
+
+def _read(
+    folder: Path, missions: Sequence[PlannedMission], flights: Flights, errors: list[str]
+) -> None:
+    with Ledger(folder) as ledger:
+        for entry in _chosen(ledger, missions):
+            if entry.state is State.ERROR:
+                errors.append(f"{canonical(dict(entry.mission.labels))}: {entry.reason}")
+            else:
+                flights.add(entry.mission.labels, flown_of(entry))
 
 
 def _chosen(ledger: Ledger, missions: Sequence[PlannedMission]) -> Iterator[MissionResult]:

@@ -1,6 +1,7 @@
 """What a detector does with faults and without: numbers of pairs, each with its interval.
 
 A fault that was not injected, or that nothing read, is counted apart and is in no other number.
+Harmful faults are all flown with the detectors; harmless ones only of the `complete` missions.
 Everything about what a fault *does* comes from the unprotected flight: in a protected one the
 detector may withhold the value before anybody reads it.
 """
@@ -8,7 +9,8 @@ detector may withhold the value before anybody reads it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from mavfi_cli.campaign.evaluation.pairs import (
     ErrorFree,
     FaultPair,
+    Flown,
     Harm,
     lengthening,
 )
@@ -109,25 +112,56 @@ class WorstFlight:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Mixture:
+    """A rate of parts that were sampled differently, with its interval."""
+
+    share: float
+    low: float
+    high: float
+
+
+def mixture(parts: Sequence[tuple[int, Share]]) -> Mixture:
+    """The rate of a whole from the rates of its parts, each weighted by its true size.
+
+    The interval adds the distances to the ends of the parts' Wilson intervals in squares (MOVER,
+    G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). Not a number where a part that is
+    not empty was never sampled.
+    """
+    whole = sum(size for size, _ in parts)
+    if not whole:
+        return Mixture(share=math.nan, low=0.0, high=1.0)
+    weighted = [(size / whole, part) for size, part in parts if size]
+    share = math.fsum(weight * part.share for weight, part in weighted)
+    below = math.hypot(*(weight * (part.share - part.low) for weight, part in weighted))
+    above = math.hypot(*(weight * (part.high - part.share) for weight, part in weighted))
+    return Mixture(share=share, low=max(0.0, share - below), high=min(1.0, share + above))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FaultMetrics:
     """A detector against faults.
 
     Attributes:
-        planned: pairs; of them not_injected, not_activated (nothing read what was struck) and
+        planned: faults; of them not_injected, not_activated (nothing read what was struck) and
             active. All that follows is about the active ones, where nothing else is said.
         crashed: faults that killed a node: those are seen without any detector.
-        not_struck: active without protection, but the protected flight ended before the strike,
-            or had parted from the other; in no rate of detection.
         harmful: LOST, LONGER or OTHERWISE; their numbers follow.
-        detected_harmful, detected_active: with an alarm at or after the strike.
+        flown: with this detector: all harmful faults, and the harmless ones of complete missions.
+        not_struck: of them those that never struck, because the protected flight had parted from
+            the other; in no rate of detection.
+        detected_harmful: with an alarm at or after the strike.
+        detected_active: the same of all faults of complete missions.
         detected_inactive: the same of faults that were struck but not activated.
-        by_chance: the same flights without their fault have an alarm in that time as well.
-        latency_s, latency_ticks: median and 95th percentile from strike to alarm.
+        by_chance: flights of complete missions that have an alarm in that time without their
+            fault as well.
+        latency_s, latency_ticks: median and 95th percentile from strike to alarm, harmful faults.
         recovered: of the lost missions those that succeed with protection.
         undone: of the harmful faults those that do no harm with protection.
         added: of the harmless faults those that do harm with protection.
-        golden, unprotected, protected: success rates of the same missions.
-        success: McNemar's test, unprotected first.
+        golden, unprotected: success rates of all missions with an active fault.
+        protected: the same with the detector: harmful and harmless faults, each with its own
+            rate, weighted by how many there are.
+        success: McNemar's test on complete missions, unprotected first.
         worst: against each mission's own golden flight.
         worst_paper: flight times against the golden mean, as in the paper's section VII-A.
     """
@@ -137,11 +171,12 @@ class FaultMetrics:
     not_activated: int
     active: int
     crashed: int
-    not_struck: int
     harmful: Share
     lost: int
     longer: int
     otherwise: int
+    flown: int
+    not_struck: int
     detected_harmful: Share
     detected_active: Share
     detected_inactive: Share
@@ -155,58 +190,72 @@ class FaultMetrics:
     added: Share
     golden: Share
     unprotected: Share
-    protected: Share
+    protected: Mixture
     success: McNemar
     worst: WorstFlight
     worst_paper: WorstCase
 
 
-def fault_metrics(pairs: Sequence[FaultPair], golden_times_s: Sequence[float]) -> FaultMetrics:
+def fault_metrics(
+    bare: Sequence[FaultPair], pairs: Sequence[FaultPair], golden_times_s: Sequence[float]
+) -> FaultMetrics:
     """Metrics of one detector on these faults.
 
     Args:
+        bare: the faults without a detector, all of them.
+        pairs: those that were flown with the detector.
         golden_times_s: of the successful golden flights, for the paper's worst case.
     """
-    injected = [pair for pair in pairs if pair.faulty.injected is not Injected.NOT_INJECTED]
+    injected = [pair for pair in bare if pair.faulty.injected is not Injected.NOT_INJECTED]
     active = [pair for pair in injected if pair.active]
-    inactive = [pair for pair in injected if not pair.active and pair.struck]
-    struck = [pair for pair in active if pair.struck]
-    harmful = [pair for pair in active if pair.harm is not Harm.NONE]
-    harmless = [pair for pair in active if pair.harm is Harm.NONE]
+    harms = Counter(pair.harm for pair in active)
+    flown = [pair for pair in pairs if pair.active]
+    harmful = [pair for pair in flown if pair.harm is not Harm.NONE]
+    harmless = [pair for pair in flown if pair.harm is Harm.NONE and pair.complete]
+    complete = [pair for pair in flown if pair.complete]
     lost = [pair for pair in harmful if pair.harm is Harm.LOST]
-    latencies = [pair.latency_s for pair in struck if pair.latency_s is not None]
+    latencies = [s for pair in harmful if (s := pair.latency_s) is not None]
     middle, late = _interval(latencies, median), _interval(latencies, _p95)
     return FaultMetrics(
-        planned=len(pairs),
-        not_injected=len(pairs) - len(injected),
+        planned=len(bare),
+        not_injected=len(bare) - len(injected),
         not_activated=len(injected) - len(active),
         active=len(active),
         crashed=sum(pair.faulty.crashed for pair in active),
-        not_struck=len(active) - len(struck),
-        harmful=rate(len(harmful), len(active)),
-        lost=len(lost),
-        longer=sum(pair.harm is Harm.LONGER for pair in harmful),
-        otherwise=sum(pair.harm is Harm.OTHERWISE for pair in harmful),
-        detected_harmful=_detected([pair for pair in harmful if pair.struck]),
-        detected_active=_detected(struck),
-        detected_inactive=_detected(inactive),
-        by_chance=rate(sum(pair.by_chance for pair in struck), len(struck)),
+        harmful=rate(len(active) - harms[Harm.NONE], len(active)),
+        lost=harms[Harm.LOST],
+        longer=harms[Harm.LONGER],
+        otherwise=harms[Harm.OTHERWISE],
+        flown=len(flown),
+        not_struck=sum(not pair.struck for pair in flown),
+        detected_harmful=_detected(harmful),
+        detected_active=_detected(complete),
+        detected_inactive=_detected([pair for pair in pairs if not pair.active and pair.complete]),
+        by_chance=_share([pair.by_chance for pair in complete if pair.struck]),
         latency_s=middle,
         latency_s_p95=late,
         latency_ticks=middle.value * TICKS_PER_S,
         latency_ticks_p95=late.value * TICKS_PER_S,
-        recovered=rate(sum(pair.protected.succeeded for pair in lost), len(lost)),
-        undone=rate(sum(pair.remaining_harm is Harm.NONE for pair in harmful), len(harmful)),
-        added=rate(sum(pair.remaining_harm is not Harm.NONE for pair in harmless), len(harmless)),
-        golden=rate(sum(pair.golden.succeeded for pair in active), len(active)),
-        unprotected=rate(sum(pair.faulty.succeeded for pair in active), len(active)),
-        protected=rate(sum(pair.protected.succeeded for pair in active), len(active)),
-        success=mcnemar((pair.faulty.succeeded, pair.protected.succeeded) for pair in active),
-        worst=_worst(active),
+        recovered=_share([pair.protected.succeeded for pair in lost]),
+        undone=_share([pair.remaining_harm is Harm.NONE for pair in harmful]),
+        added=_share([pair.remaining_harm is not Harm.NONE for pair in harmless]),
+        golden=_share([pair.golden.succeeded for pair in active]),
+        unprotected=_share([pair.faulty.succeeded for pair in active]),
+        protected=mixture(
+            [
+                (
+                    len(active) - harms[Harm.NONE],
+                    _share([pair.protected.succeeded for pair in harmful]),
+                ),
+                (harms[Harm.NONE], _share([pair.protected.succeeded for pair in harmless])),
+            ]
+        ),
+        success=mcnemar((pair.faulty.succeeded, pair.protected.succeeded) for pair in complete),
+        worst=_worst(flown),
         worst_paper=worst_case(
             golden_times_s,
-            [s for pair in active if (s := _time_s(pair, protected=False)) is not None],
-            [s for pair in active if (s := _time_s(pair, protected=True)) is not None],
+            _times_s([pair.faulty for pair in active]),
+            _times_s([pair.protected for pair in flown]),
         ),
     )
 
@@ -214,25 +263,33 @@ def fault_metrics(pairs: Sequence[FaultPair], golden_times_s: Sequence[float]) -
 def recoveries_compared(
     first: Sequence[FaultPair], second: Sequence[FaultPair]
 ) -> tuple[McNemar, McNemar]:
-    """Two detectors on the same active faults: lost missions recovered, and all successes."""
+    """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
 
     def key(pair: FaultPair) -> tuple[object, ...]:
         return pair.world, pair.seed, pair.level, pair.stage, pair.target, pair.field
 
     other = {key(pair): pair for pair in second}
     both = [(pair, other[key(pair)]) for pair in first if pair.active and key(pair) in other]
-    outcomes = [(a.protected.succeeded, b.protected.succeeded) for a, b in both]
-    lost = [o for o, (a, _) in zip(outcomes, both, strict=True) if a.harm is Harm.LOST]
-    return mcnemar(lost), mcnemar(outcomes)
+    lost = [(a, b) for a, b in both if a.harm is Harm.LOST]
+    harmful = [(a, b) for a, b in both if a.harm is not Harm.NONE]
+    return (
+        mcnemar((a.protected.succeeded, b.protected.succeeded) for a, b in lost),
+        mcnemar((a.remaining_harm is Harm.NONE, b.remaining_harm is Harm.NONE) for a, b in harmful),
+    )
 
 
 def _detected(pairs: Sequence[FaultPair]) -> Share:
-    return rate(sum(pair.alarm is not None for pair in pairs), len(pairs))
+    return _share([pair.alarm is not None for pair in pairs if pair.struck])
 
 
-def _time_s(pair: FaultPair, *, protected: bool) -> float | None:
-    flown = pair.protected if protected else pair.faulty
-    return flown.flight_time_s if flown.succeeded else None
+def _share(told: Sequence[bool]) -> Share:
+    return rate(sum(told), len(told))
+
+
+def _times_s(flights: Iterable[Flown]) -> list[float]:
+    """Flight times of the successful ones, s."""
+    times = [flown.flight_time_s for flown in flights if flown.succeeded]
+    return [time_s for time_s in times if time_s is not None]
 
 
 def _worst(pairs: Sequence[FaultPair]) -> WorstFlight:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -93,6 +93,8 @@ class FaultPair:
         field: sign, exponent, mantissa, integer, or any.
         watched: golden flight with the detector: what it does without any fault.
         protected: the faulty flight itself for the detector `none`.
+        complete: of its mission all faults are flown with detectors; otherwise this one is,
+            because it is harmful.
     """
 
     world: str
@@ -106,6 +108,7 @@ class FaultPair:
     faulty: Flown
     watched: Flown
     protected: Flown
+    complete: bool = True
 
     @property
     def state(self) -> str:
@@ -241,8 +244,12 @@ class Flights:
                 )  # fmt: skip
         return pairs
 
-    def faults(self, detectors: Iterable[str]) -> list[FaultPair]:
-        """Pairs with a fault, of which all flights are there."""
+    def faults(self, detectors: Iterable[str], complete: Callable[[int], bool]) -> list[FaultPair]:
+        """Pairs with a fault, of which all flights are there.
+
+        Args:
+            complete: whether all faults of the mission with this seed are flown with detectors.
+        """
         wanted = set(detectors)
         pairs = []
         for (kind, detector, key), protected in self._found.items():
@@ -259,6 +266,7 @@ class Flights:
                     world=str(key[0]), seed=int(str(key[1])), level=str(key[2]),
                     stage=str(key[3]), target=str(key[4]), field=str(key[5]), detector=detector,
                     golden=golden, faulty=faulty, watched=watched, protected=protected,
+                    complete=complete(int(str(key[1]))),
                 )
             )  # fmt: skip
         return pairs

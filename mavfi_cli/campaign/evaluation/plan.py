@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ from mavfi_cli.mission.instruction_config import InstructionConfig
 WORLDS = ("sparse", "dense", "factory", "farm")
 FIRST_SEED = 500_000  # training flies from 10 000 on
 GOLDEN_FLIGHTS = 100  # of each world, as the issue asks for
-FLIGHTS = 10
+FLIGHTS = 25
+HARMLESS_FLIGHTS = 5
 NONE = "none"  # no detector: what all others are held against
 DETECTORS = (NONE, "range", "l2", "gad", "aad")
 ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
@@ -56,6 +57,9 @@ class Place:
     field: str
 
 
+Fault = tuple[str, int, Place]  # world, seed of the mission, where
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationPlan:
     """What is flown.
@@ -63,6 +67,8 @@ class EvaluationPlan:
     Attributes:
         detectors: names; `none` may be among them or not, it is always flown.
         flights: missions of each world that get a fault of each place, one a flight.
+        harmless_flights: of them the first so many, all of whose faults are flown with the
+            detectors; of the others only faults that turn out to do harm.
         golden_flights: error-free missions of each world; the first of them are those with faults.
         first_seed: seeds of missions count up from here.
         models: folder of model files `NAME.json`; None takes those that come with the detectors.
@@ -74,6 +80,7 @@ class EvaluationPlan:
     worlds: tuple[str, ...] = WORLDS
     detectors: tuple[str, ...] = DETECTORS
     flights: int = FLIGHTS
+    harmless_flights: int = HARMLESS_FLIGHTS
     golden_flights: int = GOLDEN_FLIGHTS
     first_seed: int = FIRST_SEED
     protect: tuple[str, ...] = STAGES
@@ -83,6 +90,11 @@ class EvaluationPlan:
     base: MissionConfig = field(default_factory=MissionConfig)
 
     def __post_init__(self) -> None:
+        if not 0 <= self.harmless_flights <= self.flights:
+            raise ConfigError(
+                f"must be within 0 and {self.flights}, got {self.harmless_flights}",
+                key="harmless flights",
+            )
         if self.flights < 0 or self.golden_flights < max(1, self.flights):
             raise ConfigError(
                 f"needs at least one error-free flight and one for each with a fault, got "
@@ -154,12 +166,21 @@ class EvaluationPlan:
         """Golden flights, then those with a fault, none of them with a detector."""
         return [self._mission(key) for key in self._keys()]
 
-    def protected(self) -> list[PlannedMission]:
-        """The same once more with each detector."""
+    def protected(self, harmful: Collection[Fault]) -> list[PlannedMission]:
+        """The same once more with each detector.
+
+        Args:
+            harmful: the faults that did harm without one.
+        """
         return [
             self._mission(key, detector)
             for key, detector in itertools.product(self._keys(), self.protectors)
+            if key[2] is None or self.complete(key[1]) or (*key[:2], key[2]) in harmful
         ]
+
+    def complete(self, seed: int) -> bool:
+        """Whether the detectors fly all faults of this mission, harmless ones as well."""
+        return seed in self.seeds[: self.harmless_flights]
 
     def _keys(self) -> Iterator[tuple[str, int, Place | None]]:
         for world, seed in itertools.product(self.worlds, self.seeds):

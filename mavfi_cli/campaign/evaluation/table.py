@@ -30,11 +30,12 @@ def table(evaluation: Row) -> list[str]:
     lines += _columns(_detection_rows(faults, evaluation["curves"]))
     lines += ["", "Faults: recovery"]
     lines += _columns(_recovery_rows(faults))
+    lines += ["", *_columns(_worst_rows(_of(evaluation["faults"], "world")))]
     for by in ("world", "stage", "field", "state"):
-        lines += ["", f"By {by}"]
-        lines += _columns(_group_rows(by, _of(evaluation["faults"], by)))
-    lines += ["", *_comparison_lines(evaluation["comparisons"]), _INTERVALS]
-    return lines
+        rows = _columns(_group_rows(by, _of(evaluation["faults"], by)))
+        lines += ["", *rows] if len(rows) > 1 else []
+    lines += ["", *_columns(_comparison_rows(evaluation["comparisons"]))]
+    return [*lines, _INTERVALS]
 
 
 def _of(rows: Sequence[Row], by: str) -> list[Row]:
@@ -56,9 +57,8 @@ def _head(evaluation: Row) -> list[str]:
         lines += [
             f"Faults      {row['planned']}: {row['not_injected']} not injected, "
             f"{row['not_activated']} not activated, {row['active']} active",
-            f"            {row['harmful']['count']} of the active ones are harmful: {row['lost']} "
-            f"lost the mission, {row['longer']} took over 5 % longer, {row['otherwise']} failed "
-            "otherwise",
+            f"            {row['harmful']['count']} harmful: {row['lost']} lost the mission, "
+            f"{row['longer']} took over 5 % longer, {row['otherwise']} failed otherwise",
         ]
         if row["crashed"]:
             lines.append(f"            {row['crashed']} of the active ones killed a node")
@@ -68,23 +68,22 @@ def _head(evaluation: Row) -> list[str]:
 
 
 def _error_free_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "flights", "alarms", "an hour", "with an alarm", "missions lost", "longer (median)"]
+    yield ["", "flights", "alarms an hour", "with an alarm", "missions lost", "longer (median), %"]
     for row in rows:
         if row["detector"] == NONE:
             continue
         yield [
             row["detector"],
             f"{row['flights']}",
-            f"{row['alarms']}",
-            _spread(row["alarms_per_hour"], digits=2),
+            _spread(row["alarms_per_hour"]),
             _share(row["with_alarm"]),
             _fraction(row["lost"]) + (f", {row['gained']} won" if row["gained"] else ""),
-            _spread(row["lengthening"], scale=100.0, unit=" %", digits=2),
+            _spread(row["lengthening"], scale=100.0, digits=2),
         ]
 
 
 def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
-    yield ["", "harmful", "all active", "by chance", "ticks (median, 95th)", "ROC area"]
+    yield ["", "harmful", "all active", "by chance", "ticks: median, 95th", "ROC area"]
     for row in rows:
         if row["detector"] == NONE:
             continue
@@ -103,25 +102,15 @@ def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
 
 
 def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield [
-        "",
-        "success",
-        "p",
-        "missions recovered",
-        "harm undone",
-        "added",
-        "worst time, recovered",
-    ]
-    golden = rows[0]["golden"]
-    yield ["golden", _share(golden, counts=False)]
+    yield ["", "success", "missions recovered", "harm undone", "added", "worst time, recovered"]
+    yield ["golden", _rate(rows[0]["golden"])]
     for row in rows:
         worst, bare = row["worst"], row["detector"] == NONE
         yield [
             row["detector"],
-            _share(row["protected"], counts=False),
-            "" if bare else f"{row['success']['p_value']:.2g}",
+            _rate(row["unprotected"] if bare else row["protected"]),
             "" if bare else _share(row["recovered"]),
-            "" if bare else _fraction(row["undone"]),
+            "" if bare else _share(row["undone"]),
             "" if bare else _fraction(row["added"]),
             _percent(worst["protected"], signed=True)
             + ("" if bare else f", {_percent(worst['recovered_share'])}"),
@@ -129,44 +118,59 @@ def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 
 
 def _group_rows(by: str, rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "", "active", "harmful", "detected", "active det.", "recovered", "undone", "worst"]
-    last = ""
-    for row in rows:
-        if row["detector"] == NONE and len(rows) > 1 and by == "state":
+    """How many of the harmful faults each detector detects, and whose harm it undoes."""
+    detectors = [row["detector"] for row in rows if row["value"] == rows[0]["value"]]
+    told = [name for name in detectors if name != NONE]
+    yield [f"by {by}", "active", "harmful", "detected:", *told, "undone:", *told]
+    for value in dict.fromkeys(row["value"] for row in rows):
+        group = {row["detector"]: row for row in rows if row["value"] == value}
+        first = group[detectors[0]]
+        if by == "state" and not first["harmful"]["count"]:
             continue
-        worst = row["worst_paper"] if by == "world" else None
-        told = (
-            [worst["increase"], worst["protected_worst"] / worst["golden"] - 1.0]
-            if worst and worst["golden"] and not math.isnan(worst["golden"])
-            else [row["worst"]["faulty"], row["worst"]["protected"]]
-        )
-        first = row["value"] != last
-        last = row["value"]
         yield [
-            row["value"] if first else "",
-            row["detector"],
-            f"{row['active']}" if first else "",
-            f"{row['harmful']['count']}" if first else "",
-            _fraction(row["detected_harmful"]),
-            _fraction(row["detected_active"]),
-            _fraction(row["recovered"]),
-            _fraction(row["undone"]),
-            _percent(told[1], signed=True),
+            value,
+            f"{first['active']}",
+            f"{first['harmful']['count']}",
+            "",
+            *(f"{group[name]['detected_harmful']['count']}" for name in told),
+            "",
+            *(f"{group[name]['undone']['count']}" for name in told),
         ]
 
 
-def _comparison_lines(rows: Sequence[Row]) -> list[str]:
-    lines = []
+def _worst_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
+    """The worst flight time of each world over the mean of its golden flights."""
+    detectors = [row["detector"] for row in rows if row["value"] == rows[0]["value"]]
+    yield ["worst time", "golden mean", *detectors]
+    for value in dict.fromkeys(row["value"] for row in rows):
+        group = [row for row in rows if row["value"] == value]
+        cells = []
+        for row in group:
+            worst = row["worst_paper"]
+            told = _percent(worst["protected_worst"] / worst["golden"] - 1.0, signed=True)
+            if row["detector"] != NONE and not math.isnan(worst["recovered_share"]):
+                told += f", {_percent(worst['recovered_share'])}"
+            cells.append(told)
+        golden = _number(group[0]["worst_paper"]["golden"], 1)
+        yield [value, f"{golden} s", *cells]
+
+
+def _comparison_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
+    yield ["one against another", "only it recovers", "only the other", "p", "harm undone: only it",
+           "only the other", "p"]  # fmt: skip
     for row in rows:
         if NONE in (row["first"], row["second"]):
             continue
-        test = row["success"]
-        lines.append(
-            f"{row['first']} against {row['second']}: only the first saves "
-            f"{test['only_first']} missions, only the second {test['only_second']}; "
-            f"p = {test['corrected_p']:.2g}"
-        )
-    return lines
+        told = [
+            part
+            for test in (row["recovered"], row["undone"])
+            for part in (
+                f"{test['only_first']}",
+                f"{test['only_second']}",
+                f"{test['corrected_p']:.2g}",
+            )
+        ]
+        yield [f"{row['first']} against {row['second']}", *told]
 
 
 def _columns(rows: Iterator[list[str]]) -> list[str]:
@@ -195,14 +199,14 @@ def _fraction(share: Row) -> str:
     return f"{share['count']}/{share['total']}" if share["total"] else "-"
 
 
-def _share(share: Row, *, counts: bool = True) -> str:
-    if not share["total"]:
+def _share(share: Row) -> str:
+    return f"{_fraction(share)}: {_rate(share)}" if share["total"] else "-"
+
+
+def _rate(share: Row) -> str:
+    if math.isnan(share["share"]):
         return "-"
-    told = f"{_fraction(share)} = " if counts else ""
-    return (
-        f"{told}{100 * share['share']:.1f} % ({100 * share['low']:.0f} to "
-        f"{100 * share['high']:.0f})"
-    )
+    return f"{100 * share['share']:.1f} % ({100 * share['low']:.0f} to {100 * share['high']:.0f})"
 
 
 def _spread(each: Row, *, scale: float = 1.0, unit: str = "", digits: int = 1) -> str:
