@@ -41,14 +41,14 @@ def list_(models: Path | None, as_json: bool) -> None:
 @click.option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
 @click.option("--protect", default="perception,planning,control", show_default=True,
               help="Stages whose states are watched.")  # fmt: skip
-@click.option("--flights", default=25, show_default=True,
+@click.option("--flights", default=25, show_default=True, type=click.IntRange(min=0),
               help="Missions of each world with faults: of each, one for every kind.")  # fmt: skip
 @click.option("--harmless-flights", type=click.IntRange(min=0),
               help="Of these missions the first so many are flown with the detectors for every "
                    "fault, the others only for faults that do harm without  [5].")  # fmt: skip
-@click.option("--golden-flights", default=100, show_default=True,
-              help="Error-free missions of each world.")  # fmt: skip
-@click.option("--first-seed", default=500_000, show_default=True,
+@click.option("--golden-flights", default=100, show_default=True, type=click.IntRange(min=1),
+              help="Error-free missions of each world, --flights at least.")  # fmt: skip
+@click.option("--first-seed", default=500_000, show_default=True, type=click.IntRange(min=0),
               help="Of the missions; seeds count up from here. Those that trained a model are "
                    "refused.")  # fmt: skip
 @click.option("--seed", default=1, show_default=True, help="Of the faults.")

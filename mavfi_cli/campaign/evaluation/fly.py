@@ -14,10 +14,12 @@ from pathlib import Path
 
 from mavfi_cli.campaign.evaluation.pairs import Flights, Harm, flown_of
 from mavfi_cli.campaign.evaluation.plan import NONE, EvaluationPlan, Fault, require_held_out
+from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaign.outcome import MissionResult, State
+from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, store_plan
 from mavfi_cli.core.errors import ConfigError
@@ -29,11 +31,14 @@ def fly(plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectat
     """Fly what the folder has not yet; a larger plan of the same kind goes on from a smaller one.
 
     Raises:
+        UnknownName, VehicleProcessError: a world or platform that does not exist.
         ModelError: a model that cannot be used, or that was made with one of these seeds.
         ConfigError: the folder's flights were protected by other models.
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.
     """
     require_held_out(plan)
+    for world in plan.worlds:
+        check_names(replace(plan.base, world=world, seed=plan.first_seed), ask_vehicle)
     spectator.on_note("flights without detectors")
     with Ledger(folder / BARE, writing=True) as ledger:
         store_plan(ledger, plan.bare(), append=True)

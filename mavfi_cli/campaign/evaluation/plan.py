@@ -103,12 +103,19 @@ class EvaluationPlan:
             )
         if self.level not in (SOURCE, INSTRUCTION):
             raise UnknownName("level", self.level, (SOURCE, INSTRUCTION))
-        for what, chosen in (("world", self.worlds), ("detector", self.detectors)):
+        for what, chosen in (
+            ("world", self.worlds),
+            ("detector", self.detectors),
+            ("protect", self.protect),
+        ):
             twice = [name for place, name in enumerate(chosen) if name in chosen[:place]]
             if twice:
                 raise ConfigError(f"{twice[0]} is named twice", key=what)
             if not chosen:
                 raise ConfigError("none is named", key=what)
+        for stage in self.protect:
+            if stage not in STAGES:
+                raise UnknownName("stage", stage, STAGES)
         for name in self.detectors:
             if name != NONE and name not in names():
                 raise UnknownName("detector", name, (NONE, *names()))
@@ -251,8 +258,8 @@ def require_held_out(plan: EvaluationPlan) -> None:
             seed = flight.rpartition("/")[2]
             if seed.isdigit() and int(seed) in plan.seeds:
                 raise ModelError(
-                    f"{detector} was made with the flight {flight}: choose other --seed numbers "
-                    f"than {plan.seeds.start} to {plan.seeds.stop - 1}",
+                    f"{detector} was made with the flight {flight}: seeds {plan.seeds.start} to "
+                    f"{plan.seeds.stop - 1} are not held out, choose another --first-seed",
                     path=path,
                 )
 
