@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from flights import error_free, flown, pair, struck
+from evaluation_flights import error_free, flown, pair, struck
 
 from mavfi_cli.campaign.evaluation.metrics import (
     error_free_metrics,

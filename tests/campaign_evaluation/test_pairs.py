@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
-from flights import flown, pair, struck
+from evaluation_flights import flown, pair, struck
 
 from mavfi_cli.campaign.evaluation.pairs import Flights, Harm, flown_of, harm_of
 from mavfi_cli.campaign.outcome import Injected
