@@ -43,9 +43,9 @@ def list_(models: Path | None, as_json: bool) -> None:
               help="Stages whose states are watched.")  # fmt: skip
 @click.option("--flights", default=25, show_default=True, type=click.IntRange(min=0),
               help="Missions of each world with faults: of each, one for every kind.")  # fmt: skip
-@click.option("--harmless-flights", type=click.IntRange(min=0),
+@click.option("--harmless-flights", default=5, show_default=True, type=click.IntRange(min=0),
               help="Of these missions the first so many are flown with the detectors for every "
-                   "fault, the others only for faults that do harm without  [5].")  # fmt: skip
+                   "fault, the others only for faults that do harm without.")  # fmt: skip
 @click.option("--golden-flights", default=100, show_default=True, type=click.IntRange(min=1),
               help="Error-free missions of each world, --flights at least.")  # fmt: skip
 @click.option("--first-seed", default=500_000, show_default=True, type=click.IntRange(min=0),
@@ -96,12 +96,7 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
 
 
 def _plan(options: dict[str, Any]) -> Any:
-    from mavfi_cli.campaign.evaluation.plan import (
-        DETECTORS,
-        HARMLESS_FLIGHTS,
-        WORLDS,
-        EvaluationPlan,
-    )
+    from mavfi_cli.campaign.evaluation.plan import DETECTORS, WORLDS, EvaluationPlan
     from mavfi_cli.mission.config import MissionConfig
 
     base = {} if options["platform"] is None else {"platform": options["platform"]}
@@ -110,9 +105,7 @@ def _plan(options: dict[str, Any]) -> Any:
         worlds=options["worlds"] or WORLDS,
         detectors=DETECTORS if named is None else _names(named),
         flights=options["flights"],
-        harmless_flights=min(options["flights"], HARMLESS_FLIGHTS)
-        if options["harmless_flights"] is None
-        else options["harmless_flights"],
+        harmless_flights=options["harmless_flights"],
         golden_flights=max(options["golden_flights"], options["flights"]),
         first_seed=options["first_seed"],
         protect=_names(options["protect"]),

@@ -137,7 +137,7 @@ def test_all_parts_of_the_split_are_seen(models):
         ({"protect": ("palnning",)}, UnknownName, "did you mean 'planning'"),
         ({"level": "gate"}, UnknownName, "level"),
         ({"golden_flights": 1}, ConfigError, "one for each with a fault"),
-        ({"harmless_flights": 3}, ConfigError, "within 0 and 2"),
+        ({"harmless_flights": -1}, ConfigError, "harmless flights: must not be negative"),
     ],
 )
 def test_plans_that_make_no_sense(changes, error, told):

@@ -83,7 +83,7 @@ def _error_free_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 
 
 def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
-    yield ["", "harmful", "all active", "by chance", "ticks: median, 95th", "ROC area"]
+    yield ["", "harmful", "all active", "by chance", "ticks (95th)", "ROC area"]
     for row in rows:
         if row["detector"] == NONE:
             continue
@@ -91,9 +91,9 @@ def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
         yield [
             row["detector"],
             _share(row["detected_harmful"]),
-            _share(row["detected_active"]),
+            _rate(row["detected_active"]),
             _percent(row["by_chance"]["share"]),
-            f"{_number(row['latency_ticks'], 0)}, {_number(row['latency_ticks_p95'], 0)}",
+            f"{_number(row['latency_ticks'], 0)} ({_number(row['latency_ticks_p95'], 0)})",
             f"{_number(found['area'], 3)} ({_number(found['area_low'], 2)} to "
             f"{_number(found['area_high'], 2)})"
             if found["positives"]
@@ -102,7 +102,7 @@ def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
 
 
 def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "success", "missions recovered", "harm undone", "added", "worst time, recovered"]
+    yield ["", "success", "missions recovered", "harm undone", "added", "worst, recovered"]
     yield ["golden", _rate(rows[0]["golden"])]
     for row in rows:
         worst, bare = row["worst"], row["detector"] == NONE
@@ -121,7 +121,7 @@ def _group_rows(by: str, rows: Sequence[Row]) -> Iterator[list[str]]:
     """How many of the harmful faults each detector detects, and whose harm it undoes."""
     detectors = [row["detector"] for row in rows if row["value"] == rows[0]["value"]]
     told = [name for name in detectors if name != NONE]
-    yield [f"by {by}", "active", "harmful", "detected:", *told, "undone:", *told]
+    yield [f"by {by}", "active", "harmful", "seen:", *told, "undone:", *told]
     for value in dict.fromkeys(row["value"] for row in rows):
         group = {row["detector"]: row for row in rows if row["value"] == value}
         first = group[detectors[0]]
@@ -147,17 +147,17 @@ def _worst_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
         cells = []
         for row in group:
             worst = row["worst_paper"]
-            told = _percent(worst["protected_worst"] / worst["golden"] - 1.0, signed=True)
+            over = worst["protected_worst"] / worst["golden"] - 1.0
+            told = _percent(over, signed=True, digits=0)
             if row["detector"] != NONE and not math.isnan(worst["recovered_share"]):
-                told += f", {_percent(worst['recovered_share'])}"
+                told += f", {_percent(worst['recovered_share'], digits=0)}"
             cells.append(told)
         golden = _number(group[0]["worst_paper"]["golden"], 1)
         yield [value, f"{golden} s", *cells]
 
 
 def _comparison_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["one against another", "only it recovers", "only the other", "p", "harm undone: only it",
-           "only the other", "p"]  # fmt: skip
+    yield ["", "recovers: only it", "the other", "p", "undoes harm: only it", "the other", "p"]
     for row in rows:
         if NONE in (row["first"], row["second"]):
             continue
@@ -189,10 +189,10 @@ def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _percent(value: float, *, signed: bool = False) -> str:
+def _percent(value: float, *, signed: bool = False, digits: int = 1) -> str:
     if math.isnan(value) or math.isinf(value):
         return "-"
-    return f"{100.0 * value:{'+' if signed else ''}.1f} %"
+    return f"{100.0 * value:{'+' if signed else ''}.{digits}f} %"
 
 
 def _fraction(share: Row) -> str:
@@ -200,13 +200,14 @@ def _fraction(share: Row) -> str:
 
 
 def _share(share: Row) -> str:
-    return f"{_fraction(share)}: {_rate(share)}" if share["total"] else "-"
+    return f"{_fraction(share)}: {_rate(share, digits=0)}" if share["total"] else "-"
 
 
-def _rate(share: Row) -> str:
+def _rate(share: Row, digits: int = 1) -> str:
     if math.isnan(share["share"]):
         return "-"
-    return f"{100 * share['share']:.1f} % ({100 * share['low']:.0f} to {100 * share['high']:.0f})"
+    told = f"{100 * share['share']:.{digits}f} %"
+    return f"{told} ({100 * share['low']:.0f} to {100 * share['high']:.0f})"
 
 
 def _spread(each: Row, *, scale: float = 1.0, unit: str = "", digits: int = 1) -> str:
