@@ -20,6 +20,7 @@ _COMMANDS = {
     "replay": ("mavfi_cli.cli.replay", "Repeat a run and compare the records."),
     "kernels": ("mavfi_cli.cli.kernels", "Attack one kernel at a time, one bit flip a run."),
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
+    "detect": ("mavfi_cli.cli.detect", "Detectors: which there are, what they are worth."),
     "campaign": ("mavfi_cli.cli.campaign", "Plan and run thousands of missions."),
     "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),
     "show": ("mavfi_cli.cli.show", "Read a run and say what happened."),

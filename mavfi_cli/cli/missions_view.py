@@ -18,12 +18,15 @@ _PLAIN_EVERY_S = 10.0
 
 
 class _Plain(Spectator):
-    """A line every ten seconds, and one at the end."""
+    """A line every ten seconds, and one at the end; of several campaigns in turn."""
 
     def __init__(self) -> None:
-        self._next_s = 0.0
+        self._next_s = self._last_s = 0.0
 
     def on_progress(self, progress: Progress) -> None:
+        if progress.elapsed_s < self._last_s:  # the next campaign
+            self._next_s = 0.0
+        self._last_s = progress.elapsed_s
         if progress.elapsed_s >= self._next_s or progress.over == progress.total:
             self._next_s = progress.elapsed_s + _PLAIN_EVERY_S
             click.echo(progress_line(progress), err=True)

@@ -116,6 +116,19 @@ def preprocessing(path: Path) -> PreprocessParams:
         raise ModelError("corrupt model file: no preprocessing parameters", path=path) from None
 
 
+def provenance(path: Path) -> dict[str, Any]:
+    """Where a model file came from, whatever its kind; its header as well.
+
+    Raises:
+        ModelError: the file cannot be read or says nothing about it.
+    """
+    data = _read(path)
+    told = data.get("provenance")
+    if not isinstance(told, dict):
+        raise ModelError("corrupt model file: provenance is no object", path=path)
+    return {"mavfi": data.get("mavfi"), "detector": data.get("detector"), **told}
+
+
 def checked_threshold(value: float, key: str = "threshold") -> float:
     """A threshold that makes sense: a finite number above 0.
 

@@ -92,7 +92,7 @@ def plan_fault(
     """
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
-    golden = replace(config, fault=None, instruction=None, isolate=())
+    golden = replace(config, fault=None, instruction=None, detector=None, isolate=())
     folder = out / CACHE / _key(golden, versions)
 
     def fly() -> tuple[Briefing, dict[str, list[Order]]]:

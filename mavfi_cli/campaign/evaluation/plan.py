@@ -1,0 +1,271 @@
+"""The missions of an evaluation: paired flights, on seeds that no model was made with."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
+from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.states import DType
+from mavfi_cli.core.types import Stage
+from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.registry import find, names
+from mavfi_cli.fi.bits import Field
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.detector_config import STAGES, DetectorConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+
+WORLDS = ("sparse", "dense", "factory", "farm")
+FIRST_SEED = 500_000  # training flies from 10 000 on
+GOLDEN_FLIGHTS = 100  # of each world, as the issue asks for
+FLIGHTS = 25
+HARMLESS_FLIGHTS = 5
+NONE = "none"  # no detector: what all others are held against
+DETECTORS = (NONE, "range", "l2", "gad", "aad")
+ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
+INTEGER = "integer"  # all bits of states that have no sign, exponent and mantissa
+FIELDS = (Field.SIGN.value, Field.EXPONENT.value, Field.MANTISSA.value, INTEGER)
+NODES = {
+    "octomap": Stage.PERCEPTION,
+    "collision_check": Stage.PERCEPTION,
+    "point_cloud": Stage.PERCEPTION,
+    "planner": Stage.PLANNING,
+    "control": Stage.CONTROL,
+}
+SOURCE, INSTRUCTION = "source", "instruction"
+_DRAWS = 1000  # fault seeds that are tried until one draws a state of the wanted type
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """Where faults of one kind strike.
+
+    Attributes:
+        stage: of the corrupted kernel or of its output.
+        target: a stage, or a node.
+        field: a bit field, `integer`, or `any`.
+    """
+
+    stage: str
+    target: str
+    field: str
+
+
+Fault = tuple[str, int, Place]  # world, seed of the mission, where
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationPlan:
+    """What is flown.
+
+    Attributes:
+        detectors: names; `none` may be among them or not, it is always flown.
+        flights: missions of each world that get a fault of each place, one a flight.
+        harmless_flights: of them the first so many, all of whose faults are flown with the
+            detectors; of the others only faults that turn out to do harm.
+        golden_flights: error-free missions of each world; the first of them are those with faults.
+        first_seed: seeds of missions count up from here.
+        models: folder of model files `NAME.json`; None takes those that come with the detectors.
+        level: source or instruction.
+        seed: of the faults.
+        base: what else is to be flown.
+    """
+
+    worlds: tuple[str, ...] = WORLDS
+    detectors: tuple[str, ...] = DETECTORS
+    flights: int = FLIGHTS
+    harmless_flights: int = HARMLESS_FLIGHTS
+    golden_flights: int = GOLDEN_FLIGHTS
+    first_seed: int = FIRST_SEED
+    protect: tuple[str, ...] = STAGES
+    models: Path | None = None
+    level: str = SOURCE
+    seed: int = 1
+    base: MissionConfig = field(default_factory=MissionConfig)
+
+    def __post_init__(self) -> None:
+        if self.harmless_flights < 0:
+            raise ConfigError(
+                f"must not be negative, got {self.harmless_flights}", key="harmless flights"
+            )
+        if self.flights < 0 or self.golden_flights < max(1, self.flights):
+            raise ConfigError(
+                f"needs at least one error-free flight and one for each with a fault, got "
+                f"{self.golden_flights} and {self.flights}",
+                key="golden flights",
+            )
+        if self.level not in (SOURCE, INSTRUCTION):
+            raise UnknownName("level", self.level, (SOURCE, INSTRUCTION))
+        for what, chosen in (
+            ("world", self.worlds),
+            ("detector", self.detectors),
+            ("protect", self.protect),
+        ):
+            twice = [name for place, name in enumerate(chosen) if name in chosen[:place]]
+            if twice:
+                raise ConfigError(f"{twice[0]} is named twice", key=what)
+            if not chosen:
+                raise ConfigError("none is named", key=what)
+        for stage in self.protect:
+            if stage not in STAGES:
+                raise UnknownName("stage", stage, STAGES)
+        for name in self.detectors:
+            if name != NONE and name not in names():
+                raise UnknownName("detector", name, (NONE, *names()))
+
+    @property
+    def everyone(self) -> tuple[str, ...]:
+        """All detectors, `none` first."""
+        return NONE, *self.protectors
+
+    @property
+    def protectors(self) -> tuple[str, ...]:
+        """The detectors without `none`."""
+        return tuple(name for name in self.detectors if name != NONE)
+
+    def model_path(self, detector: str) -> Path | None:
+        """The model file of a detector; None where it has none of its own.
+
+        Raises:
+            ModelError: the folder of models has no such file.
+        """
+        if self.models is None:
+            shipped = model_file.shipped(detector)
+            return shipped if shipped.is_file() else None
+        path = self.models.absolute() / f"{detector}.json"
+        if not path.is_file():
+            raise ModelError("no such model file", path=path)
+        return path
+
+    def detector_config(self, detector: str) -> DetectorConfig:
+        """A detector as missions take it."""
+        path = self.model_path(detector) if self.models is not None else None
+        return DetectorConfig(
+            name=detector, protect=self.protect, model=None if path is None else str(path)
+        )
+
+    @property
+    def seeds(self) -> range:
+        """Of the missions, the same in each world; the first `flights` of them get faults."""
+        return range(self.first_seed, self.first_seed + self.golden_flights)
+
+    def places(self) -> list[Place]:
+        """Where faults strike: stage by bit field, or node."""
+        if self.level == INSTRUCTION:
+            return [
+                Place(stage=stage.value, target=node, field=Field.ANY.value)
+                for node, stage in NODES.items()
+            ]
+        return [
+            Place(stage=stage.value, target=stage.value, field=name)
+            for stage, name in itertools.product(Stage, FIELDS)
+            if stage is not Stage.CONTROL or name != INTEGER  # its states are all float64
+        ]
+
+    def bare(self) -> list[PlannedMission]:
+        """Golden flights, then those with a fault, none of them with a detector."""
+        return [self._mission(key) for key in self._keys()]
+
+    def protected(self, harmful: Collection[Fault]) -> list[PlannedMission]:
+        """The same once more with each detector.
+
+        Args:
+            harmful: the faults that did harm without one.
+        """
+        return [
+            self._mission(key, detector)
+            for key, detector in itertools.product(self._keys(), self.protectors)
+            if key[2] is None or self.complete(key[1]) or (*key[:2], key[2]) in harmful
+        ]
+
+    def complete(self, seed: int) -> bool:
+        """Whether the detectors fly all faults of this mission, harmless ones as well."""
+        return seed in self.seeds[: self.harmless_flights]
+
+    def _keys(self) -> Iterator[tuple[str, int, Place | None]]:
+        for world, seed in itertools.product(self.worlds, self.seeds):
+            yield world, seed, None
+        faulty = self.seeds[: self.flights]
+        yield from itertools.product(self.worlds, faulty, self.places())
+
+    def _mission(self, key: tuple[str, int, Place | None], detector: str = NONE) -> PlannedMission:
+        world, seed, place = key
+        config = replace(self.base, world=world, seed=seed)
+        if place is not None:
+            config = replace(config, **self._fault(world, seed, place))
+        if detector != NONE:
+            config = replace(config, detector=self.detector_config(detector))
+        return PlannedMission(config=config, labels=labels_of(key, self.level, detector))
+
+    def _fault(self, world: str, seed: int, place: Place) -> dict[str, Any]:
+        drawn = (self.seed, Stream.FAULT, "evaluation", world, seed, place.target, place.field)
+        if self.level == INSTRUCTION:
+            return {"instruction": InstructionConfig(target=place.target, seed=derive(*drawn))}
+        whole = place.field == INTEGER
+        for number in range(_DRAWS):
+            fault = FaultConfig(
+                target=place.target,
+                field=Field.ANY.value if whole else place.field,
+                seed=derive(*drawn, number),
+            )
+            # Drawn again until the state is of the wanted type, so each of them is as likely.
+            if _is_float(replace(fault, field=Field.ANY.value)) is not whole:
+                return {"fault": fault}
+        raise ConfigError(f"no state of {place.target} has a bit field {place.field}")
+
+
+def _is_float(fault: FaultConfig) -> bool:
+    return fault.draw().states[0].dtype is DType.FLOAT64
+
+
+def labels_of(
+    key: tuple[str, int, Place | None], level: str, detector: str
+) -> dict[str, str | int | float | bool | None]:
+    """What a mission is told by."""
+    world, seed, place = key
+    told: dict[str, str | int | float | bool | None] = {
+        "kind": ERROR_FREE if place is None else FAULT,
+        "world": world,
+        "seed": seed,
+        "detector": detector,
+    }
+    if place is not None:
+        told |= {"level": level, "stage": place.stage, "target": place.target, "field": place.field}
+    return told
+
+
+def require_held_out(plan: EvaluationPlan) -> None:
+    """Refuse detectors that cannot be loaded, and missions that a model was made with.
+
+    Seeds are compared whatever the world: two worlds may be drawn from the same numbers.
+
+    Raises:
+        ModelError: a model that cannot be used; names the flight that it was made with.
+    """
+    for detector in plan.protectors:
+        path = plan.model_path(detector)
+        find(detector, model=path if plan.models is not None else None)
+        if path is None:
+            continue
+        for flight in training_flights(model_file.provenance(path)):
+            seed = flight.rpartition("/")[2]
+            if seed.isdigit() and int(seed) in plan.seeds:
+                raise ModelError(
+                    f"{detector} was made with the flight {flight}: seeds {plan.seeds.start} to "
+                    f"{plan.seeds.stop - 1} are not held out, choose another --first-seed",
+                    path=path,
+                )
+
+
+def training_flights(provenance: Mapping[str, Any]) -> Sequence[str]:
+    """Flights `world/seed` that a model has seen, of all parts of its split."""
+    parts = provenance.get("split", {})
+    if not isinstance(parts, Mapping):
+        return []
+    return [str(flight) for part in parts.values() for flight in part]

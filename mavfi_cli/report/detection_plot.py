@@ -1,0 +1,180 @@
+"""What detectors are worth, drawn: ROC and precision-recall, and what is recovered."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mavfi_cli.core.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLOURS = {
+    "none": "#9aa5b1", "range": "#f2b134", "l2": "#8e5aa3", "gad": "#1b4965", "aad": "#e4572e",
+}  # fmt: skip
+_OTHERS = ("#2a9d8f", "#7f5539", "#c9184a", "#606c38")  # plug-ins
+_GREY, _GRID = "#5b6573", "#edf0f4"
+Evaluation = Mapping[str, Any]
+
+
+def write_roc_plot(evaluation: Evaluation, path: Path) -> None:
+    """Draw the curves of an evaluation as SVG, atomically; equal ones give equal bytes."""
+    _write(draw_roc_plot(evaluation), path)
+
+
+def write_recovery_plot(evaluation: Evaluation, path: Path) -> None:
+    """Draw what detectors recover as SVG, atomically; equal ones give equal bytes."""
+    _write(draw_recovery_plot(evaluation), path)
+
+
+def _write(figure: Figure, path: Path) -> None:
+    import matplotlib as mpl
+
+    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
+    write_atomically(path, lambda file: file.write(buffer.getvalue()))
+
+
+def draw_roc_plot(evaluation: Evaluation) -> Figure:
+    """A matplotlib figure: ROC to the left, precision over recall to the right.
+
+    The dot is the detector at its own threshold.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.4, 4.4), layout="constrained")
+    roc, precision = figure.subplots(1, 2)
+    colours = _colours(list(evaluation["curves"]))
+    drawn = [(name, c) for name, c in evaluation["curves"].items() if c["thresholds"]]
+    for name, curve in drawn:
+        colour = colours[name]
+        label = f"{name}: area {curve['area']:.3f}, precision {curve['average_precision']:.3f}"
+        x, y = [*curve["false_positive_rate"], 1.0], [*curve["recall"], 1.0]
+        roc.plot(x, y, color=colour, linewidth=1.5, label=label)
+        roc.plot(*curve["operating_point"], "o", color=colour, markersize=5)
+        precision.step(
+            curve["recall"], curve["precision"], where="pre", color=colour, linewidth=1.5
+        )
+        precision.plot(*_at_threshold(curve), "o", color=colour, markersize=5)
+    roc.plot([0, 1], [0, 1], color=_GREY, linewidth=0.8, linestyle=":")
+    _square(roc, "share of error-free flights with an alarm", "share of harmful faults detected")
+    _square(precision, "share of harmful faults detected", "share of alarms that are right")
+    if drawn:
+        counts = drawn[0][1]
+        caption = (
+            f"{counts['positives']} harmful faults against {counts['negatives']} error-free "
+            "flights; score of a flight: its highest; dots: own threshold"
+        )
+        figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
+    else:
+        caption = "no harmful fault: no curve"
+    figure.supxlabel(caption, fontsize=7.5, color=_GREY)
+    return figure
+
+
+def _at_threshold(curve: Mapping[str, Any]) -> tuple[float, float]:
+    """Recall and precision at the detector's own threshold; precision is 1 without any alarm."""
+    fallout, recall = curve["operating_point"]
+    hits, false = recall * curve["positives"], fallout * curve["negatives"]
+    return recall, hits / (hits + false) if hits + false else 1.0
+
+
+def _square(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlim(-0.02, 1.02)
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_aspect("equal")
+    axes.set_xlabel(x, fontsize=8.5)
+    axes.set_ylabel(y, fontsize=8.5)
+    axes.tick_params(labelsize=8)
+    axes.grid(visible=True, color=_GRID, linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_recovery_plot(evaluation: Evaluation) -> Figure:
+    """A matplotlib figure: lost missions that are recovered by stage, worst flights by world."""
+    from matplotlib.figure import Figure
+
+    rows = evaluation["faults"]
+    names = list(dict.fromkeys(row["detector"] for row in rows))
+    colours = _colours(names)
+    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    shares, times = figure.subplots(1, 2)
+    stages = [row for row in rows if row["by"] in ("all", "stage") and row["detector"] != "none"]
+    _bars(
+        shares, stages, [name for name in names if name != "none"], colours,
+        lambda row: (row["recovered"]["share"], row["recovered"]["low"], row["recovered"]["high"]),
+        lambda row: f"{row['value']}\nn = {row['recovered']['total']}",
+    )  # fmt: skip
+    shares.set_ylim(0.0, 105.0)
+    shares.set_ylabel("lost missions that are recovered, %", fontsize=8.5)
+    _bars(
+        times, [row for row in rows if row["by"] == "world"], names, colours,
+        lambda row: (_worst(row), None, None),
+        lambda row: f"{row['value']}\nn = {row['active']}",
+    )  # fmt: skip
+    times.set_ylabel("worst flight time over the golden mean, %", fontsize=8.5)
+    handles = [shares.bar(0, 0, color=colours[name], label=name) for name in names]
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=len(names), frameon=False, fontsize=8.5
+    )
+    figure.supxlabel(
+        "left: whiskers are 95 % Wilson intervals, n lost missions; right: successful flights "
+        "with n active faults", fontsize=7.5, color=_GREY,
+    )  # fmt: skip
+    return figure
+
+
+def _worst(row: Mapping[str, Any]) -> float:
+    """The worst protected flight time over the golden mean, minus 1."""
+    worst = row["worst_paper"]
+    return float(worst["protected_worst"]) / float(worst["golden"]) - 1.0
+
+
+def _bars(
+    axes: Axes,
+    rows: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+    colours: Mapping[str, str],
+    measure: Any,
+    tick: Any,
+) -> None:
+    """Bars side by side: a group a value of the rows, a bar a detector; shares become per cent."""
+    values = list(dict.fromkeys(row["value"] for row in rows))
+    width = 0.8 / max(1, len(names))
+    ticks = {}
+    for row in rows:
+        ticks[row["value"]] = tick(row)
+        place = values.index(row["value"]) + width * (
+            names.index(row["detector"]) - (len(names) - 1) / 2
+        )
+        value, low, high = measure(row)
+        if not np.isfinite(value):
+            axes.text(place, 1.0, "-", ha="center", fontsize=8, color=_GREY)
+            continue
+        axes.bar(place, 100.0 * value, width=0.9 * width, color=colours[row["detector"]])
+        if low is not None:
+            axes.errorbar(
+                place, 100.0 * value, [[100.0 * (value - low)], [100.0 * (high - value)]],
+                color="#1d232b", elinewidth=0.9, capsize=2.0,
+            )  # fmt: skip
+    axes.set_xticks(range(len(values)), [ticks[value] for value in values], fontsize=8)
+    axes.set_xlim(-0.6, max(0.6, len(values) - 0.4))
+    axes.tick_params(labelsize=8)
+    axes.grid(visible=True, axis="y", color=_GRID, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour a detector; those of others take turns."""
+    others = [name for name in names if name not in _COLOURS]
+    return {
+        name: _COLOURS.get(name) or _OTHERS[others.index(name) % len(_OTHERS)] for name in names
+    }
