@@ -2,7 +2,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from detect_builders import trace
+from detect_builders import plan, trace
 
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Stage
@@ -13,7 +13,9 @@ from mavfi_cli.detect.preprocess import PreprocessParams
 
 def dataset(count=3, params=None):
     params = params or PreprocessParams()
-    flights = tuple(flight_of(trace(4.0, seed), "w", seed, params) for seed in range(count))
+    flights = tuple(
+        flight_of(trace(4.0, seed), "w", seed, params, [plan(12)] * seed) for seed in range(count)
+    )
     return Dataset(flights=flights, preprocess=params)
 
 
@@ -24,7 +26,7 @@ def test_what_is_saved_is_loaded_and_equal_sets_give_equal_bytes(tmp_path):
     assert len(loaded) == 3
     for one, other in zip(made.flights, loaded.flights, strict=True):
         assert (one.world, one.seed) == (other.world, other.seed)
-        for name in ("stamps_s", "reports", "new_waypoint", "deltas"):
+        for name in ("stamps_s", "reports", "plan_steps", "new_waypoint", "deltas"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
             assert getattr(one, name).dtype == getattr(other, name).dtype
     loaded.save(tmp_path / "b.parquet")
@@ -37,10 +39,10 @@ def test_an_empty_set_can_be_kept(tmp_path):
 
 
 def test_samples_of_a_stage_are_those_that_bring_something_new():
-    (flight,) = dataset(1).flights
-    assert flight.of_stage(Stage.CONTROL).shape == (200, 13)
-    assert flight.of_stage(Stage.PLANNING).shape == (8, 13)
-    assert flight.of_stage(Stage.PERCEPTION).shape == (14, 13)
+    for plans, flight in enumerate(dataset(3).flights):
+        assert flight.of_stage(Stage.CONTROL).shape == (200, 13)
+        assert flight.of_stage(Stage.PLANNING).shape == (8 + 11 * plans, 13)
+        assert flight.of_stage(Stage.PERCEPTION).shape == (14, 13)
 
 
 def test_a_flight_can_be_in_a_set_only_once():

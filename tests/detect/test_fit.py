@@ -22,7 +22,13 @@ def flight(world, seed, rows=120):
     deltas[~new, 2:9] = 0
     stamps = np.arange(rows) * 0.02
     return Flight(
-        world=world, seed=seed, stamps_s=stamps, reports=reports, new_waypoint=new, deltas=deltas
+        world=world,
+        seed=seed,
+        stamps_s=stamps,
+        reports=reports,
+        new_waypoint=new,
+        deltas=deltas,
+        plan_steps=np.zeros(rows, bool),
     )
 
 
@@ -124,7 +130,7 @@ def test_components_of_a_vector_share_their_scale(dataset):
     deltas[5, NAMES.index("command_vz")] = -4
     changed = Flight(
         world="w", seed=99, stamps_s=one.stamps_s, reports=one.reports,
-        new_waypoint=one.new_waypoint, deltas=deltas,
+        plan_steps=one.plan_steps, new_waypoint=one.new_waypoint, deltas=deltas,
     )  # fmt: skip
     assert fit.scale_of([changed]).tolist() == [1, 2, 1, 1, 1, 1, 1, 1, 1, 4, 4, 4, 1]
 

@@ -1,13 +1,13 @@
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from detect_builders import trace
+from detect_builders import plan, trace
 
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import registry
-from mavfi_cli.detect.offline import columns_of, flight_of, replay
-from mavfi_cli.detect.preprocess import NAMES
+from mavfi_cli.detect.offline import columns_of, flight_of, plan_steps, replay
+from mavfi_cli.detect.preprocess import NAMES, PreprocessParams
 
 
 def test_every_message_is_judged_once_and_in_order():
@@ -71,6 +71,22 @@ def test_a_nan_is_a_value_and_a_null_is_none():
     assert [each.stamp_s for each in alarms] == [1.0]
     plain["command_yaw"][:50] = np.ma.masked
     assert sum(not j.report for j in replay(plain, None)) == 50
+
+
+def test_steps_of_plans_are_what_the_gate_looks_at():
+    """All steps, also those in which no code changes, with the other stages' states at 0."""
+    flown = plan(20)
+    flown.waypoints[9, 4:6] = -2.5, 2.5
+    steps = plan_steps(flown, PreprocessParams())
+    assert steps.shape == (19, 13)
+    changed = np.flatnonzero(steps.any(axis=1)).tolist()
+    assert {8, 9} < set(changed)
+    place = NAMES.index("waypoint_vx")
+    assert steps[8, place] == -steps[9, place] == -2
+    flight = flight_of(trace(1.0), "w", 1, plans=[flown])
+    np.testing.assert_array_equal(flight.deltas[flight.plan_steps], steps)
+    assert not flight.deltas[flight.plan_steps][:, 9:].any()
+    assert plan_steps(plan(1), PreprocessParams()).shape == (0, 13)
 
 
 def test_a_missing_column_is_named():
