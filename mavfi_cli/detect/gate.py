@@ -9,7 +9,7 @@ Per stage (`Detector.per_stage`) the alarm names the stage whose states were ano
 over all stages sees one vector: of a report on its arrival, and of each tick together with the
 report that arrived since the tick before. Its alarm always names control (paper, section V-D).
 
-A plan is looked through as a whole, too: an alarm then also names the waypoint to drop.
+A plan is looked through as a whole, too; an alarm then also names the waypoint to drop.
 """
 
 from __future__ import annotations
@@ -113,12 +113,23 @@ class Gate:
         self._pending = not self._per_stage
         return None
 
-    def judge_plan(self, trajectory: Trajectory, first: int = 0) -> Alarm | None:
-        """Look through a plan's steps from waypoint to waypoint, from waypoint `first` on.
+    def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
+        """A plan was published: all its steps from waypoint to waypoint.
 
-        For a plan that was just published, and for one under way each time it is handed to a node
-        that looks ahead: the collision check meets a corrupted waypoint long before it is flown.
-        Changes nothing in the gate, and the detector learns nothing.
+        For detectors that judge each stage alone; for one over all stages control is what an
+        alarm recomputes, and there is nothing to recompute yet: see `judge_ahead`.
+        """
+        return self.judge_ahead(trajectory, 0) if self._per_stage else None
+
+    def judge_ahead(self, trajectory: Trajectory, first: int) -> Alarm | None:
+        """Look through the steps of the plan that is flown, from the present waypoint on.
+
+        For every detector, each time the plan is handed to a node that looks ahead: the collision
+        check meets a corrupted waypoint long before it is flown. Changes nothing in the gate, and
+        the detector learns nothing.
+
+        Args:
+            first: the waypoint that is followed now.
 
         Returns:
             The alarm of the first bad step, which names the waypoint to drop.

@@ -159,13 +159,15 @@ def test_a_plan_is_looked_through_without_a_trace(per_stage, column, value, inde
     before = gate.memory["gate"].copy()
     bad = corrupted(trajectory, index, column, value)
     for looked_from in (0, 3):
-        assert gate.judge_plan(trajectory, looked_from) is None
-        alarm = gate.judge_plan(bad, looked_from)
+        assert gate.judge_ahead(trajectory, looked_from) is None
+        alarm = gate.judge_ahead(bad, looked_from)
         assert alarm is not None
         assert alarm.waypoint == index
         assert alarm.states == (NAMES[2 + column],)
         assert alarm.stage is (Stage.PLANNING if per_stage else Stage.CONTROL)
-    assert gate.judge_plan(bad, index + 1) is None  # behind the vehicle
+    assert gate.judge_ahead(bad, index + 1) is None  # behind the vehicle
+    # As it is published, only a detector that judges planning alone can ask for another plan.
+    assert gate.judge_plan(bad) == (gate.judge_ahead(bad, 0) if per_stage else None)
     assert detector.learned == []
     np.testing.assert_array_equal(gate.memory["gate"], before)
 
@@ -174,8 +176,8 @@ def test_a_plan_of_an_unwatched_stage_or_without_a_step_is_not_looked_through():
     bad = corrupted(plan(), 7, 1, HUGE)
     for per_stage in (True, False):
         unwatched = Gate(Notes(per_stage), frozenset({Stage.CONTROL, Stage.PERCEPTION}))
-        assert unwatched.judge_plan(bad) is None
-        assert Gate(Notes(per_stage)).judge_plan(corrupted(plan(1), 0, 0, HUGE)) is None
+        assert unwatched.judge_plan(bad) is unwatched.judge_ahead(bad, 0) is None
+        assert Gate(Notes(per_stage)).judge_ahead(corrupted(plan(1), 0, 0, HUGE), 0) is None
 
 
 def test_forgetting_takes_the_next_sample_unjudged():
