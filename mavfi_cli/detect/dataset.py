@@ -1,7 +1,7 @@
 """Samples as the gate sees them, grouped by flight: what models are fitted to.
 
-One row is one judged message: a collision report, or a control tick. Its deltas are those that a
-detector is shown; `new_waypoint` says whether the planning states had a new sample in that tick.
+One row is one judged message: a collision report, a control tick, or one step of a published plan
+from waypoint to waypoint. Its deltas are those that a detector is shown.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.detect.preprocess import COUNT, NAMES, Codes, PreprocessParams, states_digest
 
 SCHEMA = "1"
+_FLAGS = ("reports", "plan_steps", "new_waypoint")
 _META = (b"mavfi_samples", b"mavfi_states", b"mavfi_preprocess")
 
 
@@ -30,8 +31,9 @@ class Flight:
     world: str
     seed: int
     stamps_s: FloatArray  # (n,)
-    reports: NDArray[np.bool_]  # (n,) a collision report, else a control tick
-    new_waypoint: NDArray[np.bool_]  # (n,)
+    reports: NDArray[np.bool_]  # (n,) a collision report
+    plan_steps: NDArray[np.bool_]  # (n,) a step of a plan; what is neither is a control tick
+    new_waypoint: NDArray[np.bool_]  # (n,) a control tick with a new sample of planning's states
     deltas: Codes  # (n, COUNT)
 
     def of_stage(self, stage: Stage) -> Codes:
@@ -39,8 +41,8 @@ class Flight:
         if stage is Stage.PERCEPTION:
             return self.deltas[self.reports]
         if stage is Stage.PLANNING:
-            return self.deltas[self.new_waypoint]
-        return self.deltas[~self.reports]
+            return self.deltas[self.new_waypoint | self.plan_steps]
+        return self.deltas[~(self.reports | self.plan_steps)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,9 +71,9 @@ class Dataset:
             "world": pa.array(np.repeat([f.world for f in flights], lengths).tolist(), pa.string()),
             "seed": pa.array(np.repeat([f.seed for f in flights], lengths), pa.int64()),
             "stamp_s": pa.array(_joined([f.stamps_s for f in flights]), pa.float64()),
-            "report": pa.array(_joined([f.reports for f in flights]), pa.bool_()),
-            "new_waypoint": pa.array(_joined([f.new_waypoint for f in flights]), pa.bool_()),
         }
+        for flag in _FLAGS:
+            columns[flag] = pa.array(_joined([getattr(f, flag) for f in flights]), pa.bool_())
         deltas = np.concatenate([np.zeros((0, COUNT), np.int16), *(f.deltas for f in flights)])
         for place, name in enumerate(NAMES):
             columns[name] = pa.array(deltas[:, place], pa.int16())
@@ -136,7 +138,6 @@ def _flights(table: object) -> Iterable[Flight]:
             world=str(worlds[start]),
             seed=int(seeds[start]),
             stamps_s=columns["stamp_s"][start:end],
-            reports=columns["report"][start:end].astype(np.bool_),
-            new_waypoint=columns["new_waypoint"][start:end].astype(np.bool_),
+            **{flag: columns[flag][start:end].astype(np.bool_) for flag in _FLAGS},
             deltas=deltas[start:end],
         )

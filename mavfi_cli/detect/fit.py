@@ -165,16 +165,20 @@ def mirrored(deltas: Codes) -> NDArray[np.int64]:
 def scores(detector: Detector, flight: Flight) -> FloatArray:
     """Score of every judged message (n,): the highest of the stages that it brings."""
     found = np.zeros(len(flight.deltas))
-    for row, (deltas, report, new) in enumerate(
-        zip(flight.deltas, flight.reports.tolist(), flight.new_waypoint.tolist(), strict=True)
-    ):
+    rows = zip(flight.deltas, *(_flags(flight)), strict=True)
+    for row, (deltas, report, step, new) in enumerate(rows):
         if report:
             found[row] = detector.score(deltas, Stage.PERCEPTION)
-        else:
+            continue
+        if not (step and detector.per_stage):
             found[row] = detector.score(deltas, Stage.CONTROL)
-            if new and detector.per_stage:
-                found[row] = max(found[row], detector.score(deltas, Stage.PLANNING))
+        if (new or step) and detector.per_stage:
+            found[row] = max(found[row], detector.score(deltas, Stage.PLANNING))
     return found
+
+
+def _flags(flight: Flight) -> tuple[list[bool], list[bool], list[bool]]:
+    return flight.reports.tolist(), flight.plan_steps.tolist(), flight.new_waypoint.tolist()
 
 
 def _all(flights: list[Flight]) -> Codes:

@@ -8,6 +8,8 @@ Where the caller lets it pass nevertheless, because recomputing confirmed it, it
 Per stage (`Detector.per_stage`) the alarm names the stage whose states were anomalous. A detector
 over all stages sees one vector: of a report on its arrival, and of each tick together with the
 report that arrived since the tick before. Its alarm always names control (paper, section V-D).
+
+A plan is looked through as a whole, too; an alarm then also names the waypoint to drop.
 """
 
 from __future__ import annotations
@@ -51,6 +53,7 @@ class Alarm:
     score: float
     threshold: float
     states: tuple[str, ...]  # what looks wrong, worst first
+    waypoint: int | None = None  # of a plan that was looked through: the one to drop
 
 
 class Gate:
@@ -111,20 +114,53 @@ class Gate:
         return None
 
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
-        """A plan was published: the steps between its waypoints. Changes nothing in the gate.
+        """A plan was published: all its steps from waypoint to waypoint.
 
-        For detectors that judge each stage alone; one over all stages has nothing to say yet.
+        For detectors that judge each stage alone; for one over all stages control is what an
+        alarm recomputes, and there is nothing to recompute yet: see `judge_ahead`.
         """
-        if not self._per_stage or Stage.PLANNING not in self.protect:
+        return self.judge_ahead(trajectory, 0) if self._per_stage else None
+
+    def judge_ahead(self, trajectory: Trajectory, first: int) -> Alarm | None:
+        """Look through the steps of the plan that is flown, from the present waypoint on.
+
+        For every detector, each time the plan is handed to a node that looks ahead: the collision
+        check meets a corrupted waypoint long before it is flown. Changes nothing in the gate, and
+        the detector learns nothing.
+
+        Args:
+            first: the waypoint that is followed now.
+
+        Returns:
+            The alarm of the first bad step, which names the waypoint to drop.
+        """
+        if Stage.PLANNING not in self.protect or len(trajectory.waypoints) < 2:
             return None
-        steps = np.zeros((max(0, len(trajectory.waypoints) - 1), COUNT), np.int16)
-        plan_deltas(trajectory.waypoints, self._work, steps)
+        rows = len(trajectory.waypoints)
+        steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
+        count = plan_deltas(trajectory.waypoints, first, self._work, steps, changes)
         threshold = self.threshold
-        for deltas in steps:
-            score = self.detector.score(deltas, Stage.PLANNING)
-            if not score <= threshold:
-                return self._alarm(Stage.PLANNING, score, threshold, deltas)
-        return None
+        stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
+        bad: tuple[int, float] | None = None
+        for number in range(count):
+            score = self.detector.score(changes[number], stage)
+            if score <= threshold:
+                continue
+            if bad is None:
+                bad = number, score
+            elif steps[number] == steps[bad[0]] + 1:  # away from the bad waypoint again
+                return self._plan_alarm(changes[bad[0]], bad[1], int(steps[number]))
+            else:
+                break
+        if bad is None:
+            return None
+        step = int(steps[bad[0]])
+        only_first = step == max(first, 0) and step + 2 < rows
+        return self._plan_alarm(changes[bad[0]], bad[1], step if only_first else step + 1)
+
+    def _plan_alarm(self, deltas: Codes, score: float, waypoint: int) -> Alarm:
+        stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
+        return self._alarm(stage, score, self.threshold, deltas, waypoint)
 
     def judge_tick(
         self, trajectory: Trajectory | None, index: int, command: Command
@@ -211,7 +247,14 @@ class Gate:
         first, end = SPANS[stage]
         self._work[REFERENCE, first:end] = self._work[CODE, first:end]
 
-    def _alarm(self, stage: Stage, score: float, threshold: float, deltas: Codes) -> Alarm:
+    def _alarm(
+        self,
+        stage: Stage,
+        score: float,
+        threshold: float,
+        deltas: Codes,
+        waypoint: int | None = None,
+    ) -> Alarm:
         blamed = self._blame(stage, threshold, deltas)
         return Alarm(
             stage=stage if self._per_stage else Stage.CONTROL,
@@ -219,6 +262,7 @@ class Gate:
             score=float(score),
             threshold=float(threshold),
             states=blamed,
+            waypoint=waypoint,
         )
 
     def _blame(self, stage: Stage, threshold: float, deltas: Codes) -> tuple[str, ...]:

@@ -91,10 +91,7 @@ def load(path: Path, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> Mo
     _refuse_other(path, "detector", data["detector"], detector)
     if data["states"] != states_digest():
         raise ModelError("made for another table of states; train it anew", path=path)
-    try:
-        preprocess = structure(data["preprocess"], PreprocessParams)
-    except (ConfigError, AttributeError, TypeError) as error:
-        raise ModelError(f"corrupt model file: preprocess: {error}", path=path) from None
+    preprocess = _preprocess(path, data)
     if data["preprocess_digest"] != preprocess.digest():
         raise ModelError("made with another preprocessing; train it anew", path=path)
     if not isinstance(data["provenance"], dict):
@@ -110,10 +107,7 @@ def load(path: Path, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> Mo
 
 def preprocessing(path: Path) -> PreprocessParams:
     """The preprocessing parameters of a model file, for the gate that its detector serves."""
-    try:
-        return structure(_read(path)["preprocess"], PreprocessParams)
-    except (KeyError, ConfigError, AttributeError, TypeError):
-        raise ModelError("corrupt model file: no preprocessing parameters", path=path) from None
+    return _preprocess(path, _read(path))
 
 
 def provenance(path: Path) -> dict[str, Any]:
@@ -150,6 +144,19 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ModelError("corrupt model file: no JSON object", path=path)
     return data
+
+
+def _preprocess(path: Path, data: Mapping[str, Any]) -> PreprocessParams:
+    values = data.get("preprocess")
+    if not isinstance(values, dict):
+        raise ModelError("corrupt model file: preprocess is no object", path=path)
+    try:
+        params = structure(values, PreprocessParams)
+    except ConfigError as error:
+        raise ModelError(f"corrupt model file: preprocess: {error}", path=path) from None
+    if set(values) != set(asdict(params)):
+        raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
+    return params
 
 
 def _refuse_other(path: Path, what: str, found: object, wanted: object) -> None:

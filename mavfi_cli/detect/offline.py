@@ -8,7 +8,7 @@ Without them a message is new where one of its values is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,15 @@ from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Tr
 from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.dataset import Flight
 from mavfi_cli.detect.gate import ALL_STAGES, Alarm, Gate
-from mavfi_cli.detect.preprocess import COUNT, NAMES, SPANS, Codes, PreprocessParams
+from mavfi_cli.detect.preprocess import (
+    COUNT,
+    NAMES,
+    SPANS,
+    Codes,
+    PreprocessParams,
+    plan_deltas,
+    working_array,
+)
 
 Columns = Mapping[str, NDArray[Any]]
 _WAYPOINT = [s.name for s in STATES if s.group.startswith("waypoint_") and s.unit != "s"]
@@ -126,18 +134,43 @@ def replay(
 
 
 def flight_of(
-    trace: Columns, world: str, seed: int, params: PreprocessParams | None = None
+    trace: Columns,
+    world: str,
+    seed: int,
+    params: PreprocessParams | None = None,
+    plans: Sequence[Trajectory] = (),
 ) -> Flight:
-    """The samples of one error-free flight, for a data set."""
+    """The samples of one error-free flight, for a data set.
+
+    Args:
+        plans: all that were published; a trace only knows the waypoints that were flown.
+    """
+    params = params or PreprocessParams()
     judged = list(replay(trace, None, params))
+    steps = [step for plan in plans for step in plan_steps(plan, params)]
+    stamps = [plan.stamp_s for plan in plans for _ in range(len(plan.waypoints) - 1)]
+    messages = [False] * len(judged)
     return Flight(
         world=world,
         seed=seed,
-        stamps_s=np.array([each.stamp_s for each in judged], np.float64),
-        reports=np.array([each.report for each in judged], np.bool_),
-        new_waypoint=np.array([each.new_waypoint for each in judged], np.bool_),
-        deltas=np.array([each.deltas for each in judged], np.int16).reshape(-1, COUNT),
+        stamps_s=np.array([each.stamp_s for each in judged] + stamps, np.float64),
+        reports=np.array([each.report for each in judged] + [False] * len(steps), np.bool_),
+        plan_steps=np.array(messages + [True] * len(steps), np.bool_),
+        new_waypoint=np.array(
+            [each.new_waypoint for each in judged] + [False] * len(steps), np.bool_
+        ),
+        deltas=np.array([each.deltas for each in judged] + steps, np.int16).reshape(-1, COUNT),
     )
+
+
+def plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
+    """Deltas (n - 1, COUNT) of a plan's steps from waypoint to waypoint, as the gate sees them."""
+    rows = len(plan.waypoints)
+    steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
+    count = plan_deltas(plan.waypoints, 0, working_array(params), steps, changes)
+    found = np.zeros((max(0, rows - 1), COUNT), np.int16)
+    found[steps[:count]] = changes[:count]
+    return found
 
 
 class _Messages:

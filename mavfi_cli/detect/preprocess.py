@@ -34,6 +34,7 @@ from mavfi_cli.core.states import STATES, DType, State
 from mavfi_cli.core.types import FloatArray, Stage
 
 Codes = NDArray[np.int16]
+IntArray = NDArray[np.int64]
 
 DETECTED: tuple[State, ...] = tuple(state for state in STATES if state.detected)
 NAMES: tuple[str, ...] = tuple(state.name for state in DETECTED)
@@ -211,12 +212,28 @@ def take_tick(
 
 
 @compiled
-def plan_deltas(waypoints: FloatArray, work: Codes, out: Codes) -> None:
-    """Deltas (n - 1, COUNT) between consecutive waypoints (n, 10); `work` stays as it is."""
-    for row in range(waypoints.shape[0] - 1):
+def plan_deltas(waypoints: FloatArray, first: int, work: Codes, steps: IntArray, out: Codes) -> int:
+    """Deltas between consecutive waypoints (n, 10) from `first` on, where there are any.
+
+    Writes the steps k, from waypoint k to k + 1, in which a code changes to `steps` (n,), and
+    their deltas to `out` (n, COUNT). `work` stays as it is.
+
+    Returns:
+        How many there are.
+    """
+    count = 0
+    for row in range(max(first, 0), waypoints.shape[0] - 1):
+        changed = False
+        out[count, :] = 0
         for column in range(_CONTROL - _PLANNING):
             place = _PLANNING + column
             floor, ceiling, kind = work[FLOOR, place], work[CEILING, place], work[KIND, place]
             before = encode(waypoints[row, column], floor, ceiling, kind)
             after = encode(waypoints[row + 1, column], floor, ceiling, kind)
-            out[row, place] = difference(before, after, floor, kind)
+            delta = difference(before, after, floor, kind)
+            out[count, place] = delta
+            changed = changed or delta != 0
+        if changed:
+            steps[count] = row
+            count += 1
+    return count

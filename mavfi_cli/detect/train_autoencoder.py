@@ -33,10 +33,12 @@ class Trained:
     told: Mapping[str, Any]
 
 
-def train(
-    inputs: FloatArray, validation: FloatArray, *, seed: int, epochs: int = EPOCHS
-) -> Trained:
-    """Train on scaled vectors (n, 13), stop where those for validation (m, 13) are met best.
+def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> Trained:
+    """Train on scaled vectors (n, 13), keep what meets those for validation (m, 13) best.
+
+    Args:
+        inputs, validation: deltas over their scales, each vector once.
+        seed: of the first start; each further one takes the next.
 
     Raises:
         ModelError: torch is not installed.
@@ -50,15 +52,14 @@ def train(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        starts = [_train(torch, inputs, validation, seed + k, epochs) for k in range(STARTS)]
+        starts = [_train(torch, inputs, validation, seed + number) for number in range(STARTS)]
     finally:
         torch.set_num_threads(threads)
     return min(starts, key=lambda start: float(start.told["validation_error"]))
 
 
-def _train(
-    torch: Any, inputs: FloatArray, validation: FloatArray, seed: int, epochs: int
-) -> Trained:
+def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
+    """One start."""
     source = torch.Generator().manual_seed(seed)
     sizes = ((COUNT, HIDDEN), (HIDDEN, CODED), (CODED, COUNT))
     names = ("hidden", "coded", "output")
@@ -79,7 +80,7 @@ def _train(
     optimiser = torch.optim.Adam(list(weights.values()), lr=LEARNING_RATE)
     best, best_epoch, kept = np.inf, 0, {}
     curve: list[list[float]] = []
-    for epoch in range(epochs + 1):
+    for epoch in range(EPOCHS + 1):
         with torch.no_grad():
             met = float(loss_of(checked).max())
         if met < best:
@@ -94,7 +95,7 @@ def _train(
     return Trained(
         weights=kept,
         told={
-            "epochs": epochs,
+            "epochs": EPOCHS,
             "learning_rate": LEARNING_RATE,
             "best_epoch": best_epoch,
             "validation_error": best,

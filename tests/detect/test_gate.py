@@ -149,18 +149,35 @@ def test_only_protected_stages_raise_alarms(per_stage, stage):
     assert {where for where, alarm in found.items() if alarm is not None} == {stage}
 
 
-def test_a_fresh_plan_is_scanned_without_a_trace_in_the_gate():
-    gate, detector, trajectory = primed()
+@pytest.mark.parametrize("per_stage", [True, False])
+@pytest.mark.parametrize("column", [0, 3, 4])
+@pytest.mark.parametrize("value", [HUGE, -HUGE, np.nan, np.inf])
+@pytest.mark.parametrize("index", [3, 4, 7, 18, 19])
+def test_a_plan_is_looked_through_without_a_trace(per_stage, column, value, index):
+    """Wherever the bad waypoint is from the present one on, the alarm names it."""
+    gate, detector, trajectory = primed(per_stage)
     before = gate.memory["gate"].copy()
-    assert gate.judge_plan(trajectory) is None
-    alarm = gate.judge_plan(corrupted(trajectory, 7, 1, np.nan))
-    assert alarm is not None
-    assert (alarm.stage, alarm.states) == (Stage.PLANNING, ("waypoint_y",))
+    bad = corrupted(trajectory, index, column, value)
+    for looked_from in (0, 3):
+        assert gate.judge_ahead(trajectory, looked_from) is None
+        alarm = gate.judge_ahead(bad, looked_from)
+        assert alarm is not None
+        assert alarm.waypoint == index
+        assert alarm.states == (NAMES[2 + column],)
+        assert alarm.stage is (Stage.PLANNING if per_stage else Stage.CONTROL)
+    assert gate.judge_ahead(bad, index + 1) is None  # behind the vehicle
+    # As it is published, only a detector that judges planning alone can ask for another plan.
+    assert gate.judge_plan(bad) == (gate.judge_ahead(bad, 0) if per_stage else None)
     assert detector.learned == []
     np.testing.assert_array_equal(gate.memory["gate"], before)
-    assert Gate(Notes(per_stage=False)).judge_plan(corrupted(trajectory, 7, 1, HUGE)) is None
-    unwatched = Gate(Notes(per_stage=True), frozenset({Stage.CONTROL}))
-    assert unwatched.judge_plan(corrupted(trajectory, 7, 1, HUGE)) is None
+
+
+def test_a_plan_of_an_unwatched_stage_or_without_a_step_is_not_looked_through():
+    bad = corrupted(plan(), 7, 1, HUGE)
+    for per_stage in (True, False):
+        unwatched = Gate(Notes(per_stage), frozenset({Stage.CONTROL, Stage.PERCEPTION}))
+        assert unwatched.judge_plan(bad) is unwatched.judge_ahead(bad, 0) is None
+        assert Gate(Notes(per_stage)).judge_ahead(corrupted(plan(1), 0, 0, HUGE), 0) is None
 
 
 def test_forgetting_takes_the_next_sample_unjudged():

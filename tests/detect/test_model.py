@@ -1,0 +1,124 @@
+import json
+
+import numpy as np
+import pytest
+
+from mavfi_cli.core.errors import ConfigError, ModelError
+from mavfi_cli.detect import model, registry
+from mavfi_cli.detect.gaussian import GaussianDetector
+from mavfi_cli.detect.model import Model
+from mavfi_cli.detect.preprocess import PreprocessParams
+
+SHAPES = GaussianDetector.shapes
+OURS = ["gad", "aad", "range", "l2"]
+
+
+@pytest.fixture
+def path(tmp_path):
+    arrays = {name: np.array(array) for name, array in GaussianDetector.cold(6.0).memory.items()}
+    arrays["mean"][3] = 1 / 3
+    model.save(tmp_path / "gad.json", Model(detector="gad", arrays=arrays, provenance={"a": 1}))
+    return tmp_path / "gad.json"
+
+
+def changed(path, **values):
+    data = json.loads(path.read_text())
+    for key, value in values.items():
+        if value is None:
+            del data[key]
+        else:
+            data[key] = value
+    path.write_text(json.dumps(data))
+
+
+def test_what_is_saved_is_loaded_exactly(path):
+    loaded = model.load(path, "gad", SHAPES)
+    assert loaded.arrays["mean"][3] == 1 / 3
+    assert loaded.provenance == {"a": 1}
+    assert model.preprocessing(path) == PreprocessParams()
+    again = path.with_name("again.json")
+    model.save(again, loaded)
+    assert again.read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ({"schema": 2}, "made for model schema 2, this is 1"),
+        ({"mavfi": "0.0.1"}, "made for mavfi '0.0.1', this is '"),
+        ({"detector": "aad"}, "made for detector 'aad', this is 'gad'"),
+        ({"states": "0" * 64}, "made for another table of states"),
+        ({"preprocess_digest": "0" * 64}, "made with another preprocessing"),
+        ({"preprocess": {"yaw_floor": 1.5}}, "corrupt model file: preprocess: yaw_floor"),
+        ({"preprocess": {"nonsense": 1}}, "corrupt model file: preprocess: nonsense: unknown key"),
+        ({"preprocess": [1]}, "preprocess is no object"),
+        ({"preprocess": {"yaw_floor": -1}}, "preprocess: parameters are missing"),
+        ({"preprocess": {"position_floor": 5000}}, "corrupt model file: preprocess"),
+        ({"provenance": []}, "provenance is no object"),
+        ({"provenance": None}, "corrupt model file: keys provenance"),
+        ({"extra": 1}, "corrupt model file: keys extra"),
+        ({"arrays": {}}, "arrays must be n_sigma, sigma_floor"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused_in_one_line(path, values, problem):
+    changed(path, **values)
+    with pytest.raises(ModelError, match=problem) as caught:
+        model.load(path, "gad", SHAPES)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ([1.0, 2.0], r"array 'n_sigma' has shape \(2,\), this version needs \(1,\)"),
+        (["a"], "array 'n_sigma' is no numbers"),
+        ([None], "not finite"),
+        ([[1.0], [2.0, 3.0]], "is no numbers"),
+        ([float("inf")], "not finite"),
+    ],
+)
+def test_arrays_are_checked(path, value, problem):
+    data = json.loads(path.read_text())
+    data["arrays"]["n_sigma"] = value
+    path.write_text(json.dumps(data))
+    with pytest.raises(ModelError, match=problem):
+        model.load(path, "gad", SHAPES)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1, 2]", b"\xff\xfe", b"null", b"[" * 100000])
+def test_a_corrupt_file_is_refused(tmp_path, content):
+    path = tmp_path / "broken.json"
+    path.write_bytes(content)
+    for load in (lambda: model.load(path, "gad", SHAPES), lambda: model.preprocessing(path)):
+        with pytest.raises(ModelError, match="corrupt model file") as caught:
+            load()
+        assert "\n" not in str(caught.value)
+
+
+def test_a_number_that_is_not_finite_overwrites_nothing(path):
+    before = path.read_bytes()
+    loaded = model.load(path, "gad", SHAPES)
+    loaded.arrays["mean"][0] = np.nan
+    with pytest.raises(ModelError, match="array 'mean' holds a number that is not finite"):
+        model.save(path, loaded)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("value", [0, -2.0, float("nan"), float("inf")])
+def test_thresholds_out_of_range(value):
+    with pytest.raises(ConfigError, match="n sigma: must be a finite number above 0"):
+        model.checked_threshold(value, "n sigma")
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_shipped_models_tell_where_they_come_from(name):
+    path = model.shipped(name)
+    shapes = type(registry.find(name)).shapes
+    loaded = model.load(path, name, shapes)
+    assert model.preprocessing(path) == PreprocessParams()
+    told = loaded.provenance
+    assert told["worlds"] == ["train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5"]
+    parts = [set(told["split"][part]) for part in ("train", "validation", "threshold")]
+    assert sum(len(part) for part in parts) == len(set.union(*parts)) == told["flights"] >= 100
+    assert told["threshold"] == registry.find(name).threshold
