@@ -2,8 +2,8 @@
 
 A trace is a mapping of column names to arrays, one row a control tick: `stamp_s`, every monitored
 state by its name (NaN or masked while no message has carried it), and, where the trace has them,
-`report_stamp_s` and `waypoint_index`, from which a new message with old values can be told.
-Without them a message is new where one of its values is.
+`report_stamp_s`, `waypoint_index` and `trajectory_stamp_s`, by which a new message with old values
+is known. Without them a message is new where one of its values is.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ class _Messages:
             self._reports, trace, ("report_stamp_s",)
         )
         self._new_waypoint = self._has_waypoint & (
-            _changes(self._waypoints, trace, ("waypoint_index", "plan_trajectory_seq"))
+            _changes(self._waypoints, trace, ("waypoint_index", "trajectory_stamp_s"))
             | ~np.concatenate([[False], self._has_waypoint[:-1]])
         )
         self._trajectory: Trajectory | None = None
