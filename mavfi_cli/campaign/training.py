@@ -25,6 +25,7 @@ from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import columns_of, flight_of
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.plan_file import read_plans
 from mavfi_cli.mission.run_folder import load_run
 
 WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
@@ -106,7 +107,8 @@ def fly_training(
                 run = load_run(folder / FLIGHTS_FOLDER / entry.path)
                 assert run.trace is not None
                 columns = columns_of(run.trace)
-                flights.append(flight_of(columns, config.world, config.seed, preprocess))
+                plans = read_plans(run.folder.plans)
+                flights.append(flight_of(columns, config.world, config.seed, preprocess, plans))
     if not flights:
         raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
     dataset = Dataset(flights=tuple(flights), preprocess=preprocess)

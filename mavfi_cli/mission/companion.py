@@ -107,6 +107,7 @@ class Companion:
             self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
         self._checked: Trajectory | None = None
+        self._looked: tuple[Trajectory | None, int] = (None, -1)
         self._commands: deque[_Setpoint] = deque()
         self._frame: DepthFrame | None = None
         self._state: VehicleState | None = None
@@ -129,9 +130,9 @@ class Companion:
     def _take_cloud(self, cloud: PointCloud, _stamp_s: float) -> None:
         self.executor.submit("octomap", cloud)
 
-    def _take_snapshot(self, snapshot: occupancy.MapSnapshot, _stamp_s: float) -> None:
+    def _take_snapshot(self, snapshot: occupancy.MapSnapshot, stamp_s: float) -> None:
         self._snapshot = snapshot
-        self._check()
+        self._check(stamp_s)
 
     def _take_report(self, checked: tuple[CollisionReport, float], stamp_s: float) -> None:
         report, self._fresh_frame_s = checked
@@ -199,8 +200,9 @@ class Companion:
         if node == "collision_check" and self._injection.follower is not None:
             self._injection.follower.read(value.trajectory, node, start_s, CHECKED_STATES)
 
-    def _check(self) -> None:
+    def _check(self, stamp_s: float) -> None:
         """Have the present trajectory checked against the newest map."""
+        self._look_ahead(stamp_s)
         trajectory = self.pilot.trajectory
         if self._snapshot is None or trajectory is None:
             return
@@ -209,6 +211,44 @@ class Companion:
             "collision_check",
             CheckInput(snapshot=self._snapshot, trajectory=trajectory, time_s=self.pilot.time_s),
         )
+
+    def _look_ahead(self, stamp_s: float, only: int | None = None) -> None:
+        """Drop what the gate finds wrong on the way ahead, before others take it for true.
+
+        Args:
+            only: nothing but this waypoint is dropped.
+        """
+        while self.pilot.trajectory is not None:
+            flown = self.pilot.trajectory
+            response, alarm = self.protection.ahead(flown, self._waypoint(), only, stamp_s)
+            if response is Response.HOLD:
+                self._hold()
+            elif response is Response.RECOMPUTE and alarm is not None:
+                assert alarm.waypoint is not None
+                self.pilot.trajectory = without_waypoint(flown, alarm.waypoint)
+                if alarm.stage is Stage.PLANNING:
+                    self.pilot.want_plan()
+                if self.pilot.trajectory is not flown:
+                    continue
+            return
+
+    def _look_round(self, stamp_s: float, unharmed: Trajectory) -> None:
+        """Before the mission logic works with the flown plan: what has changed since the last tick?
+
+        With a new plan, or a waypoint that is begun, the whole way ahead is looked through. In
+        between only the waypoint that is followed is watched, in every tick: looking through the
+        whole plan 50 times a second would be another order of cost.
+
+        Args:
+            unharmed: the plan before this tick's strike; the gate has seen that one already.
+        """
+        if self.pilot.trajectory is None:
+            return
+        at, (seen, seen_at) = self._waypoint(), self._looked
+        if self.pilot.trajectory is not seen or at != seen_at:
+            known = unharmed is seen and at == seen_at
+            self._look_ahead(stamp_s, at if known else None)
+        self._looked = (self.pilot.trajectory, at)
 
     # The control tick
 
@@ -227,18 +267,20 @@ class Companion:
         if not self.sees:
             return None
         self._ticks += 1
+        self._state = state
         self._injection.strike_memory(self._moment(stamp_s))
         if self.pilot.trajectory is not None:
-            self._strike_latched(self.pilot.trajectory, stamp_s)
-        self._state = state
+            flown = self.pilot.trajectory
+            self._strike_latched(flown, stamp_s)
+            self._look_round(stamp_s, flown)
+        if self._injection.follower is not None:
+            self._follow(self._injection.follower, stamp_s)
         directive = self.directive = self.pilot.update(stamp_s, state)
         if directive.plan is not None:
             assert self._snapshot is not None
             self.executor.submit("planner", (directive.plan, self._snapshot))
         if directive.trajectory is not None and directive.trajectory is not self._checked:
-            self._check()
-        if self._injection.follower is not None:
-            self._follow(self._injection.follower, stamp_s, directive)
+            self._check(stamp_s)
         setpoint = self._track(stamp_s, state, directive)
         if setpoint is not None:  # else the last one stays in force: the node is down
             self._commands.append(setpoint)
@@ -253,14 +295,15 @@ class Companion:
         if self._checked is flown:
             self._checked = struck
 
-    def _follow(self, follower: Follower, stamp_s: float, directive: Directive) -> None:
-        """Control is about to read the followed waypoint, and the yaw it turns to."""
+    def _follow(self, follower: Follower, stamp_s: float) -> None:
+        """Mission logic and control are about to read the followed waypoint, and the next yaw."""
         if not follower.waits:
             return
-        if directive.trajectory is not None:
-            at = max(0, waypoint_index(directive.trajectory, directive.time_s))
-            follower.read(directive.trajectory, "control", stamp_s, FOLLOWED_STATES, at)
-            follower.read(directive.trajectory, "control", stamp_s, {"waypoint_yaw"}, at + 1)
+        flown = self.pilot.trajectory
+        if flown is not None:
+            at = self._waypoint()
+            follower.read(flown, "control", stamp_s, FOLLOWED_STATES, at)
+            follower.read(flown, "control", stamp_s, {"waypoint_yaw"}, at + 1)
         follower.settle(lambda message: message is self.report or self.pilot.holds(message))
 
     def _track(

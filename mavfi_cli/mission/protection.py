@@ -41,7 +41,7 @@ class AlarmRecord:
     """One alarm as the record of the run tells it."""
 
     stamp_s: float
-    message: str  # report, plan, tick
+    message: str  # report, plan, ahead (the flown plan, before it is checked), tick
     stage: str
     score: float
     states: tuple[str, ...]
@@ -70,6 +70,12 @@ class NoProtection:
     def plan(self, plan: Trajectory, stamp_s: float) -> Response:
         """Passes."""
         return Response.PASS
+
+    def ahead(
+        self, plan: Trajectory, first: int, only: int | None, stamp_s: float
+    ) -> tuple[Response, Alarm | None]:
+        """Passes."""
+        return Response.PASS, None
 
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
@@ -101,7 +107,7 @@ class Protection(NoProtection):
         _warm_up(Gate(self._detector()))
         self.gate: Gate = Gate(self._detector(), stages)
         self._threshold = self.gate.threshold
-        self._checks = dict.fromkeys(("report", "plan", "tick"), 0)
+        self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
         self._recoveries = {stage: _Recovery() for stage in Stage}
         self._alarms: list[AlarmRecord] = []
@@ -132,12 +138,19 @@ class Protection(NoProtection):
             return Response.PASS
         return self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
 
+    def ahead(
+        self, plan: Trajectory, first: int, only: int | None, stamp_s: float
+    ) -> tuple[Response, Alarm | None]:
+        """Look through the flown plan, from the present waypoint on; or look at one waypoint."""
+        alarm = self._judge("ahead", lambda: self.gate.judge_ahead(plan, first))
+        if alarm is None or only not in (None, alarm.waypoint):
+            return Response.PASS, None
+        return self._respond(alarm, "ahead", alarm.stage, stamp_s), alarm
+
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> tuple[Response, Stage]:
         """Judge the followed waypoint and the command that would go out; and who is to blame."""
-        if trajectory is None:
-            self.gate.forget(Stage.PLANNING)
         alarm = self._judge("tick", lambda: self.gate.judge_tick(trajectory, index, command))
         if alarm is None:
             self._recovered(Stage.CONTROL, stamp_s)
@@ -240,6 +253,7 @@ def _warm_up(gate: Gate) -> None:
     for _ in range(2):
         gate.judge_report(report)
         gate.judge_plan(plan)
+        gate.judge_ahead(plan, 0)
         gate.judge_tick(plan, 0, command)
 
 

@@ -31,6 +31,7 @@ from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.instruction_injection import InstructionInjection, require_possible
 from mavfi_cli.mission.instruction_plan import PlannedFault, Recorder, plan_fault, planned_of
+from mavfi_cli.mission.plan_file import write_plans
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.response import response_times
@@ -268,6 +269,7 @@ def _write(
         "host": host,
     }
     write_trace(folder.trace, flight.trace.table(truth))
+    write_plans(folder.plans, companion.plans if companion else [])
     told = [loss.traceback for loss in companion.executor.losses] if companion else []
     if errors := [text for text in (*told, crash) if text]:
         (folder.path / CRASH).write_text("\n".join(errors))

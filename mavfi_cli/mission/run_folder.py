@@ -1,4 +1,4 @@
-"""The folder of one run: result.json, trace.parquet, flight.tlog, flight.svg."""
+"""The folder of one run: result.json, trace.parquet, plans.parquet, flight.tlog, flight.svg."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 RESULT = "result.json"
 TRACE = "trace.parquet"
+PLANS = "plans.parquet"
 TLOG = "flight.tlog"
 PICTURE = "flight.svg"
 FAULT = "fault.json"
@@ -39,6 +40,11 @@ class RunFolder:
     def trace(self) -> Path:
         """States at every control tick."""
         return self.path / TRACE
+
+    @property
+    def plans(self) -> Path:
+        """Every waypoint of every plan."""
+        return self.path / PLANS
 
     @property
     def tlog(self) -> Path:

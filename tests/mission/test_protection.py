@@ -168,6 +168,19 @@ def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
 
 
 @pytest.mark.slow
+def test_a_wild_waypoint_far_ahead_is_dropped_before_the_collision_check_sees_it(guarded):
+    fault = FaultConfig(target="waypoint_x", at="time=2", exact_bits=(61,), seed=5)
+    run = guarded(fault=fault)
+    (change,) = run.result["fault"]["strikes"][0]["changes"]
+    assert abs(change["after"]) > 1e100
+    assert run.result["detection"]["alarms"][0]["message"] == "ahead"
+    assert run.result["fault"]["activation"]["activation"] == "overwritten"
+    counters = run.result["pilot"]
+    assert (counters["collisions_foreseen"], counters["stops"]) == (0, 0)
+    assert run.result["outcome"] == "success"
+
+
+@pytest.mark.slow
 def test_a_stage_that_is_not_protected_is_not_watched(fly_short, limit):
     config = replace(limit, protect=("perception", "planning"))
     run = load_run(fly_short(detector=config, fault=FLIP).path)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.states import STATES
+from mavfi_cli.mission.plan_file import read_plans
 from mavfi_cli.mission.run_folder import load_run
 
 
@@ -24,7 +25,7 @@ def truth(run):
 
 def test_the_folder_is_complete_and_nothing_else_lies_in_it(short_flight):
     names = {path.name for path in short_flight.path.iterdir()}
-    assert names == {"result.json", "trace.parquet", "flight.tlog"}
+    assert names == {"result.json", "trace.parquet", "plans.parquet", "flight.tlog"}
 
 
 def test_it_succeeds_and_says_so_once(run):
@@ -170,3 +171,19 @@ def test_a_collision_is_an_outcome_with_place_and_obstacle(tmp_path, fly_short):
     assert result["outcome"] == "collision"
     assert result["referee"]["collision"] is not None
     assert "box 0" in result["reason"]
+
+
+def test_the_plans_are_kept_whole(run):
+    plans = read_plans(run.folder.plans)
+    assert [plan.stamp_s for plan in plans] == [plan["stamp_s"] for plan in run.result["plans"]]
+    for plan, line in zip(plans, run.result["plans"], strict=True):
+        np.testing.assert_allclose(plan.waypoints[:, 0:3], line["points_enu_m"], atol=5e-4)
+        assert plan.durations_s.shape == (len(plan.waypoints),)
+    columns = run.trace.to_pydict()
+    flown = {(plan.stamp_s, i): row for plan in plans for i, row in enumerate(plan.waypoints)}
+    for stamp_s, index, x, ax in zip(
+        columns["trajectory_stamp_s"], columns["waypoint_index"], columns["waypoint_x"],
+        columns["waypoint_ax"], strict=True,
+    ):  # fmt: skip
+        if stamp_s is not None:
+            assert flown[stamp_s, index][[0, 7]].tolist() == [x, ax]
