@@ -13,6 +13,7 @@ process, never by when the host noticed, so they repeat.
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -79,6 +80,12 @@ class _Job:
             self.order = process.order(self.node.name, self.input, self.start_s)
         self.input = None
 
+    def settle(self, wall: WallClock) -> None:
+        """Wait for the work that a process was given, whatever comes of it."""
+        if self.order is not None and not self.done:
+            with contextlib.suppress(NodeLost):
+                self.result(wall)
+
     def result(self, wall: WallClock) -> Any:
         """The output, waiting for it where it is not there yet."""
         self.begin(wall)
@@ -126,6 +133,7 @@ class Executor:
     _events: list[tuple[float, int, _Event]] = field(default_factory=list)  # heap: time, order
     _waiting: list[Node] = field(default_factory=list)
     _uncomputed: list[_Job] = field(default_factory=list)
+    _jobs: dict[str, _Job] = field(default_factory=dict)  # whose output is not due yet
     _working: int = 0
     _count: int = 0
 
@@ -144,6 +152,13 @@ class Executor:
         """
         node = self._nodes[name]
         node.process = process or NodeProcess.fork({name: node.run})
+
+    def settle(self) -> None:
+        """Wait for work under way: what a fault does there must not depend on the host's pace."""
+        for job in self._jobs.values():
+            if job.node.process is not None:
+                job.settle(self.wall)
+        self._jobs.clear()
 
     def close(self) -> None:
         """End the processes of all nodes."""
@@ -221,6 +236,7 @@ class Executor:
         self.on_start(node.name, job.input, job.start_s)
         self._working += 1
         self._uncomputed.append(job)
+        self._jobs[node.name] = job
         end_s = self.now_s + latency_s
         self.timetable.append(Invocation(node=node.name, start_s=self.now_s, end_s=end_s))
         self._at(end_s, lambda stamp_s: self._finish(job, stamp_s))
@@ -231,6 +247,7 @@ class Executor:
 
     def _finish(self, job: _Job, end_s: float) -> None:
         job.node.finished += 1
+        self._jobs.pop(job.node.name, None)
         try:
             output = job.result(self.wall)
         except NodeLost as loss:

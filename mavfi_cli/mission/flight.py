@@ -153,6 +153,8 @@ class Flight:
                 if name != attacked:
                     executor.isolate(name)
             yield
+            if not self._interrupts:
+                executor.settle()
         finally:
             executor.close()
 

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 
 import pytest
 
@@ -168,3 +169,24 @@ def test_a_call_of_a_node_that_is_down_gives_nothing(executor):
         executor.advance(stamp_s)
         given.append(executor.call("a", value, stamp_s))
     assert given == [1, None, None, None, 4, 5]
+
+
+def test_settling_waits_for_work_whose_output_is_not_due_yet(tmp_path):
+    """What happens to a node must not depend on how fast the host gets to the mission's end."""
+    done = tmp_path / "done"
+
+    def run(_value, _stamp_s):
+        time.sleep(0.3)
+        done.touch()
+
+    executor = Executor(draw_latency_s=lambda _name: 1.0, cores=1)
+    executor.add("slow", run, lambda _output, _stamp_s: None)
+    executor.isolate("slow")
+    try:
+        executor.submit("slow", 1)
+        executor.compute()
+        assert not done.exists()
+        executor.settle()
+        assert done.exists()
+    finally:
+        executor.close()
