@@ -81,9 +81,8 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     """The golden setting that flew most of this setting's missions; None of itself golden."""
     if group.golden:
         return None
-    pairs = {pair_of_row(row) for row in group.of(COUNTED)}
     shared = [
-        (len(pairs & {pair_of_row(row) for row in each.rows}), -index)
+        (len(group.pairs & each.pairs), -index)
         for index, each in enumerate(groups)
         if each.golden and not _protected(each)
     ]

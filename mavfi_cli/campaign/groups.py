@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from mavfi_cli.campaign.ledger import COLUMNS, Ledger
@@ -18,7 +19,7 @@ INACTIVE = frozenset(each.value for each in Injected) - COUNTED
 _PLACE = {name: 3 + index for index, name in enumerate(COLUMNS)}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # no slots: what is asked of all rows is asked once
 class Group:
     """Missions that are counted together.
 
@@ -46,10 +47,16 @@ class Group:
         """How often each value of a column comes."""
         return dict(sorted(Counter(str(value(row, column)) for row in self.rows).items()))
 
-    @property
+    @cached_property
     def golden(self) -> bool:
         """Whether no fault was asked for."""
-        return all(value(row, "injected") == Injected.GOLDEN.value for row in self.rows)
+        none = Injected.GOLDEN.value
+        return all(value(row, "injected") == none for row in self.rows)
+
+    @cached_property
+    def pairs(self) -> frozenset[str]:
+        """Of the missions that are counted."""
+        return frozenset(pair_of_row(row) for row in self.of(COUNTED))
 
 
 def value(row: Row, column: str) -> Any:
