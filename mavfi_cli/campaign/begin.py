@@ -9,13 +9,14 @@ from typing import Any
 
 from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
-from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, golden_of
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.run import require_versions, store_plan
 from mavfi_cli.campaign.spec import Spec, load_spec, parse_spec, presets
 from mavfi_cli.campaign.spec_text import to_toml
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_text
+from mavfi_cli.mission.config import MissionConfig
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
 # Missions that differ in these only are checked once.
@@ -103,8 +104,8 @@ def _check(missions: list[PlannedMission]) -> None:
     seen: set[str] = set()
     asked: set[str] = set()
 
-    def vehicle(config: Any) -> None:
-        simple = replace(config, fault=None, instruction=None, seed=0)
+    def vehicle(config: MissionConfig) -> None:
+        simple = replace(golden_of(config), seed=0)
         key = canonical({**changes_of(simple), "planner": None, "platform": None})
         if key not in asked:
             asked.add(key)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mavfi_cli.campaign.groups import Group, Row, pair_of_row, succeeded, value
+import numpy as np
+
+from mavfi_cli.campaign.groups import Group
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.paired import McNemar, holm, mcnemar
 from mavfi_cli.campaign.statistics.worst_case import WorstCase, worst_case
@@ -16,7 +17,7 @@ from mavfi_cli.campaign.stopping import COUNTED
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 RESAMPLES = 1999
 TREATMENT = ("setting", "detector", "protect")  # labels in which protected flights differ
-Pairs = list[tuple[Row, Row]]
+Places = list[tuple[int, int]]  # rows of the first and of the second, a pair of missions each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,8 +43,15 @@ class Comparison:
 class _Match:
     first: Group
     second: Group
-    pairs: Pairs
+    places: Places
     golden: Group
+
+    def columns(self, name: str | None = None) -> tuple[Any, Any]:
+        """A column of both, a row a pair; their successes where none is named."""
+        at = np.array(self.places).T
+        if name is None:
+            return self.first.succeeded[at[0]], self.second.succeeded[at[1]]
+        return self.first.numbers(name)[at[0]], self.second.numbers(name)[at[1]]
 
 
 def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Comparison]:
@@ -81,9 +89,8 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     """The golden setting that flew most of this setting's missions; None of itself golden."""
     if group.golden:
         return None
-    pairs = {pair_of_row(row) for row in group.of(COUNTED)}
     shared = [
-        (len(pairs & {pair_of_row(row) for row in each.rows}), -index)
+        (len(group.pairs.keys() & each.pairs.keys()), -index)
         for index, each in enumerate(groups)
         if each.golden and not _protected(each)
     ]
@@ -91,46 +98,47 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     return groups[-most[1]] if most[0] else None
 
 
-def _paired(first: Group, second: Group) -> Pairs:
+def _paired(first: Group, second: Group) -> Places:
     """Missions of equal pairs, in the order of the list; one golden flight serves several."""
-    waiting: dict[str, list[Row]] = defaultdict(list)
-    for row in first.of(COUNTED):
-        waiting[pair_of_row(row)].append(row)
-    taken: dict[str, int] = defaultdict(int)
-    found: Pairs = []
-    for row in second.of(COUNTED):
-        pair = pair_of_row(row)
-        candidates = waiting.get(pair, [])
-        if candidates and (first.golden or taken[pair] < len(candidates)):
-            found.append((candidates[min(taken[pair], len(candidates) - 1)], row))
-            taken[pair] += 1
-    return found
+    found: Places = []
+    for pair, places in second.pairs.items():
+        others = first.pairs.get(pair, [])
+        if first.golden:
+            others = others[:1] * len(places)
+        found += zip(others, places, strict=False)  # as many as both have
+    return sorted(found, key=lambda pair: pair[1])
 
 
 def _compared(matches: Sequence[_Match], confidence: float, *, protected: bool) -> list[Comparison]:
-    tests = [mcnemar((succeeded(a), succeeded(b)) for a, b in each.pairs) for each in matches]
+    tests = [
+        mcnemar(zip(*(column.tolist() for column in each.columns()), strict=True))
+        for each in matches
+    ]
     corrected = holm([test.p_value for test in tests])
     found = []
     for each, test, p in zip(matches, tests, corrected, strict=True):
-        times = [group.successes("flight_time_s", COUNTED) for group in (each.first, each.second)]
-        golden = each.golden.successes("flight_time_s", COUNTED)
+        golden, first, second = (
+            group.successes("flight_time_s", COUNTED).tolist()
+            for group in (each.golden, each.first, each.second)
+        )
         found.append(
             Comparison(
                 first=each.first.labels,
                 second=each.second.labels,
                 success=test,
                 corrected_p=p,
-                differences={name: _difference(each.pairs, name, confidence) for name in METRICS},
-                worst=worst_case(golden, *times) if protected else worst_case(golden, times[1]),
+                differences={name: _difference(each, name, confidence) for name in METRICS},
+                worst=worst_case(golden, first, second)
+                if protected
+                else worst_case(golden, second),
             )
         )
     return found
 
 
-def _difference(pairs: Pairs, name: str, confidence: float) -> Interval:
-    differences = [
-        float(value(b, name)) - float(value(a, name))
-        for a, b in pairs
-        if succeeded(a) and succeeded(b) and None not in (value(a, name), value(b, name))
-    ]
-    return interval(differences, confidence=confidence, resamples=RESAMPLES)
+def _difference(match: _Match, name: str, confidence: float) -> Interval:
+    a, b = match.columns(name)
+    won_a, won_b = match.columns()
+    differences = (b - a)[won_a & won_b]
+    known = differences[~np.isnan(differences)]
+    return interval(known, confidence=confidence, resamples=RESAMPLES)

@@ -74,8 +74,8 @@ def _column(values: list[Any]) -> pa.Array:
 def _row_names(labels: list[str]) -> list[str]:
     return [
         "number", "pair", *(f"label_{name}" for name in labels), *_CONFIG, "level",
-        *(f"fault_{name}" for name in _FAULT), "state", "outcome", "reason", "injected", *_QUALITY,
-        *_PILOT, "simulated_s", "wall_s", "attempts", "path", "changes",
+        *(f"fault_{name}" for name in _FAULT), "detector", "protect", "state", "outcome",
+        "reason", "injected", *_QUALITY, *_PILOT, "simulated_s", "wall_s", "attempts", "path", "changes",
     ]  # fmt: skip
 
 
@@ -84,7 +84,7 @@ def _row(result: MissionResult, labels: list[str]) -> dict[str, Any]:
 
     config, record = result.mission.config, result.result
     asked = config.fault or config.instruction
-    level = None
+    level, detector = None, config.detector
     if asked is not None:
         level = "source" if config.fault is not None else "instruction"
     quality: Mapping[str, Any] = record.get("quality_of_flight") or {}
@@ -96,6 +96,8 @@ def _row(result: MissionResult, labels: list[str]) -> dict[str, Any]:
         **{name: getattr(config, name) for name in _CONFIG},
         "level": level,
         **{f"fault_{name}": None if asked is None else getattr(asked, name) for name in _FAULT},
+        "detector": None if detector is None else detector.name,
+        "protect": None if detector is None else "+".join(detector.protect),
         "state": result.state.value,
         "outcome": result.outcome,
         "reason": result.reason,

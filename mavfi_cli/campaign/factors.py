@@ -12,8 +12,9 @@ from enum import Enum
 from typing import Any
 
 from mavfi_cli.core.config import structure
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, FaultSpecError
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 
@@ -28,8 +29,12 @@ class Level(Enum):
 _RECORDS = {Level.SOURCE: FaultConfig, Level.INSTRUCTION: InstructionConfig}
 # What a specification may call a field of the mission, and of either level's fault, otherwise.
 _ALIASES = {"stage": "target", "site": "target"}
-_NEVER = {"fault", "instruction", "link", "realtime"}  # campaigns fly the simulated vehicle
-_MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NEVER)
+_NESTED = {"fault", "instruction", "detector"}  # written flat: see below
+_NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
+_MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NESTED | _NEVER)
+_DETECTOR = {"detector": "name"} | {
+    each.name: each.name for each in fields(DetectorConfig) if each.name != "name"
+}
 _FAULT = {
     level: tuple(each.name for each in fields(record) if each.name != "seed")
     for level, record in _RECORDS.items()
@@ -38,7 +43,7 @@ _FAULT = {
 
 def _names() -> tuple[str, ...]:
     fault = dict.fromkeys((*_ALIASES, "level", *_FAULT[Level.SOURCE], *_FAULT[Level.INSTRUCTION]))
-    return (*_MISSION, *(name for name in fault if name != "target"))
+    return (*_MISSION, *_DETECTOR, *(name for name in fault if name != "target"))
 
 
 NAMES = _names()
@@ -62,10 +67,17 @@ class Point:
         if fault:
             level, values = fault
             mission["fault" if level is Level.SOURCE else "instruction"] = values
+        detector = {_DETECTOR[name]: value for name, value in self.values.items()
+                    if name in _DETECTOR}  # fmt: skip
+        if detector and "name" not in detector:
+            raise ConfigError(f"{', '.join(sorted(detector))}: without a detector")
+        if detector:
+            mission["detector"] = detector
         return structure(mission, MissionConfig)
 
     def _fault(self, seed: int) -> tuple[Level, dict[str, Any]] | None:
-        asked = {name: value for name, value in self.values.items() if name not in _MISSION}
+        elsewhere = {*_MISSION, *_DETECTOR}
+        asked = {name: value for name, value in self.values.items() if name not in elsewhere}
         level_name = asked.pop("level", Level.SOURCE.value)
         targets = [name for name in _ALIASES if name in asked]
         if not targets:
@@ -103,13 +115,19 @@ def check_names(config: MissionConfig, simulator: Callable[[MissionConfig], None
             that make no fault, a start that is blocked.
     """
     from mavfi_cli.autonomy import planners
+    from mavfi_cli.detect.registry import find
     from mavfi_cli.mission.platform import load_platform
 
     planners.find(config.planner)
     load_platform(config.platform)
     if config.fault is not None:
-        config.fault.draw()
+        config.fault.check()
     if config.instruction is not None:
         config.instruction.strategy()
         config.instruction.node()
+    if config.detector is not None:
+        detector = config.detector
+        find(detector.name, model=detector.model_path, threshold=detector.threshold)
+    elif config.fault is not None and config.fault.attacks_detector:
+        raise FaultSpecError("a fault in the detector needs one")
     simulator(config)

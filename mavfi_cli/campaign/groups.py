@@ -3,68 +3,95 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mavfi_cli.campaign.ledger import COLUMNS, Ledger
 from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import Injected, State
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.types import FloatArray
 
-Row = tuple[Any, ...]  # number, cell, pair and the ledger's COLUMNS
+BoolArray = NDArray[np.bool_]
+
 INACTIVE = frozenset(each.value for each in Injected) - COUNTED
-_PLACE = {name: 3 + index for index, name in enumerate(COLUMNS)}
+_PAIR = 2  # place of the pair in a row of the ledger's table; its COLUMNS follow
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # no slots: what is asked of all rows is computed once
 class Group:
     """Missions that are counted together.
 
     Attributes:
         labels: what they have in common.
         planned, errors: on the list; of them such that could not begin.
-        rows: the flown ones, in the order of the list.
+        rows: of the ledger's table, the flown ones, in the order of the list.
     """
 
     labels: Mapping[str, Any]
     planned: int
     errors: int
-    rows: list[Row] = field(default_factory=list)
+    rows: list[tuple[Any, ...]] = field(default_factory=list)
 
-    def of(self, fates: frozenset[str]) -> Iterator[Row]:
-        """The missions whose fault had one of these fates."""
-        return (row for row in self.rows if value(row, "injected") in fates)
+    def column(self, name: str) -> list[Any]:
+        """One of the ledger's COLUMNS, (n,)."""
+        place = _PAIR + 1 + COLUMNS.index(name)
+        return [row[place] for row in self.rows]
 
-    def successes(self, name: str, fates: frozenset[str]) -> list[float]:
-        """A column of the successful ones among them."""
-        found = (value(row, name) for row in self.of(fates) if succeeded(row))
-        return [float(each) for each in found if each is not None]
+    def numbers(self, name: str) -> FloatArray:
+        """A column of numbers, (n,); not a number where a mission has none."""
+        if name not in self._numbers:
+            self._numbers[name] = np.array(self.column(name), dtype=np.float64)
+        return self._numbers[name]
+
+    @cached_property
+    def _numbers(self) -> dict[str, FloatArray]:
+        return {}
+
+    @cached_property
+    def succeeded(self) -> BoolArray:
+        """Whether each mission reached its goal, (n,)."""
+        return np.array([outcome == "success" for outcome in self.column("outcome")], dtype=bool)
+
+    def of(self, fates: frozenset[str]) -> BoolArray:
+        """Whether the fault of each mission had one of these fates, (n,)."""
+        if fates not in self._masks:
+            self._masks[fates] = np.array(
+                [fate in fates for fate in self.column("injected")], dtype=bool
+            )
+        return self._masks[fates]
+
+    @cached_property
+    def _masks(self) -> dict[frozenset[str], BoolArray]:
+        return {}
+
+    def successes(self, name: str, fates: frozenset[str]) -> FloatArray:
+        """A column of the successful ones among them that have the number."""
+        found = self.numbers(name)[self.succeeded & self.of(fates)]
+        return found[~np.isnan(found)]
 
     def counts(self, column: str) -> dict[str, int]:
         """How often each value of a column comes."""
-        return dict(sorted(Counter(str(value(row, column)) for row in self.rows).items()))
+        return dict(sorted(Counter(map(str, self.column(column))).items()))
 
-    @property
+    @cached_property
     def golden(self) -> bool:
         """Whether no fault was asked for."""
-        return all(value(row, "injected") == Injected.GOLDEN.value for row in self.rows)
+        return bool(self.of(frozenset((Injected.GOLDEN.value,))).all())
 
-
-def value(row: Row, column: str) -> Any:
-    """One of the ledger's COLUMNS."""
-    return row[_PLACE[column]]
-
-
-def pair_of_row(row: Row) -> str:
-    """What its golden, faulty and protected flights share."""
-    return str(row[2])
-
-
-def succeeded(row: Row) -> bool:
-    """Whether the mission reached its goal."""
-    return bool(value(row, "outcome") == "success")
+    @cached_property
+    def pairs(self) -> dict[str, list[int]]:
+        """The rows that are counted, by what golden, faulty and protected flights share."""
+        found: dict[str, list[int]] = {}
+        for place in np.flatnonzero(self.of(COUNTED)).tolist():
+            found.setdefault(self.rows[place][_PAIR], []).append(place)
+        return found
 
 
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:

@@ -40,8 +40,8 @@ def _plain(config: MissionConfig) -> dict[str, Any]:
 
 
 _BASE = _plain(MissionConfig())
-# What a golden flight has not: faults, and later what protects it from them.
-_TREATMENT = ("fault", "instruction", "isolate", "detector", "protect")
+# What a golden flight has not: faults, and what protects it from them.
+_TREATMENT = ("fault", "instruction", "detector", "isolate")
 
 
 def canonical(value: Any) -> str:
@@ -65,8 +65,9 @@ def config_from(changes: Mapping[str, Any]) -> MissionConfig:
 
 def golden_of(config: MissionConfig) -> MissionConfig:
     """The same mission without fault and without protection."""
-    known = {each.name: each.default for each in fields(MissionConfig)}
-    bare: dict[str, Any] = {name: known[name] for name in _TREATMENT if name in known}
+    bare: dict[str, Any] = {
+        each.name: each.default for each in fields(MissionConfig) if each.name in _TREATMENT
+    }
     return replace(config, **bare)
 
 

@@ -81,6 +81,5 @@ def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
         return Injected.NOT_INJECTED
     if fault["state"] == "null":
         return Injected.NULL
-    told = fault.get("activation")  # a table at instruction level, a word at source level
-    word = told["activation"] if isinstance(told, Mapping) else told
-    return _BY_ACTIVATION.get(word or "read", Injected.ACTIVE)
+    activation = fault.get("activation") or {"activation": "read"}  # cut off: it may have been
+    return _BY_ACTIVATION.get(activation["activation"], Injected.ACTIVE)

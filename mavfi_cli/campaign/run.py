@@ -18,7 +18,8 @@ from mavfi_cli.campaign.ledger import RUNS, Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
 from mavfi_cli.campaign.outcome import State, injected_of
 from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.slots import TASK, Ended, Slots
+from mavfi_cli.campaign.seats import Ended, Seats
+from mavfi_cli.campaign.slots import TASK, Slots
 from mavfi_cli.campaign.spec import Stop
 from mavfi_cli.campaign.stopping import Entry, Gate, Queue
 from mavfi_cli.campaign.verdict import CampaignStopped, Verdict, judge
@@ -42,6 +43,7 @@ class Options:
         limit_s: wall time of one mission; one that takes longer hangs.
         task: module that does the work.
         errors: fly those again that could not begin.
+        cluster: address of a scheduler of dask.distributed, instead of slots on this machine.
     """
 
     jobs: int = 0  # as many as there are cores
@@ -49,6 +51,7 @@ class Options:
     limit_s: float = LIMIT_S
     task: str = TASK
     errors: bool = False
+    cluster: str | None = None
 
 
 def run_campaign(
@@ -196,8 +199,7 @@ class _Run:
 
     def fly(self, asked: Sequence[int]) -> None:
         """Until nothing is missing, or somebody asks to stop."""
-        jobs = self._options.jobs or len(os.sched_getaffinity(0))
-        with Slots(jobs, self._options.task) as slots:
+        with self._seats() as slots:
             while len(asked) < 2:
                 self._fill(slots, asked)
                 if not self._flying:
@@ -216,7 +218,15 @@ class _Run:
                 f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
             )
 
-    def _fill(self, slots: Slots, asked: Sequence[int]) -> None:
+    def _seats(self) -> Seats:
+        options = self._options
+        if options.cluster is None:
+            return Slots(options.jobs or len(os.sched_getaffinity(0)), options.task)
+        from mavfi_cli.campaign.cluster import Cluster
+
+        return Cluster(options.cluster, options.keep, options.task)
+
+    def _fill(self, slots: Seats, asked: Sequence[int]) -> None:
         """Start as many missions as there are free slots."""
         while slots.free and not asked and (entry := self._next()) is not None:
             self._start(slots, entry)
@@ -224,7 +234,7 @@ class _Run:
     def _next(self) -> Entry | None:
         return self._again.pop() if self._again else self._queue.next()
 
-    def _start(self, slots: Slots, entry: Entry) -> None:
+    def _start(self, slots: Seats, entry: Entry) -> None:
         number, _, changes = entry
         self._attempts[number] += 1
         out = self._out(number)

@@ -10,10 +10,9 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
+from mavfi_cli.campaign.seats import Ended, Seats
 from mavfi_cli.campaign.slot import PACKET
 from mavfi_cli.campaign.template import READY
 from mavfi_cli.core.errors import MavfiError
@@ -27,27 +26,7 @@ class SlotsFailed(MavfiError):
     """The processes that fly the missions could not start."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ended:
-    """How one attempt at a mission ended.
-
-    Attributes:
-        exit: code with which the mission's process ended; None where it was killed.
-        signal: that killed it; None where its slot was killed too, or the time ran out.
-        timeout: the limit of wall time passed.
-        report: the mission's own last words: folder, or error and text, or traceback.
-        wall_s: of the whole attempt, the slot's own work included.
-    """
-
-    number: int
-    exit: int | None = None
-    signal: int | None = None
-    timeout: bool = False
-    report: Mapping[str, Any] | None = None
-    wall_s: float = 0.0
-
-
-class Slots:
+class Slots(Seats):
     """Keeps up to `jobs` missions flying.
 
     Attributes:
@@ -63,17 +42,6 @@ class Slots:
         self._template: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self.running: dict[int, int] = {}
-
-    def __enter__(self) -> Slots:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     @property
     def free(self) -> int:

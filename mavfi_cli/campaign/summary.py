@@ -14,7 +14,7 @@ from mavfi_cli.campaign.comparison import (
     against_golden,
     protection,
 )
-from mavfi_cli.campaign.groups import INACTIVE, Group, groups, succeeded
+from mavfi_cli.campaign.groups import INACTIVE, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate
@@ -89,8 +89,8 @@ def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) 
 
 def _cell(group: Group, confidence: float) -> Cell:
     def success(fates: frozenset[str]) -> Share:
-        chosen = [succeeded(row) for row in group.of(fates)]
-        return rate(sum(chosen), len(chosen), confidence)
+        chosen = group.succeeded[group.of(fates)]
+        return rate(int(chosen.sum()), len(chosen), confidence)
 
     def metric(name: str) -> Interval:
         values = group.successes(name, COUNTED)

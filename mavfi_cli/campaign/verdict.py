@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.outcome import State
+from mavfi_cli.campaign.seats import Ended
 from mavfi_cli.campaign.slot import ERRORS, SCRATCH
-from mavfi_cli.campaign.slots import Ended
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.run_folder import RunFolder
@@ -72,7 +72,7 @@ def judge(ended: Ended, out: Path, config: Mapping[str, Any], limit_s: float) ->
         reason = f"no end within {limit_s:g} s of wall time"
         return _cut_off(Outcome.HANG, reason, out, config)
     if ended.signal is None and ended.exit is None:
-        return Verdict(state=None, result={}, reason="its slot was killed")
+        return Verdict(state=None, result={}, reason=ended.lost)
     if ended.signal is not None:
         name = signal.Signals(ended.signal).name
         if ended.signal in _FROM_OUTSIDE:

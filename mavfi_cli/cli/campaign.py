@@ -31,6 +31,8 @@ def campaign() -> None:
 @click.option("--scale", type=float, help="So much of the repetitions: 0.1 runs a tenth.")
 @click.option("--jobs", type=click.IntRange(min=1),
               help="Missions at the same time  [one a core].")  # fmt: skip
+@click.option("--cluster", metavar="URL",
+              help="Fly on a scheduler of dask.distributed, as tcp://host:8786.")  # fmt: skip
 @click.option("--keep", type=click.Choice(_KEEP),
               help="Run folders that are kept  [as the campaign says].")  # fmt: skip
 @click.option("--limit", "limit_s", type=click.FloatRange(min=0.0, min_open=True), default=900.0,
@@ -65,6 +67,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
             keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
             limit_s=options["limit_s"],
             errors=options["retry_errors"],
+            cluster=options["cluster"],
         )
         fly_missing(ledger, flying, view, spec.stop)
         _show(ledger, as_json=as_json)

@@ -125,6 +125,7 @@ def refused(mavfi, tmp_path):
         ('field = "mantissa"', 'field = "mantisa"', "did you mean 'mantissa'?"),
         ('world = "farm"', 'planner = "rtt"', "unknown planner 'rtt': did you mean 'rrt'?"),
         ('world = "farm"', 'vehicle = "sola"', "unknown vehicle 'sola': did you mean 'solo'?"),
+        ('world = "farm"', 'detector = "gda"', "unknown detector 'gda': did you mean 'gad'?"),
         ('world = "farm"', 'platform = "x68"', "unknown platform 'x68': did you mean 'x86'?"),
     ],
 )

@@ -9,12 +9,14 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
 FAULT = FaultConfig(target="waypoint_position", at="time=1", together=True, field="mantissa")
+DETECTOR = DetectorConfig(name="gad", protect=("planning", "control"))
 INSTRUCTION = InstructionConfig(target="control", seed=4)
 
 
@@ -31,6 +33,7 @@ def flown(short_config, tmp_path_factory):
         replace(short_config, fault=FAULT),
         replace(short_config, instruction=INSTRUCTION),
         replace(short_config, seed=6),
+        replace(short_config, fault=FAULT, detector=DETECTOR),
     ]
     folder = tmp_path_factory.mktemp("flown") / "campaign"
     missions = [PlannedMission(config=config) for config in configs]
@@ -40,7 +43,13 @@ def flown(short_config, tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("number", "changes"),
-    [(0, {}), (1, {"fault": FAULT}), (2, {"instruction": INSTRUCTION}), (3, {"seed": 6})],
+    [
+        (0, {}),
+        (1, {"fault": FAULT}),
+        (2, {"instruction": INSTRUCTION}),
+        (3, {"seed": 6}),
+        (4, {"fault": FAULT, "detector": DETECTOR}),
+    ],
 )
 def test_records_are_identical_to_those_of_a_mission_by_itself(flown, fly_short, number, changes):
     kept = RunFolder(flown[number].path)
@@ -49,8 +58,8 @@ def test_records_are_identical_to_those_of_a_mission_by_itself(flown, fly_short,
 
 
 def test_a_pair_shares_everything_but_its_treatment(flown):
-    golden, source, instruction, other = (result.mission.pair for result in flown)
-    assert golden == source == instruction != other
+    golden, source, instruction, other, protected = (result.mission.pair for result in flown)
+    assert golden == source == instruction == protected != other
 
 
 def test_what_became_of_the_faults(flown):

@@ -1,7 +1,6 @@
 """Specifications: what they expand to, and what they refuse."""
 
 from collections import Counter
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -10,9 +9,6 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.spec import Stop, load_spec, parse_spec, presets
 from mavfi_cli.campaign.spec_text import to_toml
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey, UnknownName
-from mavfi_cli.mission.config import MissionConfig
-
-DETECTION = "detector" in {each.name for each in fields(MissionConfig)}
 
 
 def spec_of(text):
@@ -85,6 +81,29 @@ def test_a_specification_comes_back_as_it_was(text):
     assert spec_of(to_toml(spec)) == spec
 
 
+def test_detectors_and_what_they_protect():
+    text = """
+    [[setting]]
+    name = "golden"
+    [[setting]]
+    stage = "control"
+    [[setting]]
+    stage = "control"
+    detector = ["gad", "aad"]
+    protect = [["control"], ["planning", "control"]]
+    """
+    golden, faulty, *protected = spec_of(text).missions()
+    found = [(m.config.detector.name, m.config.detector.protect) for m in protected]
+    assert found == [
+        ("gad", ("control",)), ("gad", ("planning", "control")),
+        ("aad", ("control",)), ("aad", ("planning", "control")),
+    ]  # fmt: skip
+    assert golden.config.detector is None
+    assert protected[1].labels["protect"] == "planning+control"
+    assert {m.pair for m in protected} == {faulty.pair} == {golden.pair}
+    assert {m.config.fault for m in protected} == {faulty.config.fault}
+
+
 def test_scale_leaves_at_least_one_of_each():
     spec = spec_of(CROSSED)
     assert len(spec.scaled(2.0).missions()) == 2 * len(spec.missions())
@@ -149,6 +168,8 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
         ("stage = 'control'\nlevel = 'instruction'\nat = 'random'", r"at: no factor of faults at"),
         ("stage = 'control'\nbits = ['one']", r"bits: expected int"),
         ("v_max_mps = [99.0]", r"v_max_mps: must be within"),
+        ("threshold = 2.0", r"threshold: without a detector"),
+        ("detector = 'gad'\nprotect = ['contrl']", r"did you mean 'control'"),
     ],
 )
 def test_a_combination_that_makes_no_mission_is_refused(text, problem):
@@ -158,10 +179,6 @@ def test_a_combination_that_makes_no_mission_is_refused(text, problem):
 
 @pytest.mark.parametrize("name", presets())
 def test_every_preset_expands_to_the_papers_numbers(name):
-    if not DETECTION and name in ("table4", "fig13", "fig14", "fig16"):
-        with pytest.raises(UnknownKey, match="detector"):
-            load_spec(name)
-        return
     missions = load_spec(name).missions()
     cells = Counter(tuple(sorted(m.labels.items())) for m in missions)
     assert set(cells.values()) == {20 if name == "fig13" else 100}

@@ -91,7 +91,7 @@ def _levels(
     counted = int(np.count_nonzero(drawn < value)) + int(np.count_nonzero(drawn <= value))
     least = 1.0 / (len(drawn) + 1)  # the quantile of nothing, or of everything, is infinite
     bias = normal.inv_cdf(min(max(counted / (2 * len(drawn)), least), 1.0 - least))
-    left_out = np.array([float(statistic(np.delete(sample, i))) for i in range(len(sample))])
+    left_out = _left_out(sample, statistic)
     centred = left_out.mean() - left_out
     scale = float((centred**2).sum()) ** 1.5
     acceleration = float((centred**3).sum()) / (6.0 * scale) if scale > 0.0 else 0.0
@@ -100,3 +100,10 @@ def _levels(
         shifted = bias + z
         levels.append(normal.cdf(bias + shifted / (1.0 - acceleration * shifted)))
     return levels
+
+
+def _left_out(sample: FloatArray, statistic: Statistic) -> FloatArray:
+    """The statistic without each of the values in turn."""
+    if statistic is mean:
+        return np.asarray((sample.sum() - sample) / (len(sample) - 1))
+    return np.array([float(statistic(np.delete(sample, i))) for i in range(len(sample))])

@@ -55,8 +55,11 @@ def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> McNemar:
 
 def _coins(few: int, total: int) -> float:
     """Two-sided probability of at most `few` heads or tails among fair coins."""
-    tail = sum(math.comb(total, k) for k in range(few + 1))
-    half: int = 1 << (total - 1) if total else 1  # 2 tail / 2^total, whole before the division
+    ways = tail = 1  # of no heads; whole numbers, exact up to the one division
+    for heads in range(1, few + 1):
+        ways = ways * (total - heads + 1) // heads
+        tail += ways
+    half: int = 1 << (total - 1) if total else 1
     return min(1.0, tail / half)
 
 

@@ -1,0 +1,139 @@
+"""A campaign on dask.distributed: the same runner, whose slots are the threads of the workers."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import time
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.remote import Answer, Order, fly, unpack, worker_versions
+from mavfi_cli.campaign.seats import Ended, Seats
+from mavfi_cli.campaign.slots import TASK
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.mission.replay import version_differences
+from mavfi_cli.mission.run import installed_versions
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+CONNECT_S, WORKERS_S = 15.0, 60.0
+_BACKLOG = 2  # missions a thread of a worker has before it, so that it never waits for us
+_LOOK_S = 2.0  # how often the number of threads is asked for
+
+
+class ClusterError(MavfiError):
+    """A cluster that cannot be used."""
+
+
+class Cluster(Seats):
+    """The workers of one scheduler.
+
+    Args:
+        address: of the scheduler, as tcp://host:8786.
+        keep: policy of the campaign; other run folders travel without their traces.
+        task: module that does the work.
+
+    Raises:
+        ClusterError: dask is not installed, the scheduler is not there, no worker comes, or one of
+            them has another version of something that results depend on.
+    """
+
+    def __init__(self, address: str, keep: Keep, task: str = TASK) -> None:
+        self._keep, self._task = keep, task
+        self._versions = installed_versions()
+        self._token = uuid.uuid4().hex[:8]  # of this run: no other run's results are taken for ours
+        self._submitted = 0
+        self._futures: dict[int, tuple[Future, Path]] = {}
+        self._done: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._threads, self._looked_s = 0, 0.0
+        self._client = _connect(address)
+        try:
+            _require_workers(self._client, address, self._versions)
+        except BaseException:
+            self._client.close()
+            raise
+
+    @property
+    def free(self) -> int:
+        """How many missions may be handed out now."""
+        if time.monotonic() - self._looked_s > _LOOK_S:
+            self._threads = sum(self._client.nthreads().values())
+            self._looked_s = time.monotonic()
+        return _BACKLOG * self._threads - len(self._futures)
+
+    def start(self, number: int, changes: Mapping[str, Any], out: str, limit_s: float) -> None:
+        """Hand a mission out."""
+        order = Order(
+            number=number,
+            changes=changes,
+            limit_s=limit_s,
+            keep=self._keep.value,
+            task=self._task,
+            versions=self._versions,
+        )
+        self._submitted += 1
+        future = self._client.submit(
+            fly, order, key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0
+        )
+        self._futures[number] = (future, Path(out))
+        future.add_done_callback(lambda _future: self._done.put(number))
+
+    def wait(self, timeout_s: float) -> list[Ended]:
+        """The missions that came back."""
+        numbers = []
+        with contextlib.suppress(queue.Empty):
+            numbers.append(self._done.get(timeout=timeout_s))
+            while True:
+                numbers.append(self._done.get_nowait())
+        return [self._taken(number) for number in numbers]
+
+    def _taken(self, number: int) -> Ended:
+        future, out = self._futures.pop(number)
+        if future.status != "finished":
+            return Ended(number=number, lost=f"lost by the cluster: {future.exception()}")
+        answer: Answer = future.result()
+        if answer.ended is None:
+            raise ClusterError(f"a worker has other versions: {answer.refused}")
+        unpack(answer.files, out)
+        return Ended(**answer.ended)
+
+    def close(self) -> None:
+        """Take back what was not begun; what flies on a worker ends there, and nobody hears it."""
+        with contextlib.suppress(OSError, TimeoutError):  # the cluster may be gone
+            self._client.cancel([future for future, _ in self._futures.values()])
+        self._futures.clear()
+        self._client.close()
+
+
+def _connect(address: str) -> Client:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ClusterError(
+            "--cluster needs dask.distributed: pip install 'mavfi[cluster]'"
+        ) from None
+    try:
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        first = str(error).partition("\n")[0]
+        raise ClusterError(f"no scheduler at {address}: {first}") from None
+
+
+def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> None:
+    """Have at least one worker, and none with other versions than ours."""
+    try:
+        client.wait_for_workers(1, timeout=WORKERS_S)
+    except TimeoutError:
+        raise ClusterError(f"{address}: no worker within {WORKERS_S:g} s") from None
+    told = client.run(worker_versions, on_error="return")
+    for worker, versions in sorted(told.items()):
+        if not isinstance(versions, dict):
+            raise ClusterError(f"worker {worker} cannot fly missions: {versions!r}")
+        differing = version_differences(ours, versions)
+        if differing:
+            raise ClusterError(f"worker {worker} has other versions: {'; '.join(differing)}")

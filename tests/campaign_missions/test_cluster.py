@@ -1,0 +1,179 @@
+"""A real scheduler and two worker processes on loopback: the results of the local run."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import planned
+from killing import results_of
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.core.errors import ConfigError, RecordError
+
+pytest.importorskip("distributed", reason="the extra cluster is not installed")
+START_S = 90.0
+RUNNER = """
+import sys
+from pathlib import Path
+from conftest import planned
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.run import Options, run_campaign
+
+folder, address, *worlds = sys.argv[1:]
+options = Options(keep=Keep.ALL, task="fake_task", cluster=address)
+run_campaign(planned(*worlds), Path(folder), options).close()
+"""
+# A worker of another build: what it says of its versions is changed before it serves.
+OTHER_BUILD = """
+import sys
+import mavfi_cli.mission.run as run
+run.__dict__["__version__"] = "0.0.1"
+from distributed.cli.dask_worker import main
+sys.argv = ["dask-worker", *sys.argv[1:]]
+main()
+"""
+
+
+class LocalCluster:
+    """A scheduler and workers in processes of their own."""
+
+    def __init__(self, folder):
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        self.address = f"tcp://127.0.0.1:{port}"
+        self._folder = folder
+        self._processes = []
+        self._start(
+            ["-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port),
+             "--no-dashboard", "--no-jupyter"]
+        )  # fmt: skip
+        deadline = time.monotonic() + START_S
+        while True:
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
+                break
+            assert time.monotonic() < deadline, "the scheduler did not start"
+            time.sleep(0.1)
+
+    def worker(self, program=("-m", "distributed.cli.dask_worker")):
+        """One more worker: one process, one thread, nobody to start it again."""
+        return self._start(
+            [*program, self.address, "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny",
+             "--no-dashboard", "--local-directory", str(self._folder)]
+        )  # fmt: skip
+
+    def _start(self, arguments):
+        log = (self._folder / f"{len(self._processes)}.log").open("wb")
+        with log:
+            process = subprocess.Popen(
+                [sys.executable, *arguments], stdout=log, stderr=log, cwd=self._folder
+            )
+        self._processes.append(process)
+        return process
+
+    def close(self):
+        for process in reversed(self._processes):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    (tmp_path / "cluster").mkdir()
+    started = LocalCluster(tmp_path / "cluster")
+    yield started
+    started.close()
+
+
+def start(folder, cluster, *worlds):
+    """The runner in a process of its own: dask is not for a process that forks."""
+    line = [sys.executable, "-c", RUNNER, str(folder), cluster.address, *worlds]
+    return subprocess.Popen(line, stderr=subprocess.PIPE, text=True)
+
+
+def run_folders(folder):
+    with Ledger(folder) as ledger:
+        paths = [result.path for result in ledger.results() if result.path is not None]
+    return {path.name: {file.name: file.read_bytes() for file in path.iterdir()} for path in paths}
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_has_the_results_of_the_local_run(
+    campaign, cluster, tmp_path
+):
+    worlds = [*["sleep:0.5"] * 16, "end:collision", "exit:3", f"signal:{int(signal.SIGSEGV)}"]
+    campaign.run(planned(*worlds), keep=Keep.ALL).close()
+    workers = [cluster.worker(), cluster.worker()]
+    remote = tmp_path / "remote"
+    runner = start(remote, cluster, *worlds)
+    deadline = time.monotonic() + START_S
+    while not remote.is_dir() or not _over(remote):
+        assert runner.poll() is None, runner.stderr.read()
+        assert time.monotonic() < deadline, "nothing comes back from the cluster"
+        time.sleep(0.1)
+    assert _over(remote) < len(worlds)
+    os.kill(workers[0].pid, signal.SIGKILL)
+    _, err = runner.communicate(timeout=START_S)
+    assert runner.returncode == 0, err
+    assert results_of(remote) == results_of(campaign.folder)
+    assert [number for number, *_ in results_of(remote)] == list(range(len(worlds)))
+    local, far = run_folders(campaign.folder), run_folders(remote)
+    for folder in (local, far):
+        for files in folder.values():
+            files.pop("stderr.txt", None)  # addresses in the traceback of a segmentation fault
+    assert far == local
+
+
+def _over(folder):
+    with contextlib.suppress(RecordError, ConfigError), Ledger(folder) as ledger:
+        return ledger.over()
+    return 0
+
+
+@pytest.mark.slow
+def test_a_worker_of_another_version_is_named_and_refused(cluster, tmp_path):
+    cluster.worker(("-c", OTHER_BUILD))
+    runner = start(tmp_path / "remote", cluster, "fly")
+    _, err = runner.communicate(timeout=START_S)
+    assert runner.returncode == 1
+    last = err.strip().splitlines()[-1]
+    assert "worker tcp://127.0.0.1:" in last
+    assert "has other versions: mavfi was 0.1.0, is 0.0.1" in last
+
+
+def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port):
+    spec = tmp_path / "one.toml"
+    spec.write_text("[factors]\nworld = 'farm'\n")
+    address = f"tcp://127.0.0.1:{free_port}"
+    run = mavfi("campaign", "run", spec, "--cluster", address, "--quiet", cwd=tmp_path)
+    assert (run.returncode, run.stdout) == (1, "")
+    (line,) = run.stderr.splitlines()
+    assert line.startswith(f"error: no scheduler at {address}: ")
+
+
+@pytest.mark.slow
+def test_real_flights_are_the_same_on_a_cluster(cluster, mavfi, tmp_path):
+    spec = tmp_path / "short.toml"
+    spec.write_text(
+        "[mission]\nstart = [2.0, 2.0, 0.0]\ngoal = [10.0, 6.0, 5.0]\n"
+        "[factors]\nworld = 'farm'\n[[setting]]\n[[setting]]\nstage = 'control'\n"
+    )
+    cluster.worker()
+    for out, options in (("local", ()), ("far", ("--cluster", cluster.address))):
+        run = mavfi("campaign", "run", spec, "--out", tmp_path / out, "--keep", "all", *options)
+        assert run.returncode == 0, run.stderr
+    assert results_of(tmp_path / "far") == results_of(tmp_path / "local")
+    local, far = (run_folders(Path(tmp_path / out)) for out in ("local", "far"))
+    for folder in (local, far):
+        for files in folder.values():
+            result = json.loads(files["result.json"])
+            files["result.json"] = {k: v for k, v in result.items() if k != "host"}
+    assert far == local
