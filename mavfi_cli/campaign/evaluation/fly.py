@@ -21,8 +21,8 @@ from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaign.outcome import MissionResult, State
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, fly_missing, store_plan
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
+from mavfi_cli.core.errors import ConfigError, RecordError
 
 BARE, PROTECTED = "bare", "protected"
 
@@ -50,7 +50,18 @@ def fly(plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectat
     with Ledger(folder / PROTECTED, writing=True) as ledger:
         _require_models(plan, ledger)
         store_plan(ledger, plan.protected(harmful), append=True)
+        _share_profiles(folder)
         fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
+
+
+def _share_profiles(folder: Path) -> None:
+    """Have both campaigns draw instructions from the same profiles: those of the bare flights."""
+    profiles = folder / PROTECTED / PROFILES
+    if not profiles.exists():
+        try:
+            profiles.symlink_to(Path("..") / BARE / PROFILES)
+        except OSError as error:
+            raise RecordError(f"{profiles}: {error.strerror or error}") from None
 
 
 def _require_models(plan: EvaluationPlan, ledger: Ledger) -> None:
