@@ -66,7 +66,7 @@ CASES = [
 def found():
     bare = [pair(faulty, seed=seed) for seed, (faulty, _) in enumerate(CASES)]
     pairs = [pair(*case, seed=seed) for seed, case in enumerate(CASES)]
-    return fault_metrics(bare, pairs, [100.0, 100.0])
+    return fault_metrics(bare, pairs)
 
 
 def test_faults_without_effect_are_counted_apart(found):
@@ -100,10 +100,12 @@ def test_worst_case_and_its_recovery(found):
     assert (found.worst.faulty, found.worst.protected) == pytest.approx((0.5, 0.2))
     assert found.worst.recovered.value == pytest.approx(0.3)
     assert found.worst.recovered_share == pytest.approx(0.6)
-    paper = found.worst_paper
-    assert (paper.increase, paper.recovered, paper.recovered_share) == pytest.approx(
-        (0.5, 0.3, 0.6)
-    )
+
+
+def test_a_worst_flight_that_is_no_harm_needs_no_recovery():
+    worst = fault_metrics([pair(HARMLESS)], [pair(HARMLESS, struck(time_s=90.0))]).worst
+    assert (worst.faulty, worst.protected) == pytest.approx((0.01, -0.1))
+    assert math.isnan(worst.recovered_share)
 
 
 def test_harmless_faults_of_incomplete_missions_count_by_their_number_only():
@@ -114,7 +116,7 @@ def test_harmless_faults_of_incomplete_missions_count_by_their_number_only():
         pair(HARMLESS, struck("collision", 50.0), seed=1),
         pair(LOST, struck(alarms_s=(20.0,)), seed=4, complete=False),
     ]
-    found = fault_metrics(bare, flown_too, [100.0])
+    found = fault_metrics(bare, flown_too)
     assert (found.active, found.flown) == (5, 3)
     assert found.harmful.total == 5
     assert (found.detected_active.count, found.detected_active.total) == (0, 2)
@@ -124,7 +126,7 @@ def test_harmless_faults_of_incomplete_missions_count_by_their_number_only():
 
 
 def test_without_any_fault_nothing_is_known():
-    nothing = fault_metrics([], [], [])
+    nothing = fault_metrics([], [])
     assert math.isnan(nothing.harmful.share)
     assert math.isnan(nothing.latency_s.value)
     assert math.isnan(nothing.worst.recovered_share)

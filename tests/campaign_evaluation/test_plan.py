@@ -83,7 +83,7 @@ def test_more_flights_keep_the_missions_that_there_were():
 def test_detectors_fly_harmful_faults_and_the_first_missions_whole():
     last = PLAN.seeds[1]
     harmful = ("farm", last, PLAN.places()[0])
-    missions = PLAN.protected([harmful])
+    missions = PLAN.protected("gad", [harmful])
     kinds = Counter((m.labels["kind"], m.labels["world"], m.labels["seed"]) for m in missions)
     first = PLAN.seeds[0]
     assert kinds["fault", "dense", first] == kinds["fault", "farm", first] == 11

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,6 @@ def summarise(
         errors: why missions could not be flown.
         scored: scores of harmful faults and of error-free flights, by detector.
     """
-    golden = _golden_times(error_free)
     return {
         "schema": SCHEMA,
         "plan": _plan(plan),
@@ -102,9 +101,7 @@ def summarise(
                 "by": by,
                 "value": value,
                 "detector": detector,
-                **asdict(
-                    fault_metrics(_bare(faults, by, value), chosen, _of_worlds(golden, chosen))
-                ),
+                **asdict(fault_metrics(_bare(faults, by, value), chosen)),
             }
             for by, value, detector, chosen in _grouped(plan, faults, GROUPS)
         ],
@@ -135,27 +132,6 @@ def _plan(plan: EvaluationPlan) -> dict[str, Any]:
         "seed": plan.seed,
         "mission": changes_of(plan.base),
     }
-
-
-def _golden_times(error_free: Sequence[ErrorFree]) -> dict[str, list[float]]:
-    """Flight times of the successful golden flights by world, s."""
-    times: dict[tuple[str, int], float] = {}
-    for pair in error_free:
-        if pair.golden.succeeded and pair.golden.flight_time_s is not None:
-            times[pair.world, pair.seed] = pair.golden.flight_time_s
-    found: dict[str, list[float]] = {}
-    for (world, _), time_s in times.items():
-        found.setdefault(world, []).append(time_s)
-    return found
-
-
-def _of_worlds(golden: Mapping[str, Sequence[float]], faults: Sequence[FaultPair]) -> list[float]:
-    """Golden times of the worlds of these faults; none where there are several worlds.
-
-    The paper's worst case is one of a world: flight times of different worlds are not alike.
-    """
-    worlds = {pair.world for pair in faults}
-    return list(golden.get(worlds.pop(), ())) if len(worlds) == 1 else []
 
 
 def _grouped(

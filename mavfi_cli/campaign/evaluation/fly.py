@@ -1,8 +1,8 @@
 """Fly what an evaluation needs, and read what came of it.
 
-Two campaigns lie in the folder: `bare` without detectors, whose traces are kept because detectors
-are replayed on them, and `protected`, of which only the records are kept. What is flown with
-detectors depends on which faults turned out to do harm without.
+The folder holds campaigns: `bare` without detectors, whose traces are kept because detectors are
+replayed on them, and in `protected` one for each model of a detector, of which only the records are
+kept. What is flown with detectors depends on which faults turned out to do harm without.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaign.outcome import MissionResult, State
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, fly_missing, store_plan
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
+from mavfi_cli.core.errors import RecordError
 
 BARE, PROTECTED = "bare", "protected"
 
@@ -33,7 +33,7 @@ def fly(plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectat
     Raises:
         UnknownName, VehicleProcessError: a world or platform that does not exist.
         ModelError: a model that cannot be used, or that was made with one of these seeds.
-        ConfigError: the folder's flights were protected by other models.
+        ConfigError: other versions of mavfi or its libraries flew in the folder.
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.
     """
     require_held_out(plan)
@@ -43,32 +43,33 @@ def fly(plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectat
     with Ledger(folder / BARE, writing=True) as ledger:
         store_plan(ledger, plan.bare(), append=True)
         fly_missing(ledger, replace(options, keep=Keep.ALL), spectator)
-    if not plan.protectors:
-        return
-    harmful = harmful_faults(plan, read_bare(plan, folder)[0])
-    spectator.on_note(f"the same with {', '.join(plan.protectors)}")
-    with Ledger(folder / PROTECTED, writing=True) as ledger:
-        _require_models(plan, ledger)
-        store_plan(ledger, plan.protected(harmful), append=True)
-        fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
-
-
-def _require_models(plan: EvaluationPlan, ledger: Ledger) -> None:
-    """Have all flights of a detector protected by one model."""
+    harmful = harmful_faults(plan, read_bare(plan, folder)[0]) if plan.protectors else set()
     for detector in plan.protectors:
-        digest, stored = model_digest(plan, detector), ledger.meta(f"model:{detector}")
-        if stored is None:
-            ledger.set_meta({f"model:{detector}": digest})
-        elif stored != digest:
-            raise ConfigError(
-                f"flown with another model of {detector}: take another folder", path=ledger.folder
-            )
+        spectator.on_note(f"the same with {detector}")
+        with Ledger(protected_folder(plan, folder, detector), writing=True) as ledger:
+            store_plan(ledger, plan.protected(detector, harmful), append=True)
+            _share_profiles(folder, ledger.folder)
+            fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
+
+
+def protected_folder(plan: EvaluationPlan, folder: Path, detector: str) -> Path:
+    """Where the flights with a detector lie: a folder a model, whatever its file is called."""
+    return folder / PROTECTED / f"{detector}-{model_digest(plan, detector)[:12]}"
 
 
 def model_digest(plan: EvaluationPlan, detector: str) -> str:
     """A name for the contents of a detector's model file; `none` without one."""
     path = plan.model_path(detector)
     return "none" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _share_profiles(folder: Path, protected: Path) -> None:
+    """Draw instructions from the profiles of the bare flights: the golden flight is the same."""
+    try:
+        if not (protected / PROFILES).exists():
+            (protected / PROFILES).symlink_to(Path("..") / ".." / BARE / PROFILES)
+    except OSError as error:
+        raise RecordError(f"{folder}: {error.strerror or error}") from None
 
 
 def harmful_faults(plan: EvaluationPlan, flights: Flights) -> set[Fault]:
@@ -98,9 +99,10 @@ def read(plan: EvaluationPlan, folder: Path) -> tuple[Flights, list[str]]:
         RecordError: nothing was flown there.
     """
     flights, errors = read_bare(plan, folder)
-    if plan.protectors:
-        missions = plan.protected(harmful_faults(plan, flights))
-        _read(folder / PROTECTED, missions, flights, errors)
+    harmful = harmful_faults(plan, flights)
+    for detector in plan.protectors:
+        missions = plan.protected(detector, harmful)
+        _read(protected_folder(plan, folder, detector), missions, flights, errors)
     return flights, errors
 
 

@@ -32,7 +32,9 @@ def _row(name: str, models: Path | None) -> dict[str, Any]:
         "provenance": None,
     }
     try:
-        row["threshold"] = find(name, model=path if has_model else None).threshold
+        row["threshold"] = find(
+            name, model=path if has_model or models is not None else None
+        ).threshold
         if has_model:
             row["provenance"] = model_file.provenance(path)
     except ModelError as error:

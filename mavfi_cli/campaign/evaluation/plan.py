@@ -172,15 +172,15 @@ class EvaluationPlan:
         """Golden flights, then those with a fault, none of them with a detector."""
         return [self._mission(key) for key in self._keys()]
 
-    def protected(self, harmful: Collection[Fault]) -> list[PlannedMission]:
-        """The same once more with each detector.
+    def protected(self, detector: str, harmful: Collection[Fault]) -> list[PlannedMission]:
+        """The same once more with a detector.
 
         Args:
             harmful: the faults that did harm without one.
         """
         return [
             self._mission(key, detector)
-            for key, detector in itertools.product(self._keys(), self.protectors)
+            for key in self._keys()
             if key[2] is None or self.complete(key[1]) or (*key[:2], key[2]) in harmful
         ]
 

@@ -105,15 +105,14 @@ def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
     yield ["", "success", "missions recovered", "harm undone", "added", "worst, recovered"]
     yield ["golden", _rate(rows[0]["golden"])]
     for row in rows:
-        worst, bare = row["worst"], row["detector"] == NONE
+        bare = row["detector"] == NONE
         yield [
             row["detector"],
             _rate(row["unprotected"] if bare else row["protected"]),
             "" if bare else _share(row["recovered"]),
             "" if bare else _share(row["undone"]),
             "" if bare else _fraction(row["added"]),
-            _percent(worst["protected"], signed=True)
-            + ("" if bare else f", {_percent(worst['recovered_share'])}"),
+            _worst_cell(row),
         ]
 
 
@@ -139,21 +138,18 @@ def _group_rows(by: str, rows: Sequence[Row]) -> Iterator[list[str]]:
 
 
 def _worst_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    """The worst flight time of each world over the mean of its golden flights."""
-    detectors = [row["detector"] for row in rows if row["value"] == rows[0]["value"]]
-    yield ["worst time", "golden mean", *detectors]
+    """The worst flight time of each world over the golden flight's, and how much is recovered."""
+    yield ["worst time", *dict.fromkeys(row["detector"] for row in rows)]
     for value in dict.fromkeys(row["value"] for row in rows):
         group = [row for row in rows if row["value"] == value]
-        cells = []
-        for row in group:
-            worst = row["worst_paper"]
-            over = worst["protected_worst"] / worst["golden"] - 1.0
-            told = _percent(over, signed=True, digits=0)
-            if row["detector"] != NONE and not math.isnan(worst["recovered_share"]):
-                told += f", {_percent(worst['recovered_share'], digits=0)}"
-            cells.append(told)
-        golden = _number(group[0]["worst_paper"]["golden"], 1)
-        yield [value, f"{golden} s", *cells]
+        yield [value, *map(_worst_cell, group)]
+
+
+def _worst_cell(row: Row) -> str:
+    worst = row["worst"]
+    told = _percent(worst["protected"], signed=True)
+    recovered = row["detector"] != NONE and not math.isnan(worst["recovered_share"])
+    return told + (f", {_percent(worst['recovered_share'], digits=0)}" if recovered else "")
 
 
 def _comparison_rows(rows: Sequence[Row]) -> Iterator[list[str]]:

@@ -1,0 +1,65 @@
+"""`mavfi detect`: what is there, and bad input in one line."""
+
+import json
+import shutil
+
+import pytest
+
+from mavfi_cli.detect import model as model_file
+
+
+def refused(mavfi, tmp_path, *arguments):
+    """The line that an evaluation ends with before anything is flown."""
+    done = mavfi("detect", "evaluate", *arguments, "--out", tmp_path / "out", "--quiet")
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert not (tmp_path / "out").exists()
+    return line
+
+
+@pytest.mark.parametrize(
+    ("option", "given", "told"),
+    [
+        ("--world", "denze", "did you mean 'dense'"),
+        ("--detector", "gda", "did you mean 'gad'"),
+        ("--protect", "palnning", "did you mean 'planning'"),
+        ("--platform", "x68", "did you mean 'x86'"),
+        ("--models", "nowhere", "no such model file"),
+    ],
+)
+def test_bad_input_gets_one_line(mavfi, tmp_path, option, given, told):
+    assert told in refused(mavfi, tmp_path, option, given)
+
+
+def test_seeds_of_the_training_are_refused_by_name(mavfi, tmp_path):
+    flight = model_file.provenance(model_file.shipped("gad"))["split"]["train"][0]
+    line = refused(mavfi, tmp_path, "--detector", "gad", "--first-seed", flight.split("/")[1])
+    assert "gad was made with the flight train-" in line
+
+
+def test_usage_errors(mavfi, tmp_path):
+    done = mavfi("detect", "evaluate", "--json", "--csv", cwd=tmp_path)
+    assert done.returncode == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_list_names_model_threshold_and_training(mavfi):
+    rows = {row["name"]: row for row in json.loads(mavfi("detect", "list", "--json").stdout)}
+    assert {"gad", "aad", "range", "l2"} <= set(rows)
+    aad = rows["aad"]
+    assert aad["model"] == str(model_file.shipped("aad"))
+    assert aad["threshold"] == model_file.provenance(model_file.shipped("aad"))["threshold"]
+    text = mavfi("detect", "list").stdout
+    assert f"threshold {aad['threshold']:.6g}" in text
+    assert f"{aad['provenance']['flights']} flights in train-0.05-3" in text
+
+
+def test_the_list_tells_of_a_model_that_cannot_be_used(mavfi, tmp_path):
+    shutil.copy(model_file.shipped("gad"), tmp_path)
+    (tmp_path / "aad.json").write_text("{")
+    done = mavfi("detect", "list", "--models", tmp_path)
+    assert done.returncode == 0
+    assert "cannot be used" in done.stdout
+    assert "corrupt model file: not JSON" in done.stdout
+    assert "threshold 5" in done.stdout
+    assert done.stdout.count("No such file or directory") == 2  # l2 and range
