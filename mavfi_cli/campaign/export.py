@@ -75,7 +75,8 @@ def _row_names(labels: list[str]) -> list[str]:
     return [
         "number", "pair", *(f"label_{name}" for name in labels), *_CONFIG, "level",
         *(f"fault_{name}" for name in _FAULT), "detector", "protect", "state", "outcome",
-        "reason", "injected", *_QUALITY, *_PILOT, "simulated_s", "wall_s", "attempts", "path", "changes",
+        "reason", "injected", *_QUALITY, *_PILOT, "simulated_s", "wall_s", "attempts", "path",
+        "changes",
     ]  # fmt: skip
 
 

@@ -53,15 +53,16 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.campaign.begin import begin, chosen
     from mavfi_cli.campaign.keep import Keep
     from mavfi_cli.campaign.run import Options, fly_missing
-    from mavfi_cli.cli.campaign_progress import progress_view
+    from mavfi_cli.cli.missions_view import missions_view
 
     spec, folder = chosen(what, options["out"], options["scale"])
     with (
         begin(
             spec, folder, append=options["append"], missing_only=options["missing_only"]
         ) as ledger,
-        progress_view(ledger, quiet=quiet) as view,
+        missions_view(quiet=quiet) as view,
     ):
+        view.on_note(f"{ledger.meta('name')} in {ledger.folder}")
         flying = Options(
             jobs=options["jobs"] or 0,
             keep=spec.keep if options["keep"] is None else Keep(options["keep"]),

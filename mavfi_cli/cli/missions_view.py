@@ -52,9 +52,11 @@ class _Live(Spectator):
 
 def progress_line(progress: Progress) -> str:
     """How far it is: missions, rate, time left, success rate so far."""
-    parts = [f"{progress.over}/{progress.total} missions", f"{progress.rate_per_h:.0f} an hour"]
-    if progress.eta_s is not None and progress.over < progress.total:
-        parts.append(f"{_duration(progress.eta_s)} to go")
+    parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
+    if progress.eta_s is not None:
+        parts.append(f"{progress.rate_per_h:.0f} an hour")
+        if progress.over < progress.total:
+            parts.append(f"{_duration(progress.eta_s)} to go")
     if progress.success_rate is not None:
         parts.append(f"{100.0 * progress.success_rate:.1f} % success")
     if progress.again:
