@@ -1,0 +1,87 @@
+"""What a bit flip in the detector itself does: one flip a flight, somewhere in its memory.
+
+    python benchmarks/detector_faults.py --flights 50 --out detector-faults
+
+Each flight is paired with the same flight, detector and all, without the flip.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.fi.isolated.outcome import wilson
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.detector_config import DetectorConfig
+from mavfi_cli.mission.fault_config import DETECTOR, FaultConfig
+
+FIRST_SEED = 600_000
+LONGER = 1.05
+
+
+def main() -> None:
+    """Fly and count."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--flights", type=int, default=50, help="of each world")
+    parser.add_argument("--world", nargs="+", default=["sparse", "dense"])
+    parser.add_argument("--detector", nargs="+", default=["gad", "aad"])
+    parser.add_argument("--out", type=Path, default=Path("detector-faults"))
+    parser.add_argument("--jobs", type=int, default=0)
+    asked = parser.parse_args()
+    missions = []
+    for name in asked.detector:
+        for world in asked.world:
+            for number in range(asked.flights):
+                calm = MissionConfig(
+                    world=world, seed=FIRST_SEED + number, detector=DetectorConfig(name=name)
+                )
+                fault = FaultConfig(target=DETECTOR, seed=number + 1)
+                for struck in (False, True):
+                    config = replace(calm, fault=fault) if struck else calm
+                    labels = {"detector": name, "world": world, "struck": struck}
+                    missions.append(PlannedMission(config=config, labels=labels))
+    options = Options(jobs=asked.jobs, keep=Keep.NONE)
+    with run_campaign(missions, asked.out, options, Spectator()) as ledger:
+        results = [entry.result for entry in ledger.results()]
+    for name in asked.detector:
+        counts: Counter[str] = Counter()
+        for mission, calm_result, struck_result in zip(
+            missions[::2], results[::2], results[1::2], strict=True
+        ):
+            if mission.labels["detector"] == name:
+                counts.update(_what_happened(calm_result, struck_result))
+        total = counts["flights"]
+        print(f"{name}: {total} flights with a flip in the detector, 95 % Wilson intervals")
+        for what in ("not injected", "no effect at all", "alarms", "lost", "longer by over 5 %"):
+            low, high = wilson(counts[what], total)
+            share = 100.0 * counts[what] / total
+            print(
+                f"  {what:<20} {counts[what]:4d}  {share:5.1f} % ({100 * low:.1f}, {100 * high:.1f})"
+            )
+
+
+def _what_happened(calm: dict, struck: dict) -> list[str]:
+    """What became of one struck flight beside its unharmed pair."""
+    found = ["flights"]
+    if struck["fault"]["state"] != "applied":
+        return [*found, "not injected"]
+    if struck["detection"]["alarm_count"] > calm["detection"]["alarm_count"]:
+        found.append("alarms")
+    times = [result["quality_of_flight"]["flight_time_s"] for result in (calm, struck)]
+    if calm["outcome"] == "success" != struck["outcome"]:
+        found.append("lost")
+    elif calm["outcome"] == struck["outcome"] == "success" and times[1] > LONGER * times[0]:
+        found.append("longer by over 5 %")
+    if len(found) == 1:
+        found.append("no effect at all")
+    return found
+
+
+if __name__ == "__main__":
+    main()
