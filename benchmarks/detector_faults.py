@@ -59,11 +59,9 @@ def main() -> None:
         total = counts["flights"]
         print(f"{name}: {total} flights with a flip in the detector, 95 % Wilson intervals")
         for what in ("not injected", "no effect at all", "alarms", "lost", "longer by over 5 %"):
-            low, high = wilson(counts[what], total)
-            share = 100.0 * counts[what] / total
-            print(
-                f"  {what:<20} {counts[what]:4d}  {share:5.1f} % ({100 * low:.1f}, {100 * high:.1f})"
-            )
+            share = wilson(counts[what], total)
+            figures = f"{100 * share.share:5.1f} % ({100 * share.low:.1f}, {100 * share.high:.1f})"
+            print(f"  {what:<20} {share.count:4d}  {figures}")
 
 
 def _what_happened(calm: dict, struck: dict) -> list[str]:
