@@ -55,6 +55,9 @@ def list_(models: Path | None, as_json: bool) -> None:
 @click.option("--level", type=click.Choice(["source", "instruction"]), default="source",
               show_default=True,
               help="Faults in states between kernels, or in instructions of a node.")  # fmt: skip
+@click.option("--field", "fields", default="sign,exponent,mantissa,integer", show_default=True,
+              help="Bit fields that are struck at the source level; integer: states that have none "
+                   "of the others.")  # fmt: skip
 @click.option("--platform", help="The companion computer  [x86].")
 @click.option("--jobs", type=click.IntRange(min=1),
               help="Missions at the same time  [one a core].")  # fmt: skip
@@ -111,6 +114,7 @@ def _plan(options: dict[str, Any]) -> Any:
         protect=_names(options["protect"]),
         models=options["models"],
         level=options["level"],
+        fields=_names(options["fields"]),
         seed=options["seed"],
         base=MissionConfig(**base),
     )

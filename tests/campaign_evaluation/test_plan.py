@@ -80,6 +80,12 @@ def test_more_flights_keep_the_missions_that_there_were():
     assert {mission.config for mission in PLAN.bare()} < more
 
 
+def test_fewer_bit_fields_leave_the_other_faults_as_they_are():
+    few = replace(PLAN, fields=("exponent",))
+    assert {place.field for place in few.places()} == {"exponent"}
+    assert {mission.config for mission in few.bare()} < {m.config for m in PLAN.bare()}
+
+
 def test_detectors_fly_harmful_faults_and_the_first_missions_whole():
     last = PLAN.seeds[1]
     harmful = ("farm", last, PLAN.places()[0])
@@ -136,6 +142,7 @@ def test_all_parts_of_the_split_are_seen(models):
         ({"worlds": ("farm", "farm")}, ConfigError, "farm is named twice"),
         ({"protect": ("palnning",)}, UnknownName, "did you mean 'planning'"),
         ({"level": "gate"}, UnknownName, "level"),
+        ({"fields": ("exponnet",)}, UnknownName, "did you mean 'exponent'"),
         ({"golden_flights": 1}, ConfigError, "one for each with a fault"),
         ({"harmless_flights": -1}, ConfigError, "harmless flights: must not be negative"),
     ],

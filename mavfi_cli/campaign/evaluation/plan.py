@@ -73,6 +73,7 @@ class EvaluationPlan:
         first_seed: seeds of missions count up from here.
         models: folder of model files `NAME.json`; None takes those that come with the detectors.
         level: source or instruction.
+        fields: bit fields that are struck at the source level.
         seed: of the faults.
         base: what else is to be flown.
     """
@@ -86,6 +87,7 @@ class EvaluationPlan:
     protect: tuple[str, ...] = STAGES
     models: Path | None = None
     level: str = SOURCE
+    fields: tuple[str, ...] = FIELDS
     seed: int = 1
     base: MissionConfig = field(default_factory=MissionConfig)
 
@@ -102,22 +104,10 @@ class EvaluationPlan:
             )
         if self.level not in (SOURCE, INSTRUCTION):
             raise UnknownName("level", self.level, (SOURCE, INSTRUCTION))
-        for what, chosen in (
-            ("world", self.worlds),
-            ("detector", self.detectors),
-            ("protect", self.protect),
-        ):
-            twice = [name for place, name in enumerate(chosen) if name in chosen[:place]]
-            if twice:
-                raise ConfigError(f"{twice[0]} is named twice", key=what)
-            if not chosen:
-                raise ConfigError("none is named", key=what)
-        for stage in self.protect:
-            if stage not in STAGES:
-                raise UnknownName("stage", stage, STAGES)
-        for name in self.detectors:
-            if name != NONE and name not in names():
-                raise UnknownName("detector", name, (NONE, *names()))
+        _require_distinct("world", self.worlds, self.worlds)
+        _require_distinct("detector", self.detectors, (NONE, *names()))
+        _require_distinct("stage", self.protect, STAGES)
+        _require_distinct("field", self.fields, FIELDS)
 
     @property
     def everyone(self) -> tuple[str, ...]:
@@ -164,7 +154,7 @@ class EvaluationPlan:
             ]
         return [
             Place(stage=stage.value, target=stage.value, field=name)
-            for stage, name in itertools.product(Stage, FIELDS)
+            for stage, name in itertools.product(Stage, self.fields)
             if stage is not Stage.CONTROL or name != INTEGER  # its states are all float64
         ]
 
@@ -218,6 +208,16 @@ class EvaluationPlan:
             if _is_float(replace(fault, field=Field.ANY.value)) is not whole:
                 return {"fault": fault}
         raise ConfigError(f"no state of {place.target} has a bit field {place.field}")
+
+
+def _require_distinct(what: str, chosen: Sequence[str], known: Sequence[str]) -> None:
+    if not chosen:
+        raise ConfigError("none is named", key=what)
+    for place, name in enumerate(chosen):
+        if name not in known:
+            raise UnknownName(what, name, known)
+        if name in chosen[:place]:
+            raise ConfigError(f"{name} is named twice", key=what)
 
 
 def _is_float(fault: FaultConfig) -> bool:
