@@ -6,6 +6,7 @@ says when the autoencoder has learned enough, `threshold` sets the thresholds. N
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -71,7 +72,8 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     Args:
         kind: gad, aad, range or l2.
         seed: of the split and of the autoencoder's first weights.
-        n_sigma: threshold of the Gaussian model; None takes `gaussian.N_SIGMA`.
+        n_sigma: threshold of the Gaussian model; None takes the least whole number that error-free
+            flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
 
     Raises:
         ModelError: too few flights, an unknown kind, or torch is missing for aad.
@@ -85,9 +87,16 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     told: dict[str, Any] = {}
     detector: Any
     if kind == "gad":
-        n = gaussian.N_SIGMA if n_sigma is None else checked_threshold(n_sigma, "n sigma")
-        detector = warmed(GaussianDetector.cold(n), [*train, *validation])
-        told["largest_distance_sigma"] = _largest(detector, held_out)
+        cold = (
+            GaussianDetector.cold()
+            if n_sigma is None
+            else GaussianDetector.cold(checked_threshold(n_sigma, "n sigma"))
+        )
+        detector = warmed(cold, [*train, *validation])
+        largest = _largest(detector, held_out)
+        told["largest_distance_sigma"] = largest
+        if n_sigma is None:
+            detector.memory["n_sigma"][0] = max(gaussian.N_SIGMA, math.ceil(largest))
     elif kind == "range":
         everything = mirrored(_all(list(flights)))
         detector = RangeDetector(
