@@ -245,11 +245,6 @@ class Pilot:
         if not self._awaiting_plan and self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
             self._wanted = True
 
-    def replace_trajectory(self, flown: Trajectory, other: Trajectory) -> None:
-        """Fly `other` from the same point on, if `flown` is what is flown now."""
-        if self.trajectory is flown:
-            self.trajectory = other
-
     def _plan_failed(self) -> None:
         self.counters.plans_failed += 1
         self._failures += 1

@@ -58,6 +58,7 @@ class MissionResult:
 
 _BY_ACTIVATION = {
     "read": Injected.ACTIVE,
+    "withheld": Injected.ACTIVE,
     "unchanged": Injected.NOT_ACTIVATED,
     "not_read": Injected.NOT_ACTIVATED,
     "not_injected": Injected.NOT_INJECTED,

@@ -19,7 +19,7 @@ from mavfi_cli.autonomy import occupancy, tracking
 from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFailure
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.trajectory import waypoint_index, without_waypoint
-from mavfi_cli.core.states import of_stage
+from mavfi_cli.core.states import Message, of_stage
 from mavfi_cli.core.types import (
     CollisionReport,
     Command,
@@ -49,6 +49,7 @@ FOLLOWED_STATES = {s.name for s in of_stage(Stage.PLANNING) if s.name.startswith
 PLAN_STATES = {s.name for s in of_stage(Stage.PLANNING)} - FOLLOWED_STATES
 CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 COMMAND_STATES = {state.name for state in of_stage(Stage.CONTROL)}
+ATTEMPTS = 2  # a command is computed again in one tick
 BRAKE_SHARE = 0.6  # of a_max that stopping counts on, as planned motion does
 
 
@@ -60,6 +61,7 @@ class _Setpoint:
     command: Command
     directive: Directive
     waypoint: int
+    attempt: int = 0  # how often it was computed again
 
 
 class Companion:
@@ -139,6 +141,7 @@ class Companion:
         report = self._injection.pass_on(report, self._moment(stamp_s))
         response = self.protection.report(report, stamp_s)
         if response in (Response.RECOMPUTE, Response.HOLD):
+            self._withheld(report)
             self._recompute_perception()
             if response is Response.HOLD:
                 self._hold()
@@ -155,6 +158,7 @@ class Companion:
             if self.pilot.expects(result):
                 response = self.protection.plan(result, stamp_s)
                 if response in (Response.RECOMPUTE, Response.HOLD):
+                    self._withheld(result)
                     self.pilot.reject_plan()
                     if response is Response.HOLD:
                         self._hold()
@@ -176,24 +180,43 @@ class Companion:
         if self._state is not None:
             self.pilot.abandon(self._state)
 
-    def _drop_waypoint(self, setpoint: _Setpoint) -> Directive:
-        """The directive of a command without the waypoint that it followed."""
-        flown = setpoint.directive.trajectory
-        if flown is None:
-            return setpoint.directive
-        bridged = without_waypoint(flown, setpoint.waypoint)
-        self.pilot.replace_trajectory(flown, bridged)
-        return replace(setpoint.directive, trajectory=bridged)
+    def _without(self, flown: Trajectory, waypoint: int) -> Trajectory:
+        """The flown plan without a waypoint, flown from now on; like a flip, it causes no check."""
+        bridged = without_waypoint(flown, waypoint)
+        self._withheld(flown)
+        if self.pilot.trajectory is flown:
+            self.pilot.trajectory = bridged
+        if self._checked is flown:
+            self._checked = bridged
+        return bridged
 
-    def _recompute_control(self, stamp_s: float, setpoint: _Setpoint) -> _Setpoint | None:
-        """Take the next waypoint, and compute again from the last command that went out."""
+    def _withheld(self, message: Message) -> None:
+        if self._injection.follower is not None:
+            self._injection.follower.withheld(message)
+
+    def _recompute_control(self, stamp_s: float, setpoint: _Setpoint, stage: Stage) -> None:
+        """Compute a command again; where that did not help, from the next waypoint and afresh.
+
+        A waypoint that raised the alarm itself is dropped at once. The controller then begins from
+        the last command that went out.
+        """
         assert self._state is not None
-        fresh = None
-        if self.command is not None:
-            last = self.command
-            fresh = tracking.TrackingState(yaw_rad=last.yaw_rad, stamp_s=last.stamp_s)
-        directive = self._drop_waypoint(setpoint)
-        return self._track(stamp_s, self._state, directive, fresh)
+        directive, fresh = setpoint.directive, None
+        if stage is Stage.PLANNING or setpoint.attempt > 0:
+            if directive.trajectory is not None:
+                bridged = self._without(directive.trajectory, setpoint.waypoint)
+                directive = replace(directive, trajectory=bridged)
+            if self.command is not None:
+                last = self.command
+                fresh = tracking.TrackingState(yaw_rad=last.yaw_rad, stamp_s=last.stamp_s)
+        renewed = self._track(stamp_s, self._state, directive, fresh)
+        if renewed is None:
+            return
+        renewed = replace(renewed, attempt=setpoint.attempt + 1)
+        if renewed.due_s <= stamp_s:
+            self._take_command(stamp_s, renewed)
+        else:
+            self._commands.append(renewed)
 
     def _on_start(self, node: str, value: Any, start_s: float) -> None:
         """A node begins to work on its input: it has read it."""
@@ -225,7 +248,7 @@ class Companion:
                 self._hold()
             elif response is Response.RECOMPUTE and alarm is not None:
                 assert alarm.waypoint is not None
-                self.pilot.trajectory = without_waypoint(flown, alarm.waypoint)
+                self._without(flown, alarm.waypoint)
                 if alarm.stage is Stage.PLANNING:
                     self.pilot.want_plan()
                 if self.pilot.trajectory is not flown:
@@ -339,26 +362,25 @@ class Companion:
         self._control.busy_s += latency_s
         return latency_s if latency_s >= SAME_TICK_S else 0.0
 
-    def _take_command(self, stamp_s: float, setpoint: _Setpoint, *, again: bool = False) -> None:
+    def _take_command(self, stamp_s: float, setpoint: _Setpoint) -> None:
         """A command is due: through the gate, and out.
 
-        One that is withheld is computed again, at once where the platform is fast enough; what
-        raises an alarm once more leaves the last command in force until the next tick.
+        One that is withheld is computed again, at once where the platform is fast enough. What
+        raises an alarm ATTEMPTS times leaves the last command in force until the next tick.
         """
         command = self._injection.pass_on(setpoint.command, self._moment(stamp_s))
         flown = setpoint.directive.trajectory
         response, stage = self.protection.tick(flown, setpoint.waypoint, command, stamp_s)
+        if response in (Response.RECOMPUTE, Response.HOLD):
+            self._withheld(command)
         if response is Response.HOLD:
             self._hold()
             return
         if response is Response.RECOMPUTE:
             if stage is Stage.PLANNING:
                 self.pilot.want_plan()
-            renewed = None if again else self._recompute_control(stamp_s, setpoint)
-            if renewed is not None and renewed.due_s <= stamp_s:
-                self._take_command(stamp_s, renewed, again=True)
-            elif renewed is not None:
-                self._commands.append(renewed)
+            if setpoint.attempt < ATTEMPTS:
+                self._recompute_control(stamp_s, setpoint, stage)
             return
         self.command = command
         if self._injection.follower is not None:

@@ -166,6 +166,7 @@ def _activation(fault: dict[str, Any]) -> str:
     if reader is not None:
         return f"first read by {reader['name']} at {reader['stamp_s']:.2f} s ({reader['state']})"
     return {
+        "withheld": "withheld by the detector's gate before anybody read it",
         "overwritten": "overwritten before anybody read it",
         "not_read": "never read: the mission ended before",
         "unchanged": "changed nothing: the value was that already",

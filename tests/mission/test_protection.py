@@ -156,7 +156,7 @@ def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
     assert alarm["stamp_s"] == pytest.approx(strike["stamp_s"])
     assert (alarm["stage"], alarm["response"]) == ("control", "recompute")
     assert alarm["states"][0] == "command_vx"
-    assert run.result["fault"]["activation"]["activation"] == "overwritten"
+    assert run.result["fault"]["activation"]["activation"] == "withheld"
     largest = np.abs(run.trace["command_vx"].to_numpy(zero_copy_only=False)).max()
     assert largest < 5.0
     text = b"limit alarm in control"
@@ -174,7 +174,7 @@ def test_a_wild_waypoint_far_ahead_is_dropped_before_the_collision_check_sees_it
     (change,) = run.result["fault"]["strikes"][0]["changes"]
     assert abs(change["after"]) > 1e100
     assert run.result["detection"]["alarms"][0]["message"] == "ahead"
-    assert run.result["fault"]["activation"]["activation"] == "overwritten"
+    assert run.result["fault"]["activation"]["activation"] == "withheld"
     counters = run.result["pilot"]
     assert (counters["collisions_foreseen"], counters["stops"]) == (0, 0)
     assert run.result["outcome"] == "success"

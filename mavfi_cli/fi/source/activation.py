@@ -18,6 +18,7 @@ class Activation(Enum):
     """What became of the corrupted values, over all strikes of a fault."""
 
     READ = "read"  # some receiver worked with a corrupted value
+    WITHHELD = "withheld"  # the detector's gate kept it from its receivers
     OVERWRITTEN = "overwritten"  # the message was replaced before
     NOT_READ = "not_read"  # the mission ended before
     UNCHANGED = "unchanged"  # the value was that already
@@ -37,7 +38,7 @@ class Follower:
     """Follows the struck message until one of its corrupted values is read.
 
     Attributes:
-        activation: the best that is known; READ once, READ for ever.
+        activation: the best that is known; READ or WITHHELD once, so for ever.
         reader: the first one.
     """
 
@@ -54,7 +55,7 @@ class Follower:
 
     def struck(self, message: Message, strike: Strike) -> None:
         """A message was corrupted; it goes on as `message`."""
-        if self.activation is Activation.READ:
+        if self.activation in (Activation.READ, Activation.WITHHELD):
             return
         self._corrupted = {c.state: c.index for c in strike.changes if c.bits}
         if self._corrupted:
@@ -78,6 +79,11 @@ class Follower:
                 self.activation, self._message = Activation.READ, None
                 self.reader = Reader(name=by, stamp_s=stamp_s, state=state)
                 return
+
+    def withheld(self, message: Message) -> None:
+        """The gate does not let a message, or the struck part of it, pass."""
+        if message is self._message:
+            self.activation, self._message = Activation.WITHHELD, None
 
     def settle(self, held: Callable[[Message], bool]) -> None:
         """Anyone who asks whether the message still counts: if not, it was overwritten."""

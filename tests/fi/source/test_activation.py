@@ -58,6 +58,16 @@ def test_replaced_before_it_was_read_is_overwritten(follower):
     assert follower.activation is Activation.OVERWRITTEN
 
 
+def test_what_the_gate_withholds_is_no_longer_on_its_way(follower):
+    follower.withheld(OTHER)
+    assert follower.waits
+    follower.withheld(STRUCK)
+    assert follower.activation is Activation.WITHHELD
+    follower.settle(lambda _message: False)
+    follower.struck(OTHER, strike())
+    assert follower.activation is Activation.WITHHELD
+
+
 def test_once_read_is_read_whatever_comes_later(follower):
     follower.read(STRUCK, "control", 9.5, {"waypoint_x"}, index=4)
     follower.struck(OTHER, strike())
