@@ -24,6 +24,7 @@ class Injected(Enum):
     GOLDEN = "golden"  # none was asked for
     ACTIVE = "active"  # it struck, and what it struck was read afterwards
     UNREAD = "unread"  # it struck, and nothing read it as long as it was followed
+    CAUGHT = "caught"  # it struck, and a detector withheld it before anything read it
     NOT_ACTIVATED = "not_activated"  # it struck what nothing read before it was over
     NOT_INJECTED = "not_injected"  # the mission ended, or the run parted, before the trigger
     NULL = "null"  # everything but the flip, as was asked for
@@ -83,4 +84,21 @@ def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
     if fault["state"] == "null":
         return Injected.NULL
     activation = fault.get("activation") or {"activation": "read"}  # cut off: it may have been
-    return _BY_ACTIVATION.get(activation["activation"], Injected.ACTIVE)
+    found = _BY_ACTIVATION.get(activation["activation"], Injected.ACTIVE)
+    return Injected.CAUGHT if found is Injected.NOT_ACTIVATED and _caught(result) else found
+
+
+def _caught(result: Mapping[str, Any]) -> bool:
+    """Whether an alarm withheld what the fault had struck: at that stamp, or naming that state."""
+    strikes = result["fault"].get("strikes") or []
+    stamps = {strike["stamp_s"] for strike in strikes}
+    states = {change["state"] for strike in strikes for change in strike["changes"]}
+    alarms = (result.get("detection") or {}).get("alarms", [])
+    return any(
+        alarm["response"] != "accept"
+        and (
+            alarm["stamp_s"] in stamps
+            or (alarm["stamp_s"] >= min(stamps) and not states.isdisjoint(alarm["states"]))
+        )
+        for alarm in (alarms if stamps else [])
+    )

@@ -16,7 +16,9 @@ from mavfi_cli.campaign.spec import Stop
 from mavfi_cli.campaign.statistics.proportions import half_width, rate
 
 # Missions in whose success the fault, if there was one, had a part.
-COUNTED = frozenset((Injected.GOLDEN.value, Injected.ACTIVE.value, Injected.UNREAD.value))
+COUNTED = frozenset(
+    each.value for each in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
+)
 Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission
 Row = tuple[str | None, str | None]  # outcome, what became of the fault
 

@@ -164,3 +164,26 @@ def test_a_database_of_somebody_else_is_refused(tmp_path):
 def test_what_became_of_a_fault(fault, injected):
     assert injected_of({"fault": fault}, asked=True) is injected
     assert injected_of({"fault": fault}, asked=False) is Injected.GOLDEN
+
+
+@pytest.mark.parametrize(
+    ("alarm", "injected"),
+    [
+        ({}, Injected.CAUGHT),
+        ({"states": ["waypoint_x"]}, Injected.CAUGHT),  # at that very stamp
+        ({"stamp_s": 11.5}, Injected.CAUGHT),
+        ({"stamp_s": 11.5, "states": ["waypoint_x"]}, Injected.NOT_ACTIVATED),
+        ({"stamp_s": 10.0}, Injected.NOT_ACTIVATED),  # before the fault
+        ({"response": "accept"}, Injected.NOT_ACTIVATED),
+    ],
+)
+def test_a_fault_that_a_detector_withheld_was_no_idle_one(alarm, injected):
+    told = {"stamp_s": 11.0, "states": ["command_yaw"], "response": "recompute", **alarm}
+    fault = {
+        "state": "applied",
+        "activation": {"activation": "overwritten"},
+        "strikes": [{"stamp_s": 11.0, "changes": [{"state": "command_yaw"}]}],
+    }
+    result = {"fault": fault, "detection": {"alarms": [told]}}
+    assert injected_of(result, asked=True) is injected
+    assert injected_of({**result, "detection": None}, asked=True) is Injected.NOT_ACTIVATED

@@ -57,17 +57,18 @@ def fill(book):
 
 
 def test_faults_that_did_nothing_are_counted_apart(book):
-    fates = [ACTIVE, Injected.UNREAD, Injected.NOT_ACTIVATED, Injected.NOT_INJECTED, Injected.NULL]
+    fates = [ACTIVE, Injected.UNREAD, Injected.NOT_ACTIVATED, Injected.NOT_INJECTED, Injected.NULL,
+             Injected.CAUGHT]  # fmt: skip
     for seed, injected in enumerate(fates):
         outcome = "collision" if injected is ACTIVE else "success"
         book.add(FI, seed, 20.0 + seed, injected=injected, outcome=outcome)
     (cell,) = summarise(book.ledger).cells
-    assert (cell.success.count, cell.success.total) == (1, 2)
+    assert (cell.success.count, cell.success.total) == (2, 3)
     assert (cell.inactive.count, cell.inactive.total) == (3, 3)
-    assert (cell.every.count, cell.every.total) == (4, 5)
+    assert (cell.every.count, cell.every.total) == (5, 6)
     assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
-    assert cell.metrics["flight_time_s"].value == 21.0
-    assert cell.metrics["flight_time_s"].count == 1
+    assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
+    assert cell.metrics["flight_time_s"].count == 2
 
 
 def test_errors_are_counted_nowhere_else(book):
