@@ -102,6 +102,8 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
     ]
     vehicle = outcome == Outcome.LINK_LOST.value and config.get("link") is None
     doubts = [how for how in [*crashes, reason if vehicle else ""] if how.endswith(_OUTSIDE_WORDS)]
+    if config.get("link") is None and result.get("referee", {}) is None:
+        doubts.append("the vehicle died before it had saved the truth")
     return Verdict(state=State.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts))
 
 

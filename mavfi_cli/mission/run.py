@@ -22,7 +22,7 @@ import numpy as np
 
 from mavfi_cli import __version__
 from mavfi_cli.autonomy import planners, warm_up
-from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.mission import briefing, quality
@@ -142,7 +142,9 @@ def _injection(
 
 def _plan(config: MissionConfig, asked: InstructionConfig, out: Path) -> PlannedFault:
     def fly_golden(golden: MissionConfig, folder: Path, recorder: Recorder) -> None:
-        fly_mission(golden, folder, Watcher(), recorder=recorder)
+        flown = fly_mission(golden, folder, Watcher(), recorder=recorder)
+        if json.loads(flown.result.read_text())["referee"] is None:  # nothing to draw from
+            raise VehicleProcessError("the vehicle process of the golden flight died")
 
     return plan_fault(config, asked, out, installed_versions(), fly_golden)
 

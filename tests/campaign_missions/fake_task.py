@@ -65,4 +65,5 @@ def record(changes, seed, world, value):
         "pilot": {"replans": int(rng.integers(5))},
         "simulated_s": 30.0,
         "fault": None,
+        "referee": None if world == "untrue" else {},
     }

@@ -93,7 +93,7 @@ def test_a_mission_killed_each_time_stays_missing(campaign):
         assert [number for number, *_ in ledger.missing()] == [1]
 
 
-@pytest.mark.parametrize("world", ["end:link_lost", "node:killed by SIGKILL"])
+@pytest.mark.parametrize("world", ["end:link_lost", "node:killed by SIGKILL", "untrue"])
 def test_a_record_that_something_outside_had_a_hand_in_is_doubted_first(campaign, world):
     result = only(campaign.run(planned(world)))
     assert (result.state, result.attempts) == (State.FLOWN, ATTEMPTS)
