@@ -22,6 +22,8 @@ _COMMANDS = {
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
     "detect": ("mavfi_cli.cli.detect", "Detectors: which there are, what they are worth."),
     "campaign": ("mavfi_cli.cli.campaign", "Plan and run thousands of missions."),
+    "vpm": ("mavfi_cli.cli.vpm", "What DMR and TMR cost in speed, time and energy."),
+    "platforms": ("mavfi_cli.cli.platforms", "Compute platforms and their latencies."),
     "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),
     "show": ("mavfi_cli.cli.show", "Read a run and say what happened."),
     "doctor": ("mavfi_cli.cli.doctor", "Test this machine: what works here, and why not."),

@@ -13,7 +13,7 @@ import cattrs
 from cattrs import AttributeValidationNote, IterableValidationNote
 from cattrs.gen import make_dict_structure_fn
 
-from mavfi_cli.core.errors import ConfigError, UnknownKey
+from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 
 T = TypeVar("T")
 
@@ -33,6 +33,28 @@ def load_toml(path: Path, cls: type[T]) -> T:
     except tomllib.TOMLDecodeError as error:
         raise syntax_error(error, path) from None
     return structure(data, cls, path=path, text=text)
+
+
+def shipped_names(folder: Path) -> list[str]:
+    """The names of the TOML files in a folder, in alphabetical order."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def shipped_path(kind: str, name_or_path: str, folder: Path) -> Path:
+    """The TOML file of a shipped `kind` by its name, or a user's own by its path.
+
+    Raises:
+        UnknownName: nothing shipped has this name, and it is not a path to a TOML file.
+        ConfigError: it is such a path, and there is no such file.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        if name_or_path not in shipped_names(folder):
+            raise UnknownName(kind, name_or_path, shipped_names(folder))
+        return folder / f"{name_or_path}.toml"
+    if not path.is_file():
+        raise ConfigError("no such file", path=path)
+    return path
 
 
 def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:

@@ -10,6 +10,7 @@ MavfiError                      one known error, one line, exit code 1
 │   ├── NoAutopilot             nothing answered
 │   ├── CommandRefused          the autopilot said no, in its own words
 │   └── LinkLost                the peer fell silent or closed the connection
+├── CannotLift                  a vehicle whose rotors do not lift its compute; with the numbers
 ├── VehicleProcessError         the simulated vehicle could not start or ended early
 ├── ModelError                  a detector's model or data set that cannot be used or made
 ├── RecordError                 a run folder that cannot be written or read
@@ -115,6 +116,19 @@ class CommandRefused(LinkError):
 
 class LinkLost(LinkError):
     """The peer fell silent or closed the connection."""
+
+
+class CannotLift(MavfiError):
+    """A vehicle whose rotors do not lift what it carries; says the numbers."""
+
+    def __init__(
+        self, vehicle: str, *, pull_n: float, mass_kg: float, compute_kg: float, limit_kg: float
+    ) -> None:
+        super().__init__(
+            f"vehicle {vehicle!r} cannot lift its compute: {pull_n:.2f} N of rotor pull lift less "
+            f"than {limit_kg:.3f} kg, {mass_kg:.3f} kg + {compute_kg:.3f} kg of compute are "
+            f"{mass_kg + compute_kg:.3f} kg"
+        )
 
 
 class VehicleProcessError(MavfiError):

@@ -1,14 +1,19 @@
-"""Compute platforms: how long each kernel takes in simulated time. TOML files, one a platform."""
+"""Compute platforms: how long each kernel takes in simulated time. TOML files, one a platform.
+
+A file either gives every kernel its latency, or names a shipped platform as its `base` and says
+by how much each kernel is slower: `scale` of the kernel, or that of the whole file.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.core.config import load_toml
+from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
 
@@ -25,40 +30,101 @@ class KernelLatency:
     source: str = ""
 
     def __post_init__(self) -> None:
-        if self.latency_s < 0.0:
-            raise ValueError(f"latency_s must not be negative, got {self.latency_s:g}")
-        if not 0.0 <= self.spread <= 2.0:
-            raise ValueError(f"spread must be within 0 and 2, got {self.spread:g}")
+        _check_latency(self.latency_s, self.spread)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformProfile:
-    """A companion computer as the flight feels it: latencies, cores, power, mass."""
+    """A companion computer as the flight feels it: latencies, cores, power, mass.
+
+    Raises:
+        ValueError: a number out of its range, a kernel missing or one that does not exist.
+    """
 
     name: str
     cores: int
     kernels: dict[str, KernelLatency]
     description: str = ""
-    power_w: float = 0.0
-    mass_kg: float = 0.0
+    carried: bool = True  # False: it stays on the ground, the vehicle feeds and lifts nothing
+    power_w: float = 0.0  # thermal design power
+    mass_kg: float = 0.0  # the board, without its heat sink
+    heatsink_kgpw: float = 0.0  # mass of the heat sink for each watt of power_w
     sources: list[str] = field(default_factory=list)
+    base: str = ""  # the platform whose latencies are scaled, where there is one
 
     def __post_init__(self) -> None:
         if self.cores < 1:
             raise ValueError(f"cores must be at least 1, got {self.cores}")
-        missing = [kernel for kernel in KERNELS if kernel not in self.kernels]
-        if missing:
-            raise ValueError(f"kernels without a latency: {', '.join(missing)}")
-        unknown = [kernel for kernel in self.kernels if kernel not in KERNELS]
-        if unknown:
-            raise ValueError(f"unknown kernels: {', '.join(unknown)} (known: {', '.join(KERNELS)})")
-        if self.power_w < 0.0 or self.mass_kg < 0.0:
-            raise ValueError("power_w and mass_kg must not be negative")
+        _check_kernels(self.kernels)
+        _check_hardware(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _KernelEntry:
+    """A kernel as a file describes it: a latency, or a factor on that of the base."""
+
+    latency_s: float | None = None
+    scale: float | None = None
+    spread: float | None = None  # None: the base's, or 0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.latency_s is None) is (self.scale is None):
+            raise ValueError("needs either latency_s or scale")
+        if self.scale is not None and self.scale <= 0.0:
+            raise ValueError(f"scale must be above zero, got {self.scale:g}")
+        _check_latency(self.latency_s or 0.0, self.spread or 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PlatformFile:
+    """A platform's TOML file."""
+
+    name: str
+    cores: int
+    kernels: dict[str, _KernelEntry] = field(default_factory=dict)
+    base: str = ""  # a shipped platform
+    scale: float = 1.0  # of the base's latencies, for the kernels that are not named
+    description: str = ""
+    carried: bool = True
+    power_w: float = 0.0
+    mass_kg: float = 0.0
+    heatsink_kgpw: float = 0.0
+    sources: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.scale <= 0.0:
+            raise ValueError(f"scale must be above zero, got {self.scale:g}")
+        if not self.base and self.scale != 1.0:
+            raise ValueError("scale needs a base, the platform whose latencies are scaled")
+
+
+def _check_latency(latency_s: float, spread: float) -> None:
+    if latency_s < 0.0:
+        raise ValueError(f"latency_s must not be negative, got {latency_s:g}")
+    if not 0.0 <= spread <= 2.0:
+        raise ValueError(f"spread must be within 0 and 2, got {spread:g}")
+
+
+def _check_kernels(kernels: Collection[str]) -> None:
+    missing = [f"kernels.{kernel}" for kernel in KERNELS if kernel not in kernels]
+    if missing:
+        raise ValueError(f"{', '.join(missing)}: missing, a kernel without a latency")
+    unknown = [f"kernels.{kernel}" for kernel in kernels if kernel not in KERNELS]
+    if unknown:
+        raise ValueError(f"{', '.join(unknown)}: no such kernel (known: {', '.join(KERNELS)})")
+
+
+def _check_hardware(profile: PlatformProfile) -> None:
+    for key in ("power_w", "mass_kg", "heatsink_kgpw"):
+        value = getattr(profile, key)
+        if value < 0.0:
+            raise ValueError(f"{key}: must not be negative, is {value:g}")
 
 
 def platform_names() -> list[str]:
     """The shipped platforms, in alphabetical order."""
-    return sorted(path.stem for path in _FOLDER.glob("*.toml"))
+    return shipped_names(_FOLDER)
 
 
 def load_platform(name_or_path: str) -> PlatformProfile:
@@ -68,14 +134,49 @@ def load_platform(name_or_path: str) -> PlatformProfile:
         UnknownName: no shipped platform has this name, and it is not a path to a TOML file.
         ConfigError: the file cannot be used.
     """
-    path = Path(name_or_path)
-    if path.suffix == ".toml":
-        if not path.is_file():
-            raise ConfigError("no such file", path=path)
-        return load_toml(path, PlatformProfile)
-    if name_or_path not in platform_names():
-        raise UnknownName("platform", name_or_path, platform_names())
-    return load_toml(_FOLDER / f"{name_or_path}.toml", PlatformProfile)
+    path = shipped_path("platform", name_or_path, _FOLDER)
+    return _resolved(load_toml(path, _PlatformFile), path)
+
+
+def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
+    """The profile of a file: its own latencies and those that it takes from its base."""
+    base: dict[str, KernelLatency] = {}
+    if file.base:
+        if file.base not in platform_names() or path == _FOLDER / f"{file.base}.toml":
+            error = UnknownName("platform", file.base, set(platform_names()) - {path.stem})
+            raise ConfigError(str(error), path=path, key="base")
+        base = load_platform(file.base).kernels
+    kernels = {
+        name: replace(
+            latency,
+            latency_s=latency.latency_s * file.scale,
+            source=f"{file.base} x {file.scale:g}",
+        )
+        for name, latency in base.items()
+    }
+    for name, entry in file.kernels.items():
+        if entry.scale is not None and name not in base:
+            problem = "scale needs a base" if name in KERNELS else "no such kernel"
+            raise ConfigError(problem, path=path, key=f"kernels.{name}")
+        kernels[name] = _latency(entry, base.get(name), file.base)
+    shared = {key.name: getattr(file, key.name) for key in fields(PlatformProfile)}
+    try:
+        return PlatformProfile(**{**shared, "kernels": kernels})
+    except ValueError as error:
+        raise ConfigError(str(error), path=path) from None
+
+
+def _latency(entry: _KernelEntry, base: KernelLatency | None, base_name: str) -> KernelLatency:
+    spread = entry.spread if entry.spread is not None else (base.spread if base else 0.0)
+    if entry.scale is None or base is None:
+        assert entry.latency_s is not None
+        return KernelLatency(latency_s=entry.latency_s, spread=spread, source=entry.source)
+    told = f"{base_name} x {entry.scale:g}"
+    return KernelLatency(
+        latency_s=entry.scale * base.latency_s,
+        spread=spread,
+        source=f"{told}: {entry.source}" if entry.source else told,
+    )
 
 
 class LatencyModel:

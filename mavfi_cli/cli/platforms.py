@@ -1,0 +1,67 @@
+"""`mavfi platforms`: the compute platforms, and where their latencies come from."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import click
+
+_P95 = 1.6449  # standard normal: 90 % lie within
+
+
+@click.command()
+@click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
+@click.option("--json", "as_json", is_flag=True, help="Print all of it as JSON.")
+def platforms(names: tuple[str, ...], as_json: bool) -> None:
+    """List the compute platforms, or explain the named ones kernel by kernel."""
+    from mavfi_cli.mission.platform import load_platform, platform_names
+
+    profiles = [load_platform(name) for name in names or platform_names()]
+    if as_json:
+        click.echo(json.dumps([_plain(profile) for profile in profiles], indent=2))
+    elif names:
+        click.echo("\n\n".join(_explained(profile) for profile in profiles))
+    else:
+        for profile in profiles:
+            click.echo(_line(profile))
+        click.echo("\n`mavfi platforms NAME` shows every kernel; CONTRIBUTING.md how to add one.")
+
+
+def _all_s(profile: Any) -> float:
+    return float(sum(latency.latency_s for latency in profile.kernels.values()))
+
+
+def _line(profile: Any) -> str:
+    return (
+        f"{profile.name:<12} {profile.cores:>3} cores {profile.power_w:>6.1f} W "
+        f"{1000 * profile.mass_kg:>5.0f} g  all kernels {_all_s(profile):>6.3f} s  "
+        f"{profile.description}"
+    )
+
+
+def _explained(profile: Any) -> str:
+    based = f"; latencies from {profile.base}" if profile.base else ""
+    where = "carried" if profile.carried else "stays on the ground"
+    lines = [
+        f"{profile.name}: {profile.description}",
+        f"{profile.cores} cores, {profile.power_w:g} W, {1000 * profile.mass_kg:g} g + "
+        f"{1000 * profile.heatsink_kgpw:g} g/W of heat sink, {where}{based}",
+        f"{'kernel':<16} {'median':>10}  {'5 % to 95 %':>22}  source",
+    ]
+    for name, latency in profile.kernels.items():
+        factor = math.exp(_P95 * latency.spread)
+        low, high = (1000 * latency.latency_s * f for f in (1.0 / factor, factor))
+        lines.append(
+            f"{name:<16} {1000 * latency.latency_s:>7.2f} ms  {low:>8.2f} to {high:>8.2f} ms  "
+            f"{latency.source or 'not given'}"
+        )
+    lines.append(f"{'all of them':<16} {1000 * _all_s(profile):>7.2f} ms")
+    return "\n".join([*lines, *profile.sources])
+
+
+def _plain(profile: Any) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(profile)

@@ -1,0 +1,110 @@
+"""`mavfi vpm`: what redundant computers cost a vehicle in speed, time and energy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+_ABOVE_ZERO = click.FloatRange(min=0.0, min_open=True)
+
+
+@click.command()
+@click.option("--vehicle", "vehicles", multiple=True, metavar="NAME|FILE",
+              help="airsim, spark, cal20 or a TOML file; may be repeated  "
+                   "[airsim, spark: the paper's Fig. 15].")  # fmt: skip
+@click.option("--platform", metavar="NAME|FILE",
+              help="Its latencies are the response time; its board flies  "
+                   "[the vehicle's own].")  # fmt: skip
+@click.option("--chain", type=click.Choice(["serial", "pipelined"]), default="serial",
+              show_default=True,
+              help="Response time of a platform: the sum of its kernels' latencies, or the "
+                   "slowest.")  # fmt: skip
+@click.option("--board", metavar="NAME|FILE",
+              help="Mass and power of a computer: a57, ncs, raspi3b, tx2, xavier or a TOML "
+                   "file  [the platform's, or the vehicle's own].")  # fmt: skip
+@click.option("--response", type=_ABOVE_ZERO, metavar="S", help="Response time of the computer, s.")
+@click.option("--range", "range_", type=_ABOVE_ZERO, metavar="M", help="Sensing range, m.")
+@click.option("--distance", type=_ABOVE_ZERO, default=50.0, show_default=True, metavar="M",
+              help="Length of a mission, m.")  # fmt: skip
+@click.option("--overhead", "overheads", multiple=True, metavar="DETECTOR=PERCENT",
+              help="Measured compute overhead of gad or aad, per cent  "
+                   "[the paper's Table V].")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False),
+              help="Folder for roofline.svg, redundancy.svg, vpm.json, vpm.csv.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+@click.option("--csv", "as_csv", is_flag=True, help="Print a row a scheme as CSV.")
+def vpm(
+    vehicles: tuple[str, ...], out: Path | None, as_json: bool, as_csv: bool, **options: Any
+) -> None:
+    """Safe velocity, flight time and energy with none, DMR, TMR, and detection and recovery.
+
+    The F-1 visual performance model: a vehicle flies so fast that it stops within what it sees.
+    A copy of the computer adds mass and power; detection and recovery adds compute time.
+    """
+    from mavfi_cli.core.files import plain
+    from mavfi_cli.vpm.report import report
+    from mavfi_cli.vpm.schemes import schemes_with
+    from mavfi_cli.vpm.table import scheme_rows_csv, table
+    from mavfi_cli.vpm.vehicle import load_vehicle
+
+    if as_json and as_csv:
+        raise click.UsageError("--json or --csv, not both")
+    chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
+    told = report(chosen, _choices(options), schemes_with(_overheads(options["overheads"])))
+    if out is not None:
+        _save(told, out)
+    if as_json:
+        click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
+    elif as_csv:
+        click.echo(scheme_rows_csv(told), nl=False)
+    else:
+        click.echo("\n".join(table(told)))
+
+
+def _choices(options: dict[str, Any]) -> Any:
+    from mavfi_cli.mission.platform import load_platform
+    from mavfi_cli.vpm.board import load_board
+    from mavfi_cli.vpm.report import Choices
+
+    platform, board = options["platform"], options["board"]
+    return Choices(
+        platform=None if platform is None else load_platform(platform),
+        chain=options["chain"],
+        board=None if board is None else load_board(board),
+        response_s=options["response"],
+        range_m=options["range_"],
+        distance_m=options["distance"],
+    )
+
+
+def _overheads(texts: tuple[str, ...]) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        try:
+            found[name.strip()] = float(number)
+        except ValueError:
+            raise click.UsageError(
+                f"--overhead {text}: give a detector and per cent, as aad=0.0062"
+            ) from None
+    return found
+
+
+def _save(told: dict[str, Any], out: Path) -> None:
+    from mavfi_cli.core.errors import RecordError
+    from mavfi_cli.core.files import write_json, write_text
+    from mavfi_cli.report.redundancy_plot import write_redundancy_plot
+    from mavfi_cli.report.roofline_plot import write_roofline_plot
+    from mavfi_cli.vpm.table import scheme_rows_csv
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{out}: {error.strerror or error}") from None
+    write_json(out / "vpm.json", told)
+    write_text(out / "vpm.csv", scheme_rows_csv(told))
+    write_roofline_plot(told, out / "roofline.svg")
+    write_redundancy_plot(told, out / "redundancy.svg")

@@ -1,0 +1,63 @@
+"""Boards: the computer as mass and power. TOML files, one a board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
+from mavfi_cli.mission.platform import PlatformProfile
+
+_FOLDER = Path(__file__).parent / "boards"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Board:
+    """One copy of the computer that the vehicle carries."""
+
+    name: str
+    mass_kg: float  # without the heat sink
+    power_w: float  # thermal design power
+    heatsink_kgpw: float  # mass of the heat sink for each watt of power_w
+    description: str = ""
+    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
+
+    def __post_init__(self) -> None:
+        for key in ("mass_kg", "power_w", "heatsink_kgpw"):
+            value = getattr(self, key)
+            if value < 0.0:
+                raise ValueError(f"{key}: must not be negative, is {value:g}")
+
+    @property
+    def total_kg(self) -> float:
+        """Mass of a board and its heat sink, kg."""
+        return self.mass_kg + self.heatsink_kgpw * self.power_w
+
+    @classmethod
+    def of_platform(cls, platform: PlatformProfile) -> Board:
+        """The board of a platform; one that stays on the ground has neither mass nor power."""
+        told = f"platform {platform.name}"
+        if not platform.carried:
+            told = f"{told} stays on the ground"
+        keys = ("mass_kg", "power_w", "heatsink_kgpw")
+        return cls(
+            name=platform.name,
+            description=platform.description,
+            sources=dict.fromkeys(keys, told),
+            **{key: getattr(platform, key) if platform.carried else 0.0 for key in keys},
+        )
+
+
+def board_names() -> list[str]:
+    """The shipped boards, in alphabetical order."""
+    return shipped_names(_FOLDER)
+
+
+def load_board(name_or_path: str) -> Board:
+    """A shipped board by name, or a user's own by the path of its TOML file.
+
+    Raises:
+        UnknownName: no shipped board has this name, and it is not a path to a TOML file.
+        ConfigError: the file cannot be used.
+    """
+    return load_toml(shipped_path("board", name_or_path, _FOLDER), Board)

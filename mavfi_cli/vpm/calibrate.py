@@ -1,0 +1,102 @@
+"""The one free number of a vehicle, found from one published ratio of flight times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.vpm.board import Board, load_board
+from mavfi_cli.vpm.model import GRAVITY_MPS2
+from mavfi_cli.vpm.schemes import REFERENCE, SCHEMES, named
+from mavfi_cli.vpm.setting import Setting
+from mavfi_cli.vpm.vehicle import Vehicle
+
+_SPAN = 1.0e4  # from the smallest to the largest value that is tried
+_STEPS = 200  # halvings of the interval; far below a float's resolution
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """A vehicle with its free number found, and the ratios of flight times that follow."""
+
+    vehicle: Vehicle
+    board: Board
+    parameter: str
+    value: float  # in the unit of the parameter
+    published_ratio: float
+    tmr_ratio: float  # flight time with TMR over that with detection and recovery
+    dmr_ratio: float  # a prediction: nothing was fitted to it
+
+
+def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
+    """Find the vehicle's free number so that its published ratio comes out.
+
+    The ratio falls as the free number grows, so that halving the interval finds it.
+
+    Args:
+        vehicle: with a calibration.
+        board: of which the redundant computers consist, where not the calibration's own.
+
+    Raises:
+        ConfigError: no value gives the ratio; says what can be reached.
+        UnknownName: the calibration's board does not exist.
+    """
+    plan = vehicle.calibration
+    assert plan is not None
+    board = board or load_board(plan.board)
+    known = {scheme.name: scheme for scheme in SCHEMES}
+
+    def setting(value: float) -> Setting:
+        pull_n, compute_s = vehicle.rotor_pull_n, vehicle.response_s
+        if plan.parameter == "rotor_pull_n":
+            pull_n = value
+        else:
+            compute_s = value
+        full = replace(vehicle, calibration=None, rotor_pull_n=pull_n, response_s=compute_s)
+        assert pull_n is not None  # the vehicle has the one that is not calibrated
+        assert compute_s is not None
+        return Setting(
+            vehicle=full, board=board, pull_n=pull_n, range_m=full.range_m,
+            compute_s=compute_s, distance_m=1.0,
+        )  # fmt: skip
+
+    def ratio(value: float, scheme: str) -> float:
+        fast = setting(value).velocity_mps(named(SCHEMES, REFERENCE))
+        slow = setting(value).velocity_mps(known[scheme])
+        return math.inf if fast is None or slow is None else fast / slow
+
+    low = 1.0 / vehicle.sensor_hz
+    if plan.parameter == "rotor_pull_n":
+        three_kg = vehicle.mass_kg + known["tmr"].copies * board.total_kg
+        low = three_kg * GRAVITY_MPS2 / math.cos(vehicle.tilt_rad)
+    value = _halving(lambda trial: ratio(trial, "tmr"), plan.tmr_time_ratio, low, low * _SPAN)
+    if value is None:
+        ends = f"{ratio(low * _SPAN, 'tmr'):.3f} to {ratio(low, 'tmr'):.3f}"
+        raise ConfigError(
+            f"no {plan.parameter} gives {vehicle.name!r} a ratio of {plan.tmr_time_ratio:g}; "
+            f"it can be {ends}",
+            key="calibration.tmr_time_ratio",
+        )
+    return Calibrated(
+        vehicle=setting(value).vehicle,
+        board=board,
+        parameter=plan.parameter,
+        value=value,
+        published_ratio=plan.tmr_time_ratio,
+        tmr_ratio=ratio(value, "tmr"),
+        dmr_ratio=ratio(value, "dmr"),
+    )
+
+
+def _halving(
+    falling: Callable[[float], float], target: float, low: float, high: float
+) -> float | None:
+    """Where a falling function takes the value `target`, or None outside its range."""
+    if not falling(high) <= target <= falling(low):
+        return None
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if falling(middle) > target else (low, middle)
+    return high

@@ -1,0 +1,217 @@
+"""The whole report as plain data: what is printed, drawn and written as JSON or CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.mission.platform import PlatformProfile
+from mavfi_cli.vpm.board import Board, load_board
+from mavfi_cli.vpm.calibrate import Calibrated, calibrated
+from mavfi_cli.vpm.model import KNEE_SHARE, safe_velocity_mps
+from mavfi_cli.vpm.schemes import REFERENCE, Scheme, named
+from mavfi_cli.vpm.sensitivity import sensitivity
+from mavfi_cli.vpm.setting import Outcome, Setting, outcome
+from mavfi_cli.vpm.vehicle import Vehicle
+
+# How the latencies of a platform's kernels make one response time, and how that is told.
+CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
+    "serial": (sum, "sum"),
+    "pipelined": (max, "slowest"),
+}
+OTHER_BOARD = "tx2"  # calibrations are repeated with it: what a heavier copy would mean
+RATIOS = ("velocity", "flight_time", "energy", "missions")
+_CURVE_HZ = np.logspace(-1.0, 3.0, 161)
+_COMMAND = "command line"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """What the user chose; None: the vehicle's own."""
+
+    platform: PlatformProfile | None = None
+    chain: str = "serial"  # one of CHAINS
+    board: Board | None = None
+    response_s: float | None = None
+    range_m: float | None = None
+    distance_m: float = 50.0
+
+
+def report(
+    vehicles: Sequence[Vehicle], choices: Choices, schemes: tuple[Scheme, ...]
+) -> dict[str, Any]:
+    """The model's answer for each vehicle; every key of a number names its unit or is a ratio.
+
+    Raises:
+        CannotLift: a vehicle does not lift even one board.
+        ConfigError: a vehicle lacks what the choices do not give either.
+    """
+    return {
+        "model": "F-1, IEEE CAL 19(1), equations 1 to 3",
+        "knee_velocity_over_roof_ratio": KNEE_SHARE,
+        "distance_m": choices.distance_m,
+        "ratios_over": REFERENCE,
+        "vehicles": [_one(vehicle, choices, schemes) for vehicle in vehicles],
+    }
+
+
+def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
+    found = calibrated(vehicle) if vehicle.calibration else None
+    setting, parameters = _setting(vehicle, choices, found)
+    reference = outcome(setting, named(schemes, REFERENCE))
+    return {
+        "vehicle": vehicle.name,
+        "description": vehicle.description,
+        "board": setting.board.name,
+        "parameters": parameters,
+        "schemes": [_row(setting, scheme, reference) for scheme in schemes],
+        "sensitivity": sensitivity(setting, schemes),
+        "calibrations": _calibrations(vehicle, found),
+        "curves": _curves(setting, schemes),
+    }
+
+
+def _setting(
+    vehicle: Vehicle, choices: Choices, found: Calibrated | None
+) -> tuple[Setting, list[dict[str, Any]]]:
+    """The numbers that the model works with, and the list of them with their sources."""
+    full = found.vehicle if found else vehicle
+    sources, free = dict(vehicle.sources), ""
+    if found is not None and vehicle.calibration is not None:
+        free = found.parameter
+        sources[free] = (
+            f"calibrated: TMR takes {found.published_ratio:g} times the flight time of detection "
+            f"and recovery, with board {found.board.name} ({vehicle.calibration.source})"
+        )
+    board = _board(vehicle, choices)
+    compute_s, given = full.response_s, ""
+    if choices.response_s is not None:
+        compute_s, given = choices.response_s, _COMMAND
+    elif choices.platform is not None:
+        kernels = choices.platform.kernels
+        combined, how = CHAINS[choices.chain]
+        compute_s = combined([each.latency_s for each in kernels.values()])
+        given = f"platform {choices.platform.name}: {how} of {', '.join(kernels)}"
+    if given:
+        sources["response_s"], free = given, "" if free == "response_s" else free
+    if compute_s is None:
+        raise ConfigError(f"vehicle {vehicle.name!r} has none: give --platform or --response",
+                          key="response_s")  # fmt: skip
+    if choices.range_m is not None:
+        sources["range_m"] = _COMMAND
+    assert full.rotor_pull_n is not None
+    setting = Setting(
+        vehicle=replace(full, response_s=compute_s, range_m=choices.range_m or full.range_m),
+        board=board,
+        pull_n=full.rotor_pull_n,
+        range_m=choices.range_m or full.range_m,
+        compute_s=compute_s,
+        distance_m=choices.distance_m,
+    )
+    return setting, _parameters(setting, sources, free)
+
+
+def _board(vehicle: Vehicle, choices: Choices) -> Board:
+    if choices.board is not None:
+        return choices.board
+    if choices.platform is not None:
+        return Board.of_platform(choices.platform)
+    if not vehicle.board:
+        raise ConfigError(f"vehicle {vehicle.name!r} has none: give --platform or --board",
+                          key="board")  # fmt: skip
+    return load_board(vehicle.board)
+
+
+def _parameters(setting: Setting, sources: dict[str, str], free: str) -> list[dict[str, Any]]:
+    units = {
+        "mass_kg": "kg", "rotor_pull_n": "N", "tilt_deg": "deg", "range_m": "m",
+        "sensor_hz": "Hz", "response_s": "s", "hover_power_w": "W", "battery_wh": "Wh",
+    }  # fmt: skip
+    sources.setdefault("tilt_deg", "CAL20: its Table 1 is reproduced with 0 degrees")
+    rows = [
+        {
+            "parameter": key, "value": getattr(setting.vehicle, key), "unit": unit,
+            "source": sources.get(key, "not given"), "calibrated": key == free,
+        }
+        for key, unit in units.items()
+    ]  # fmt: skip
+    for key, unit in (("mass_kg", "kg"), ("power_w", "W"), ("heatsink_kgpw", "kg/W")):
+        told = setting.board.sources.get(key, "not given")
+        rows.append({"parameter": f"board.{key}", "value": getattr(setting.board, key),
+                     "unit": unit, "source": told, "calibrated": False})  # fmt: skip
+    return rows
+
+
+def _row(setting: Setting, scheme: Scheme, reference: Outcome) -> dict[str, Any]:
+    """A scheme's numbers and its ratios over the reference, or why it cannot fly."""
+    told = {
+        "scheme": scheme.name, "title": scheme.title, "boards": scheme.copies,
+        "overhead_percent": 100.0 * scheme.overhead, "source": scheme.source,
+    }  # fmt: skip
+    numbers = [key.name for key in fields(Outcome) if key.name not in ("scheme", "bound")]
+    if setting.velocity_mps(scheme) is None:
+        nothing = dict.fromkeys([*numbers, *(f"{name}_ratio" for name in RATIOS), "bound"])
+        weights = {"mass_kg": setting.mass_kg(scheme.copies),
+                   "compute_kg": setting.carried_kg(scheme.copies)}  # fmt: skip
+        return {**told, **nothing, **weights, "problem": str(setting.too_heavy(scheme.copies))}
+    flown = outcome(setting, scheme)
+    return {
+        **told,
+        **{key: getattr(flown, key) for key in numbers},
+        "bound": flown.bound.value,
+        "velocity_ratio": flown.velocity_mps / reference.velocity_mps,
+        "flight_time_ratio": flown.flight_time_s / reference.flight_time_s,
+        "energy_ratio": flown.energy_j / reference.energy_j,
+        "missions_ratio": flown.missions / reference.missions,
+        "problem": None,
+    }
+
+
+def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, Any]]:
+    """The paper's figure: with the calibration's board, and once more with a heavier one."""
+    if found is None:
+        return []
+    both = [found]
+    if found.board.name != OTHER_BOARD:
+        both.append(calibrated(vehicle, load_board(OTHER_BOARD)))
+    units = {"rotor_pull_n": "N", "response_s": "s"}
+    return [
+        {
+            "board": each.board.name,
+            "board_kg": each.board.total_kg,
+            "parameter": each.parameter,
+            "value": each.value,
+            "unit": units[each.parameter],
+            "published_tmr_ratio": each.published_ratio,
+            "tmr_ratio": each.tmr_ratio,
+            "predicted_dmr_ratio": each.dmr_ratio,
+        }
+        for each in both
+    ]
+
+
+def _curves(setting: Setting, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
+    """Safe velocity against action throughput for one, two, three boards, where they fly."""
+    copies = sorted({scheme.copies for scheme in schemes})
+    flying = [(n, setting.acceleration_mps2(n)) for n in copies]
+    return {
+        "throughput_hz": _CURVE_HZ.tolist(),
+        "velocity_mps": {
+            str(n): safe_velocity_mps(accel, 1.0 / _CURVE_HZ, setting.range_m).tolist()
+            for n, accel in flying
+            if accel > 0.0
+        },
+    }
+
+
+def schemes_of(told: dict[str, Any]) -> list[dict[str, Any]]:
+    """One flat row a vehicle and scheme, for CSV."""
+    return [
+        {"vehicle": one["vehicle"], "board": one["board"], "distance_m": told["distance_m"], **row}
+        for one in told["vehicles"]
+        for row in one["schemes"]
+    ]

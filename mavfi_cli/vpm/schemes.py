@@ -1,0 +1,60 @@
+"""Ways to protect a computer, and what each costs: copies of the board, or compute time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from mavfi_cli.core.errors import ConfigError, UnknownName
+
+REFERENCE = "aad"  # what the paper's Fig. 15 holds redundancy against
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scheme:
+    """One way to protect the computer."""
+
+    name: str
+    title: str
+    copies: int = 1  # boards with their heat sinks
+    overhead: float = 0.0  # longer compute, as a share of it
+    source: str = ""
+
+
+_TABLE_V = "paper, Table V: Dense, the worst of four environments"
+SCHEMES = (
+    Scheme(name="none", title="no protection", source="one board"),
+    Scheme(name="dmr", title="DMR", copies=2, source="two boards; no time for the comparison"),
+    Scheme(name="tmr", title="TMR", copies=3, source="three boards; no time for the vote"),
+    Scheme(name="gad", title="detection (Gaussian)", overhead=0.022223, source=_TABLE_V),
+    Scheme(name="aad", title="detection (autoencoder)", overhead=0.000062, source=_TABLE_V),
+)
+
+
+def schemes_with(overheads_percent: Mapping[str, float]) -> tuple[Scheme, ...]:
+    """The schemes, with measured overheads in place of the paper's.
+
+    Args:
+        overheads_percent: of a detector's name to its overhead, per cent of the compute time.
+
+    Raises:
+        UnknownName: a scheme that does not detect and recover.
+        ConfigError: a negative overhead.
+    """
+    known = [scheme.name for scheme in SCHEMES if scheme.overhead > 0.0]
+    for name, percent in overheads_percent.items():
+        if name not in known:
+            raise UnknownName("detector", name, known)
+        if not percent >= 0.0:
+            raise ConfigError(f"must not be negative, is {percent:g} %", key=f"overhead of {name}")
+    return tuple(
+        replace(scheme, overhead=overheads_percent[scheme.name] / 100.0, source="--overhead")
+        if scheme.name in overheads_percent
+        else scheme
+        for scheme in SCHEMES
+    )
+
+
+def named(schemes: tuple[Scheme, ...], name: str) -> Scheme:
+    """The scheme of this name, which must be there."""
+    return next(scheme for scheme in schemes if scheme.name == name)

@@ -1,0 +1,85 @@
+"""Vehicles as the model sees them: mass, rotor pull, sensor, battery. TOML files, one a vehicle."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
+
+CALIBRATED = ("rotor_pull_n", "response_s")  # what a calibration may set
+_FOLDER = Path(__file__).parent / "vehicles"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """One number that nobody published, set so that one published ratio comes out."""
+
+    parameter: str  # one of CALIBRATED
+    board: str  # a shipped board, of which the redundant computers consist
+    tmr_time_ratio: float  # flight time with TMR over that with detection and recovery
+    source: str  # of the ratio
+
+    def __post_init__(self) -> None:
+        if self.parameter not in CALIBRATED:
+            raise ValueError(f"parameter: must be {' or '.join(CALIBRATED)}, is {self.parameter}")
+        if self.tmr_time_ratio <= 1.0:
+            raise ValueError(f"tmr_time_ratio: must be above 1, is {self.tmr_time_ratio:g}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vehicle:
+    """A quadrotor for the model; a number that is calibrated is None until it is."""
+
+    name: str
+    mass_kg: float  # frame, rotors and battery, without the boards
+    rotor_pull_n: float | None = None  # thrust of all rotors at full throttle
+    response_s: float | None = None  # from sensing to acting, where no platform is named
+    range_m: float  # how far the sensor sees
+    sensor_hz: float
+    hover_power_w: float  # at mass_kg
+    battery_wh: float
+    tilt_deg: float = 0.0
+    board: str = ""  # a shipped board, where no platform is named
+    description: str = ""
+    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
+    calibration: Calibration | None = None
+
+    def __post_init__(self) -> None:
+        for key in (
+            "mass_kg", "rotor_pull_n", "response_s", "range_m", "sensor_hz", "hover_power_w",
+            "battery_wh",
+        ):  # fmt: skip
+            value = getattr(self, key)
+            if value is not None and value <= 0.0:
+                raise ValueError(f"{key}: must be above zero, is {value:g}")
+        if not 0.0 <= self.tilt_deg < 90.0:
+            raise ValueError(f"tilt_deg: must be within 0 and 90, is {self.tilt_deg:g}")
+        free = self.calibration.parameter if self.calibration else ""
+        if free and getattr(self, free) is not None:
+            raise ValueError(f"{free}: has a value, so it cannot be calibrated")
+        if self.rotor_pull_n is None and free != "rotor_pull_n":
+            raise ValueError("rotor_pull_n: is missing, and no calibration sets it")
+        if free == "rotor_pull_n" and self.response_s is None:
+            raise ValueError("response_s: is missing, the calibration needs it")
+
+    @property
+    def tilt_rad(self) -> float:
+        """Angle between the thrust and the vertical, rad."""
+        return math.radians(self.tilt_deg)
+
+
+def vehicle_names() -> list[str]:
+    """The shipped vehicles of the model, in alphabetical order."""
+    return shipped_names(_FOLDER)
+
+
+def load_vehicle(name_or_path: str) -> Vehicle:
+    """A shipped vehicle of the model by name, or a user's own by the path of its TOML file.
+
+    Raises:
+        UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
+        ConfigError: the file cannot be used.
+    """
+    return load_toml(shipped_path("vehicle", name_or_path, _FOLDER), Vehicle)
