@@ -8,7 +8,18 @@ from typing import Any
 
 import click
 
-_ABOVE_ZERO = click.FloatRange(min=0.0, min_open=True)
+
+class _Positive(click.FloatRange):
+    """A number above zero, at most a million; click's own range lets "nan" through."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        number = float(super().convert(value, param, ctx))
+        return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
+
+
+_ABOVE_ZERO = _Positive(min=0.0, max=1.0e6, min_open=True)
 
 
 @click.command()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
-from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 from mavfi_cli.core.seeds import Stream, generator
 
 KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
@@ -93,6 +93,7 @@ class _PlatformFile:
     sources: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        _check_names(self.kernels)
         if self.scale <= 0.0:
             raise ValueError(f"scale must be above zero, got {self.scale:g}")
         if not self.base and self.scale != 1.0:
@@ -106,13 +107,19 @@ def _check_latency(latency_s: float, spread: float) -> None:
         raise ValueError(f"spread must be within 0 and 2, got {spread:g}")
 
 
+def _check_names(kernels: Collection[str]) -> None:
+    for kernel in kernels:
+        if kernel not in KERNELS:
+            match = nearest(kernel, KERNELS)
+            hint = f"did you mean {match!r}? " if match else ""
+            raise ValueError(f"kernels.{kernel}: no such kernel; {hint}Known: {', '.join(KERNELS)}")
+
+
 def _check_kernels(kernels: Collection[str]) -> None:
+    _check_names(kernels)
     missing = [f"kernels.{kernel}" for kernel in KERNELS if kernel not in kernels]
     if missing:
         raise ValueError(f"{', '.join(missing)}: missing, a kernel without a latency")
-    unknown = [f"kernels.{kernel}" for kernel in kernels if kernel not in KERNELS]
-    if unknown:
-        raise ValueError(f"{', '.join(unknown)}: no such kernel (known: {', '.join(KERNELS)})")
 
 
 def _check_hardware(profile: PlatformProfile) -> None:
@@ -155,9 +162,8 @@ def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
         for name, latency in base.items()
     }
     for name, entry in file.kernels.items():
-        if entry.scale is not None and name not in base:
-            problem = "scale needs a base" if name in KERNELS else "no such kernel"
-            raise ConfigError(problem, path=path, key=f"kernels.{name}")
+        if entry.scale is not None and not base:
+            raise ConfigError("scale needs a base", path=path, key=f"kernels.{name}")
         kernels[name] = _latency(entry, base.get(name), file.base)
     shared = {key.name: getattr(file, key.name) for key in fields(PlatformProfile)}
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -39,14 +40,14 @@ def schemes_with(overheads_percent: Mapping[str, float]) -> tuple[Scheme, ...]:
 
     Raises:
         UnknownName: a scheme that does not detect and recover.
-        ConfigError: a negative overhead.
+        ConfigError: an overhead that is negative or not finite.
     """
     known = [scheme.name for scheme in SCHEMES if scheme.overhead > 0.0]
     for name, percent in overheads_percent.items():
         if name not in known:
             raise UnknownName("detector", name, known)
-        if not percent >= 0.0:
-            raise ConfigError(f"must not be negative, is {percent:g} %", key=f"overhead of {name}")
+        if not 0.0 <= percent < math.inf:
+            raise ConfigError(f"must be zero or more, is {percent:g} %", key=f"overhead of {name}")
     return tuple(
         replace(scheme, overhead=overheads_percent[scheme.name] / 100.0, source="--overhead")
         if scheme.name in overheads_percent

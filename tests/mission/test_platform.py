@@ -54,12 +54,21 @@ def test_a_file_of_one_s_own(load):
         ("cores = 2", "cores = 2.5", r"mine\.toml:2: cores: expected int"),
         ("cores = 2", "corse = 2", r"mine\.toml:2: corse: unknown key; did you mean 'cores'"),
         ("cores = 2", "cores = ", r"mine\.toml:2: Invalid value"),
-        ("[kernels.planner]", "[kernels.planer]", "without a latency: planner"),
+        (
+            "[kernels.planner]",
+            "[kernels.planer]",
+            r"mine\.toml.*kernels\.planer: no such kernel; did you mean 'planner'",
+        ),
         ("latency_s = 0.02", "latency_s = -0.02", r"mine\.toml:6: kernels\.octomap: .*negative"),
         ("latency_s = 0.02", "latency_s = nan", "finite"),
         ("latency_s = 0.02", 'latency_s = "fast"', r"mine\.toml:7: kernels\.octomap\.latency_s"),
         ("spread = 0.5", "spread = 2.5", "spread must be within 0 and 2"),
-        ("cores = 2", "cores = 2\npower_w = -1.0", "must not be negative"),
+        ("cores = 2", "cores = 2\npower_w = -1.0", r"mine\.toml.*power_w: must not be neg"),
+        ("cores = 2", "cores = 2\nmass_kg = -1.0", r"mine\.toml.*mass_kg: must not be neg"),
+        ("latency_s = 0.02", "scale = 2.0", r"mine\.toml.*kernels\.octomap: scale needs a base"),
+        ("latency_s = 0.02", "", r"mine\.toml.*kernels\.octomap: needs either latency_s or scale"),
+        ("cores = 2", "cores = 2\nscale = 2.0", r"mine\.toml.*scale needs a base"),
+        ("cores = 2", 'cores = 2\nbase = "x68"', r"mine\.toml: base: .*did you mean 'x86'"),
     ],
 )
 def test_what_is_wrong_with_a_file(load, old, new, said):
@@ -69,8 +78,64 @@ def test_what_is_wrong_with_a_file(load, old, new, said):
 
 
 def test_a_kernel_too_many(load):
-    with pytest.raises(ConfigError, match="unknown kernels: dreams"):
+    with pytest.raises(ConfigError, match=r"kernels\.dreams: no such kernel; Known: point_cloud"):
         load(SOUND + "[kernels.dreams]\nlatency_s = 1.0\n")
+
+
+def test_a_kernel_missing(load):
+    text = SOUND[: SOUND.index("[kernels.control]")]
+    with pytest.raises(ConfigError, match=r"mine\.toml: kernels\.control: missing"):
+        load(text)
+
+
+SCALED = """name = "mine"
+base = "x86"
+cores = 4
+scale = 3.0
+[kernels.octomap]
+scale = 2.0
+source = "a guess"
+[kernels.planner]
+latency_s = 0.5
+[kernels.control]
+scale = 1.5
+spread = 0.0
+"""
+
+
+def test_a_platform_that_scales_another(load):
+    mine, x86 = load(SCALED).kernels, load_platform("x86").kernels
+    factors = {kernel: mine[kernel].latency_s / x86[kernel].latency_s for kernel in KERNELS}
+    assert factors == pytest.approx(
+        {"point_cloud": 3.0, "octomap": 2.0, "collision_check": 3.0,
+         "planner": 0.5 / 0.083, "control": 1.5}
+    )  # fmt: skip
+    assert mine["octomap"].spread == x86["octomap"].spread
+    assert mine["control"].spread == 0.0
+    assert mine["octomap"].source == "x86 x 2: a guess"
+    assert mine["point_cloud"].source == "x86 x 3"
+    assert load_platform("x86").mass_kg == load(SCALED).mass_kg == 0.0
+
+
+def test_a_scale_must_be_above_zero(load):
+    with pytest.raises(
+        ConfigError, match=r"mine\.toml.*kernels\.octomap: scale must be above zero"
+    ):
+        load(SCALED.replace("scale = 2.0", "scale = -2.0"))
+
+
+def test_tx2_is_slower_in_every_kernel_and_with_every_cut():
+    x86, tx2 = load_platform("x86").kernels, load_platform("tx2").kernels
+    assert all(tx2[kernel].latency_s > x86[kernel].latency_s for kernel in KERNELS)
+    octomap = [
+        load_platform(name).kernels["octomap"].latency_s
+        for name in ("tx2", "tx2-2c-2.04", "tx2-4c-0.81", "tx2-2c-0.81")
+    ]
+    assert octomap == sorted(octomap)
+    # MAVBench logs of the mapping application, medians over that of four cores at 2.04 GHz
+    logged = [0.458, 0.667, 1.20, 2.96]
+    for found, seconds in zip(octomap, logged, strict=True):
+        assert found / octomap[0] == pytest.approx(seconds / logged[0], rel=0.01)
 
 
 @pytest.mark.parametrize(

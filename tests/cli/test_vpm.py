@@ -1,0 +1,136 @@
+"""`mavfi vpm` and `mavfi platforms`: tables, JSON, CSV, pictures, and what is refused."""
+
+import csv
+import json
+import re
+import xml.etree.ElementTree as ET
+
+import pytest
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def test_the_table_is_the_paper_s_figure(command_line):
+    code, out, err = command_line("vpm")
+    assert (code, err) == (0, "")
+    assert "== airsim: AirSim UAV" in out
+    assert "== spark: DJI Spark" in out
+    assert "response_s = 0.8175 s (calibrated); TMR x 1.0600, paper x 1.06; DMR x 1.0287" in out
+    assert "rotor_pull_n = 8.331 N (calibrated); TMR x 1.9100, paper x 1.91; DMR x 1.2959" in out
+
+
+def test_csv_and_json_say_the_same(command_line, tmp_path):
+    _, out, _ = command_line("vpm", "--csv")
+    rows = list(csv.DictReader(out.splitlines()))
+    told = json.loads(command_line("vpm", "--json")[1])
+    flat = [(one["vehicle"], row) for one in told["vehicles"] for row in one["schemes"]]
+    assert len(rows) == len(flat) == 10
+    for row, (vehicle, same) in zip(rows, flat, strict=True):
+        assert (row["vehicle"], row["scheme"]) == (vehicle, same["scheme"])
+        assert float(row["flight_time_s"]) == same["flight_time_s"]
+        assert float(row["energy_ratio"]) == same["energy_ratio"]
+
+
+UNITS = ("_kg", "_n", "_m", "_s", "_hz", "_w", "_j", "_wh", "_deg", "_mps", "_mps2", "_kgpw",
+         "_ratio", "_percent")  # fmt: skip
+COUNTS = {"boards", "missions", "thrust_to_weight"}  # these have no unit
+
+
+def numbers(value, key=""):
+    if isinstance(value, dict):
+        for name, item in value.items():
+            if name == "value":
+                assert value["unit"], value
+            else:
+                yield from numbers(item, key if name.isdecimal() else name)
+    elif isinstance(value, list):
+        for item in value:
+            yield from numbers(item, key)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield key
+
+
+def test_every_number_of_the_json_has_its_unit(command_line):
+    told = json.loads(command_line("vpm", "--json")[1])
+    for one in told["vehicles"]:
+        for row in one["sensitivity"]:
+            row["points"] = [{**point, "unit": row["unit"]} for point in row["points"]]
+    keys = set(numbers(told))
+    assert {"velocity_mps", "energy_j", "missions"} <= keys
+    assert [key for key in keys if key not in COUNTS and not key.endswith(UNITS)] == []
+
+
+def test_every_number_of_the_table_has_its_unit(command_line):
+    """In each row of a scheme, only its boards and its missions are counts."""
+    _, out, _ = command_line("vpm", "--vehicle", "spark")
+    unit = r"(?:%|kg|N/N|m/s²|m/s|Hz|s|W|kJ)(?= |$)"
+    found = [line for line in out.splitlines() if re.match(r"(none|dmr|tmr|gad|aad) ", line)]
+    assert len(found) == 10
+    for line in found:
+        bare = re.sub(rf"[\d.]+ {unit}|x [\d.]+", "", line)
+        assert len(re.findall(r"\d[\d.]*", bare)) == 1, line
+
+
+def test_files_and_pictures(command_line, tmp_path):
+    line = ("vpm", "--vehicle", "spark", "--board", "xavier", "--out", "report")
+    assert command_line(*line)[0] == 0
+    folder = tmp_path / "report"
+    first = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert set(first) == {"roofline.svg", "redundancy.svg", "vpm.json", "vpm.csv"}
+    words = {
+        name: " ".join(text.text or "" for text in ET.fromstring(data).iter(f"{SVG}text"))
+        for name, data in first.items()
+        if name.endswith(".svg")
+    }
+    assert "TMR cannot be lifted" in words["roofline.svg"]
+    assert "action throughput, Hz" in words["roofline.svg"]
+    assert "cannot be lifted" in words["redundancy.svg"]
+    assert "rotor_pull_n = 8.331 N is calibrated" in words["redundancy.svg"]
+    assert command_line(*line)[0] == 0
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == first
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--vehicle", "sparck"), "unknown vehicle 'sparck': did you mean 'spark'?"),
+        (("--platform", "tx3"), "unknown platform 'tx3': did you mean 'tx2'?"),
+        (("--board", "xaviar"), "unknown board 'xaviar': did you mean 'xavier'?"),
+        (("--overhead", "aead=1"), "unknown detector 'aead': did you mean 'aad'?"),
+        (("--vehicle", "none.toml"), "none.toml: no such file"),
+        (("--out", "file/below"), "file/below: Not a directory"),
+    ],
+)
+def test_bad_input_is_one_line(command_line, tmp_path, arguments, said):
+    (tmp_path / "file").touch()
+    code, out, err = command_line("vpm", *arguments)
+    assert (code, out) == (1, "")
+    (line,) = err.splitlines()
+    assert line.startswith(f"error: {said}")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--overhead", "aad"), ("--range", "0"), ("--response=-1",), ("--json", "--csv"),
+     ("--distance", "nan"), ("--range", "inf")],
+)  # fmt: skip
+def test_usage(command_line, arguments):
+    code, out, err = command_line("vpm", *arguments)
+    assert (code, out) == (2, "")
+    assert "Error: " in err
+
+
+def test_platforms(command_line, tmp_path):
+    code, out, _ = command_line("platforms")
+    assert code == 0
+    for name in ("x86", "tx2", "tx2-2c-0.81", "tx2-2c-2.04", "tx2-4c-0.81"):
+        assert re.search(rf"^{re.escape(name)} +\d+ cores", out, re.M)
+    code, out, _ = command_line("platforms", "x86", "tx2")
+    assert re.search(r"octomap +289\.00 ms", out)
+    assert re.search(r"octomap +1346\.74 ms .* x86 x 4\.66: same workload", out)
+    told = json.loads(command_line("platforms", "tx2", "--json")[1])
+    assert told[0]["kernels"]["collision_check"]["latency_s"] == 0.074
+    (tmp_path / "mine.toml").write_text('name = "mine"\nbase = "tx2"\ncores = 6\nscale = 0.5\n')
+    code, out, _ = command_line("platforms", "mine.toml")
+    assert re.search(r"octomap +673\.37 ms", out)
+    assert command_line("platforms", "tx1")[2].startswith("error: unknown platform 'tx1': did you")
