@@ -35,8 +35,8 @@ def _all_s(profile: Any) -> float:
 
 def _line(profile: Any) -> str:
     return (
-        f"{profile.name:<12} {profile.cores:>3} cores {profile.power_w:>6.1f} W "
-        f"{1000 * profile.mass_kg:>5.0f} g  all kernels {_all_s(profile):>6.3f} s  "
+        f"{profile.name:<12} {profile.cores:>3} cores {profile.power_w:>6.1f} W  "
+        f"board {1000 * profile.mass_kg:>3.0f} g  all kernels {_all_s(profile):>6.3f} s  "
         f"{profile.description}"
     )
 
