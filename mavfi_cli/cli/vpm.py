@@ -10,7 +10,7 @@ import click
 
 
 class _Positive(click.FloatRange):
-    """A number above zero, at most a million; click's own range lets "nan" through."""
+    """A number from a millionth to a million; click's own range lets "nan" through."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -19,7 +19,7 @@ class _Positive(click.FloatRange):
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 
-_ABOVE_ZERO = _Positive(min=0.0, max=1.0e6, min_open=True)
+_ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
 
 
 @click.command()

@@ -18,6 +18,8 @@ from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 from mavfi_cli.core.seeds import Stream, generator
 
 KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
+_LONGEST_S = 3600.0
+_LARGEST = 1.0e6  # W or kg; more is a slip of the unit
 _FOLDER = Path(__file__).parent / "platforms"
 
 
@@ -103,6 +105,8 @@ class _PlatformFile:
 def _check_latency(latency_s: float, spread: float) -> None:
     if latency_s < 0.0:
         raise ValueError(f"latency_s must not be negative, got {latency_s:g}")
+    if latency_s > _LONGEST_S:
+        raise ValueError(f"latency_s must be at most {_LONGEST_S:g}, got {latency_s:g}")
     if not 0.0 <= spread <= 2.0:
         raise ValueError(f"spread must be within 0 and 2, got {spread:g}")
 
@@ -127,6 +131,8 @@ def _check_hardware(profile: PlatformProfile) -> None:
         value = getattr(profile, key)
         if value < 0.0:
             raise ValueError(f"{key}: must not be negative, is {value:g}")
+        if value > _LARGEST:
+            raise ValueError(f"{key}: must be at most {_LARGEST:g}, is {value:g}")
 
 
 def platform_names() -> list[str]:
@@ -153,6 +159,17 @@ def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
             error = UnknownName("platform", file.base, set(platform_names()) - {path.stem})
             raise ConfigError(str(error), path=path, key="base")
         base = load_platform(file.base).kernels
+    shared = {key.name: getattr(file, key.name) for key in fields(PlatformProfile)}
+    try:
+        return PlatformProfile(**{**shared, "kernels": _kernels(file, base, path)})
+    except ValueError as error:
+        raise ConfigError(str(error), path=path) from None
+
+
+def _kernels(
+    file: _PlatformFile, base: dict[str, KernelLatency], path: Path
+) -> dict[str, KernelLatency]:
+    """Every kernel's latency: the base's times the file's factor, or the kernel's own entry."""
     kernels = {
         name: replace(
             latency,
@@ -165,11 +182,7 @@ def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
         if entry.scale is not None and not base:
             raise ConfigError("scale needs a base", path=path, key=f"kernels.{name}")
         kernels[name] = _latency(entry, base.get(name), file.base)
-    shared = {key.name: getattr(file, key.name) for key in fields(PlatformProfile)}
-    try:
-        return PlatformProfile(**{**shared, "kernels": kernels})
-    except ValueError as error:
-        raise ConfigError(str(error), path=path) from None
+    return kernels
 
 
 def _latency(entry: _KernelEntry, base: KernelLatency | None, base_name: str) -> KernelLatency:

@@ -8,6 +8,7 @@ from pathlib import Path
 from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
 from mavfi_cli.mission.platform import PlatformProfile
 
+LARGEST = 1.0e6  # of any number here; more is a slip of the unit
 _FOLDER = Path(__file__).parent / "boards"
 
 
@@ -27,6 +28,8 @@ class Board:
             value = getattr(self, key)
             if value < 0.0:
                 raise ValueError(f"{key}: must not be negative, is {value:g}")
+            if value > LARGEST:
+                raise ValueError(f"{key}: must be at most {LARGEST:g}, is {value:g}")
 
     @property
     def total_kg(self) -> float:

@@ -95,6 +95,8 @@ def _setting(
         kernels = choices.platform.kernels
         combined, how = CHAINS[choices.chain]
         compute_s = combined([each.latency_s for each in kernels.values()])
+        if compute_s == 0.0:
+            raise ConfigError(f"no kernel of platform {choices.platform.name!r} takes any time")
         given = f"platform {choices.platform.name}: {how} of {', '.join(kernels)}"
     if given:
         sources["response_s"], free = given, "" if free == "response_s" else free

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
+from mavfi_cli.vpm.board import LARGEST
 
 CALIBRATED = ("rotor_pull_n", "response_s")  # what a calibration may set
 _FOLDER = Path(__file__).parent / "vehicles"
@@ -54,6 +55,8 @@ class Vehicle:
             value = getattr(self, key)
             if value is not None and value <= 0.0:
                 raise ValueError(f"{key}: must be above zero, is {value:g}")
+            if value is not None and value > LARGEST:
+                raise ValueError(f"{key}: must be at most {LARGEST:g}, is {value:g}")
         if not 0.0 <= self.tilt_deg < 90.0:
             raise ValueError(f"tilt_deg: must be within 0 and 90, is {self.tilt_deg:g}")
         free = self.calibration.parameter if self.calibration else ""

@@ -65,6 +65,8 @@ def test_a_file_of_one_s_own(load):
         ("spread = 0.5", "spread = 2.5", "spread must be within 0 and 2"),
         ("cores = 2", "cores = 2\npower_w = -1.0", r"mine\.toml.*power_w: must not be neg"),
         ("cores = 2", "cores = 2\nmass_kg = -1.0", r"mine\.toml.*mass_kg: must not be neg"),
+        ("cores = 2", "cores = 2\npower_w = 1e9", r"mine\.toml.*power_w: must be at most"),
+        ("latency_s = 0.02", "latency_s = 9e9", r"mine\.toml:6: kernels\.octomap: .*at most 3600"),
         ("latency_s = 0.02", "scale = 2.0", r"mine\.toml.*kernels\.octomap: scale needs a base"),
         ("latency_s = 0.02", "", r"mine\.toml.*kernels\.octomap: needs either latency_s or scale"),
         ("cores = 2", "cores = 2\nscale = 2.0", r"mine\.toml.*scale needs a base"),
@@ -122,6 +124,11 @@ def test_a_scale_must_be_above_zero(load):
         ConfigError, match=r"mine\.toml.*kernels\.octomap: scale must be above zero"
     ):
         load(SCALED.replace("scale = 2.0", "scale = -2.0"))
+
+
+def test_a_scale_that_goes_too_far(load):
+    with pytest.raises(ConfigError, match=r"mine\.toml: latency_s must be at most 3600"):
+        load(SCALED.replace("scale = 3.0", "scale = 1e9"))
 
 
 def test_tx2_is_slower_in_every_kernel_and_with_every_cut():

@@ -128,6 +128,15 @@ def test_a_platform_gives_response_time_and_board():
     assert parameters(one)["response_s"]["value"] == pytest.approx(max(medians))
 
 
+def test_a_platform_that_takes_no_time(tmp_path):
+    text = 'name = "x"\nbase = "x86"\ncores = 1\n' + "".join(
+        f"[kernels.{kernel}]\nlatency_s = 0\n" for kernel in load_platform("x86").kernels
+    )
+    (tmp_path / "x.toml").write_text(text)
+    with pytest.raises(ConfigError, match="no kernel of platform 'x' takes any time"):
+        told("spark", Choices(platform=load_platform(str(tmp_path / "x.toml"))))
+
+
 def test_a_platform_on_the_ground_costs_no_mass():
     assert Board.of_platform(load_platform("x86")).total_kg == 0.0
     tmr = rows(told("spark", Choices(platform=load_platform("x86"))))["tmr"]
@@ -188,6 +197,12 @@ def test_an_overhead_of_one_s_own():
     ("vehicle", "old", "new", "said"),
     [
         ("spark", "mass_kg = 0.300", "mass_kg = -0.3", r"mine\.toml.*mass_kg: must be above zero"),
+        (
+            "spark",
+            "mass_kg = 0.300",
+            "mass_kg = 1e300",
+            r"mass_kg: must be at most 1e\+06, is 1e\+300",
+        ),
         ("spark", "range_m = 7.0\n", "", r"mine\.toml.*range_m.*missing"),
         (
             "spark",
