@@ -1,5 +1,6 @@
 """Compute platforms: their files, and the latencies that are drawn from them."""
 
+import json
 import math
 
 import numpy as np
@@ -196,3 +197,19 @@ def test_the_kernels_draws_are_independent(load):
     logs = np.log([draws(model, kernel, 2000) for kernel in KERNELS])
     correlation = np.corrcoef(logs) - np.eye(len(KERNELS))
     assert np.abs(correlation).max() < 0.1
+
+
+def responses(folder):
+    return json.loads(folder.result.read_text())["response_time_s"]
+
+
+def test_a_flight_responds_as_late_as_its_platform_s_kernels(fly_short, short_flight, tmp_path):
+    """The map is the slowest kernel on the way from a frame to a setpoint."""
+    (tmp_path / "mine.toml").write_text('name = "mine"\nbase = "tx2"\ncores = 4\nscale = 0.5\n')
+    platforms = ("tx2", str(tmp_path / "mine.toml"))
+    found = [responses(short_flight), *(responses(fly_short(platform=p)) for p in platforms)]
+    x86, tx2, mine = (response["median"] for response in found)
+    assert x86 < mine < tx2
+    octomap_s = load_platform("tx2").kernels["octomap"].latency_s
+    assert octomap_s < tx2 < 2.0 * octomap_s
+    assert octomap_s / 2 < mine < octomap_s
