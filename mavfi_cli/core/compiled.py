@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
+
+from mavfi_cli.core.sources import folder_digest
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -27,7 +27,7 @@ def compiled(function: F) -> F:
     if cache_file is not None:
         known: list[Any] = [function, *_callees(function)]
         folders = sorted({Path(inspect.getfile(each)).parent for each in known})
-        cache_file._source_stamp = tuple(_sources_digest(folder) for folder in folders)
+        cache_file._source_stamp = tuple(folder_digest(folder) for folder in folders)
     kernel: F = dispatcher
     return kernel
 
@@ -35,13 +35,3 @@ def compiled(function: F) -> F:
 def _callees(function: Any) -> list[Any]:
     """The Python side of every compiled function that the module of `function` has so far."""
     return [each.py_func for each in function.__globals__.values() if hasattr(each, "py_func")]
-
-
-@cache
-def _sources_digest(folder: Path) -> str:
-    """SHA-256 of all Python sources of a folder, by name and content."""
-    digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
-        digest.update(path.name.encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()

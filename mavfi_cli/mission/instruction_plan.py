@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-import mavfi_cli
 from mavfi_cli.core.errors import FaultError, RecordError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.sources import own_digest
 from mavfi_cli.fi import record
 from mavfi_cli.fi.native.fault import InstructionFault
 from mavfi_cli.fi.sampling import draw_fault
@@ -189,18 +187,7 @@ def _key(golden: MissionConfig, versions: Mapping[str, str]) -> str:
     parts = [
         json.dumps(values, sort_keys=True),
         json.dumps(dict(versions), sort_keys=True),
-        _sources(),
+        own_digest(),
         *(hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()),
     ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
-
-
-@cache
-def _sources() -> str:
-    """Digest of our own code: after an edit the golden flight may be another one."""
-    digest = hashlib.sha256()
-    package = Path(os.path.dirname(mavfi_cli.__file__))
-    for folder in (package, package.parent / "sitl"):
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()

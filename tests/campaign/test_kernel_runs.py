@@ -11,7 +11,7 @@ from mavfi_cli.campaign.kernels.difference import pack
 from mavfi_cli.campaign.kernels.inputs import load_inputs
 from mavfi_cli.campaign.kernels.replay import replay_runs
 from mavfi_cli.campaign.kernels.summary import CSV_COLUMNS, csv_rows, summarise, table
-from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
+from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
 from mavfi_cli.fi.isolated import profile as isolated_profile
 from mavfi_cli.fi.isolated.compare import digest
@@ -87,6 +87,13 @@ def test_runs_of_a_program_are_not_replayed_as_kernels(tmp_path):
     write_json(tmp_path / "plan.json", {"program": ["a.out"]})
     with pytest.raises(RecordError, match="runs of a program"):
         list(replay_runs(tmp_path))
+
+
+def test_runs_of_other_code_are_not_replayed(control_copy):
+    plan = json.loads((control_copy / "plan.json").read_text())
+    write_json(control_copy / "plan.json", plan | {"sources": "of another version"})
+    with pytest.raises(BuildMismatch, match="our own code"):
+        list(replay_runs(control_copy))
 
 
 def test_nothing_to_replay_is_an_error(tmp_path):

@@ -12,7 +12,8 @@ from mavfi_cli.campaign.kernels import catalogue
 from mavfi_cli.campaign.kernels.attack import KernelVerdict, attacker_of, golden_run
 from mavfi_cli.campaign.kernels.inputs import INPUTS
 from mavfi_cli.campaign.kernels.place import Place, load, template_of
-from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.errors import BuildMismatch, RecordError
+from mavfi_cli.core.sources import own_digest
 from mavfi_cli.fi import record
 from mavfi_cli.fi.isolated.attack import Attacker
 from mavfi_cli.fi.isolated.journal import read_plan, read_runs
@@ -51,6 +52,8 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
     plan = read_plan(folder)
     if "tolerance" not in plan:
         raise RecordError(f"{folder}: holds runs of a program; only our kernels' can be repeated")
+    if plan.get("sources") != own_digest():  # other code lays out the memory otherwise
+        raise BuildMismatch(["our own code"])
     tolerance = float(plan["tolerance"])
     found = False
     for kernel in catalogue.select(kernels):

@@ -17,6 +17,7 @@ from mavfi_cli.campaign.kernels.attack import Golden, KernelVerdict, attacker_of
 from mavfi_cli.campaign.kernels.place import Layout, Place, load, template_of
 from mavfi_cli.campaign.kernels.profile import profile_kernel
 from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.sources import own_digest
 from mavfi_cli.fi.isolated.attack import Attacker
 from mavfi_cli.fi.isolated.journal import Journal
 from mavfi_cli.fi.isolated.profile import TargetProfile
@@ -49,6 +50,7 @@ class Plan(FaultPlan):
             "inputs_sha256": self.inputs_sha256,
             "flight": self.flight,
             "tolerance": self.tolerance,
+            "sources": own_digest(),
         }
 
 
