@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import Enum
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -164,8 +165,10 @@ class Protection(NoProtection):
 
     def _judge(self, kind: str, check: Callable[[], Alarm | None]) -> Alarm | None:
         self._checks[kind] += 1
-        with self._wall.measure("gate"):
-            return check()
+        begun_s = perf_counter()
+        alarm = check()
+        self._wall.add("gate", perf_counter() - begun_s)
+        return alarm
 
     def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Response:
         recovery = self._recoveries[stage]

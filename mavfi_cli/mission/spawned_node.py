@@ -31,7 +31,8 @@ class SpawnedNode:
             (os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0),
             (os.POSIX_SPAWN_DUP2, theirs.fileno(), _CHANNEL),
         ]
-        line = [sys.executable, "-m", "mavfi_cli.mission.node_server", str(_CHANNEL)]
+        # -P: where we stand must not decide what is imported, and so how its memory lies.
+        line = [sys.executable, "-P", "-m", "mavfi_cli.mission.node_server", str(_CHANNEL)]
         with theirs, linux.fixed_addresses():
             self.pid = os.posix_spawn(
                 sys.executable, line, {**environment, **_FIXED},

@@ -21,6 +21,7 @@ KINDS = [
 VALUES = {
     "float64": st.floats(),
     "float32": st.floats(width=32, allow_nan=False),
+    "int16": st.integers(-(2**15), 2**15 - 1),
     "int32": st.integers(-(2**31), 2**31 - 1),
     "int64": st.integers(-(2**63), 2**63 - 1),
     "bool": st.booleans(),
