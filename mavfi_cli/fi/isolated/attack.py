@@ -96,7 +96,7 @@ class Limits:
     """When a run counts as hung, and how far to step."""
 
     factor: float = 10.0  # times the golden CPU time and duration
-    cpu_grace_s: float = 0.2
+    cpu_grace_s: float = 1.0
     wall_grace_s: float = 5.0  # a loaded machine delays; only a blocked target waits this long
     follow_window: int = 64  # instructions after a destination fault
     profile_steps: int = 2_000_000  # of one window
