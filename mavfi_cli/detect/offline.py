@@ -4,6 +4,9 @@ A trace is a mapping of column names to arrays, one row a control tick: `stamp_s
 state by its name (NaN or masked while no message has carried it), and, where the trace has them,
 `report_stamp_s`, `waypoint_index` and `trajectory_stamp_s`, by which a new message with old values
 is known. Without them a message is new where one of its values is.
+
+A trace knows the waypoint that is followed; the gate also looks through the plan that is flown.
+Where the published plans, and what a fault did to the flown one, are given too, so does this.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.states import STATES, DType
+from mavfi_cli.core.states import BY_NAME, STATES, DType
 from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Trajectory
 from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.dataset import Flight
@@ -38,6 +41,17 @@ _COMMAND = list(NAMES[slice(*SPANS[Stage.CONTROL])])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PlanStrike:
+    """A value that a fault changed in the memory of a plan."""
+
+    stamp_s: float
+    state: str
+    waypoint: int
+    before: float | int | bool
+    after: float | int | bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
     """What the gate said of one message."""
 
@@ -45,7 +59,7 @@ class Judgement:
     report: bool  # a collision report, else a control tick
     new_waypoint: bool
     deltas: Codes  # (COUNT,)
-    score: float  # the highest of the stages that were judged
+    score: float  # the highest of what was judged: stages, and steps of the plan ahead
     alarm: Alarm | None
 
 
@@ -56,11 +70,14 @@ class _Probe:
         self.name = "none" if detector is None else detector.name
         self.per_stage = detector is not None and detector.per_stage
         self.highest = -np.inf
+        self.patient = False  # nothing is an alarm, so that a plan is looked through to its end
         self._detector = detector
 
     @property
     def threshold(self) -> float:
-        return np.inf if self._detector is None else self._detector.threshold
+        if self.patient or self._detector is None:
+            return np.inf
+        return self._detector.threshold
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
@@ -88,6 +105,8 @@ def replay(
     *,
     protect: frozenset[Stage] = ALL_STAGES,
     patience: int = 0,
+    plans: Sequence[Trajectory] = (),
+    strikes: Sequence[PlanStrike] = (),
 ) -> Iterator[Judgement]:
     """Judge every message of a trace, in the order in which they came.
 
@@ -98,11 +117,15 @@ def replay(
         patience: alarms in a row, of one kind of message, that are obeyed; the message after
             them is accepted. 0: every message becomes the reference, so that scores do not
             depend on the threshold.
+        plans: those that were published. The one that is flown is looked through when it is new,
+            when a waypoint is begun and when it is struck; the score is part of the tick's.
+        strikes: what a fault did to plans after they had been published.
 
     Raises:
         ModelError: a column is missing.
     """
     messages = _Messages(trace)
+    flown = _FlownPlans(trace, plans, strikes)
     probe = _Probe(detector)
     gate = Gate(probe, protect, params)
     in_a_row = {True: 0, False: 0}
@@ -117,6 +140,11 @@ def replay(
                 command = messages.command(row)
                 if command is None:
                     continue
+                ahead = flown.ahead(row, stamp_s)
+                if ahead is not None:
+                    probe.patient = True
+                    gate.judge_ahead(*ahead)
+                    probe.patient = False
                 alarm = gate.judge_tick(messages.waypoint(row), 0, command)
             judged = Judgement(
                 stamp_s=stamp_s,
@@ -171,6 +199,45 @@ def plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
     found = np.zeros((max(0, rows - 1), COUNT), np.int16)
     found[steps[:count]] = changes[:count]
     return found
+
+
+class _FlownPlans:
+    """The plan that is flown in each row of a trace, as far as it was published."""
+
+    def __init__(
+        self, trace: Columns, plans: Sequence[Trajectory], strikes: Sequence[PlanStrike]
+    ) -> None:
+        self._plans = {plan.stamp_s: plan for plan in plans}
+        self._strikes = sorted(strikes, key=lambda strike: strike.stamp_s)
+        self._looked: tuple[Trajectory | None, int] = (None, -1)
+        if plans and not {"trajectory_stamp_s", "waypoint_index"} <= set(trace):
+            raise ModelError("a trace that does not tell which plan is flown")
+        if plans:
+            self._stamps_s = _reals(trace["trajectory_stamp_s"])
+            self._waypoints = _reals(trace["waypoint_index"])
+
+    def ahead(self, row: int, stamp_s: float) -> tuple[Trajectory, int] | None:
+        """The plan and the waypoint from which on the gate looks through it; None: no look."""
+        if not self._plans:
+            return None
+        while self._strikes and self._strikes[0].stamp_s <= stamp_s + 1e-9:
+            self._strike(self._strikes.pop(0), float(self._stamps_s[row]))
+        plan = self._plans.get(float(self._stamps_s[row]))
+        if plan is None:
+            return None
+        waypoint = int(self._waypoints[row])
+        seen, self._looked = self._looked, (plan, waypoint)
+        return None if plan is seen[0] and waypoint == seen[1] else (plan, waypoint)
+
+    def _strike(self, strike: PlanStrike, plan_stamp_s: float) -> None:
+        """The flown plan as it is from now on; a value that was published so is left alone."""
+        plan, state = self._plans.get(plan_stamp_s), BY_NAME[strike.state]
+        if plan is None or strike.waypoint >= len(plan.waypoints):
+            return
+        if state.read(plan, strike.waypoint) == strike.before:
+            struck = state.write(plan, strike.waypoint, strike.after)
+            assert isinstance(struck, Trajectory)
+            self._plans[plan_stamp_s] = struck
 
 
 class _Messages:

@@ -6,7 +6,7 @@ from detect_builders import plan, trace
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import registry
-from mavfi_cli.detect.offline import columns_of, flight_of, plan_steps, replay
+from mavfi_cli.detect.offline import PlanStrike, columns_of, flight_of, plan_steps, replay
 from mavfi_cli.detect.preprocess import NAMES, PreprocessParams
 
 
@@ -43,6 +43,46 @@ def test_a_struck_waypoint_is_found_where_it_is(name):
     if name != "gad":  # which learns from what its threshold lets pass
         assert follows == lenient
     assert [s > registry.find(name).threshold for s in follows].count(True) == 2
+
+
+@pytest.fixture
+def planned():
+    """A flight of 6 s, and the one plan that is flown in it."""
+    columns = trace(6.0)
+    columns["trajectory_stamp_s"] = np.zeros(len(columns["stamp_s"]))
+    return columns, plan(13)
+
+
+FAR = PlanStrike(stamp_s=1.0, state="waypoint_x", waypoint=8, before=13.6, after=-1e99)
+
+
+@pytest.mark.parametrize("name", ["gad", "aad", "l2", "range"])
+def test_a_struck_waypoint_is_seen_ahead_as_soon_as_it_is_struck(name, planned):
+    columns, flown = planned
+    threshold = registry.find(name).threshold
+    assert flown.waypoints[8, 0] == FAR.before
+
+    def high(strikes):
+        judged = replay(columns, registry.find(name), plans=[flown], strikes=strikes)
+        return [each.stamp_s for each in judged if each.score > threshold]
+
+    assert high([]) == []
+    # At the strike, then at each begun waypoint up to the one from which the step back leaves.
+    assert high([FAR]) == pytest.approx([1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0])
+
+
+def test_a_plan_that_was_published_with_the_value_is_seen_when_it_is_new(planned):
+    columns, flown = planned
+    flown.waypoints[8, 0] = FAR.after
+    judged = replay(columns, registry.find("range"), plans=[flown], strikes=[FAR])
+    assert next(each.stamp_s for each in judged if each.score > 1.0) == 0.0
+
+
+def test_looks_ahead_need_to_know_which_plan_is_flown(planned):
+    columns, flown = planned
+    del columns["trajectory_stamp_s"]
+    with pytest.raises(ModelError, match="which plan"):
+        list(replay(columns, None, plans=[flown]))
 
 
 def test_patience_is_how_many_alarms_in_a_row_are_obeyed():

@@ -9,7 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from mavfi_cli.cli.replay import replay
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi import record as records
 from mavfi_cli.fi.native.arch import SUPPORTED
@@ -127,6 +129,30 @@ def test_the_node_waits_for_a_debugger_with_the_fault_in_place(repeat):
     folder = repeat(for_debugger=look)
     assert states == ["T"]
     assert load_run(folder.path).result["fault"]["state"] == "applied"
+
+
+@traced
+def test_a_replay_under_a_debugger_is_compared_without_what_it_cannot_follow(
+    fly_short, tmp_path, monkeypatch
+):
+    written = InstructionConfig(target="control", seed=2, roles=("destination",))
+    attacked = fly_short(instruction=written)
+    assert records.read(attacked.fault)["activation"]["activation"] == "read"
+    waited = []
+
+    def go_on(pid):
+        waited.append(pid)
+        os.kill(pid, signal.SIGCONT)
+
+    monkeypatch.setattr("mavfi_cli.cli.replay._say_where", go_on)
+    line = [str(attacked.path), "--gdb", "--json", "--out", str(tmp_path)]
+    shown = CliRunner().invoke(replay, line)
+    assert len(waited) == 1
+    comparison = json.loads(shown.stdout)
+    assert comparison["identical"]
+    assert shown.exit_code == 0
+    again = records.read(load_run(Path(comparison["again"])).folder.fault)
+    assert again["activation"]["activation"] == "not_followed"
 
 
 def test_a_stage_draws_one_of_its_nodes():

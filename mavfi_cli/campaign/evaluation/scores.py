@@ -2,27 +2,65 @@
 
 The score is the highest of the flight's messages, in units of the detector's threshold: above 1
 the gate would have raised an alarm. Nothing is withheld on the way, so the scores do not depend on
-the threshold (but what a gate says of plans on their arrival is not in a trace).
+the threshold. The looks through the flown plan are among them.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from mavfi_cli.campaign.evaluation.fly import model_digest
 from mavfi_cli.campaign.evaluation.pairs import Flown
 from mavfi_cli.campaign.evaluation.plan import EvaluationPlan
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.types import Stage
+from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.core.types import Stage, Trajectory
 from mavfi_cli.detect.model import preprocessing
-from mavfi_cli.detect.offline import Columns, columns_of, replay
+from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.detect.registry import find
+from mavfi_cli.fi import bits
+from mavfi_cli.mission.plan_file import read_plans
 from mavfi_cli.mission.run_folder import load_run
 
 SCORES = "scores.json"
+_WAY = "looks ahead"  # how scores are taken; those of another way are not mixed with them
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Kept:
+    """What was kept of a flight, as far as a gate sees it."""
+
+    columns: Columns
+    plans: Sequence[Trajectory]
+    strikes: Sequence[PlanStrike]
+
+
+def _kept_of(path: Path) -> _Kept:
+    run = load_run(path)
+    if run.trace is None:
+        return _Kept(columns={}, plans=(), strikes=())
+    fault = run.result.get("fault") or {}
+    strikes = [
+        PlanStrike(
+            stamp_s=strike["stamp_s"], state=change["state"], waypoint=change["index"],
+            before=_value(change["state"], change["before_hex"]),
+            after=_value(change["state"], change["after_hex"]),
+        )
+        for strike in fault.get("strikes", ())
+        for change in strike["changes"]
+        if change["state"] in BY_NAME and BY_NAME[change["state"]].stage is Stage.PLANNING
+    ]  # fmt: skip
+    return _Kept(columns=columns_of(run.trace), plans=read_plans(run.folder.plans), strikes=strikes)
+
+
+def _value(state: str, pattern: str) -> float | int | bool:
+    """From its bits: a record has no numbers that are not finite."""
+    kind = bits.NUMPY_TYPES[BY_NAME[state].dtype.value]
+    return bits.value_of(int(pattern, 16), kind)
 
 
 class Scores:
@@ -33,7 +71,7 @@ class Scores:
         self._path = folder / SCORES
         protect = "+".join(sorted(plan.protect))
         self._names = {
-            name: f"{name}/{protect}/{model_digest(plan, name)}" for name in plan.protectors
+            name: f"{name}/{protect}/{_WAY}/{model_digest(plan, name)}" for name in plan.protectors
         }
         self._kept: dict[str, dict[str, float | None]] = _read(self._path)
 
@@ -50,12 +88,11 @@ class Scores:
         tell(f"replaying {len(missing)} flights through {len(self._names)} detectors")
         for flown in missing:
             assert flown.path is not None
-            trace = load_run(flown.path).trace
-            columns = {} if trace is None else columns_of(trace)
+            flight = _kept_of(flown.path)
             for detector, name in self._names.items():
                 kept = self._kept.setdefault(name, {})
                 if flown.path.name not in kept:
-                    kept[flown.path.name] = self._score(columns, flown.struck_s, detector)
+                    kept[flown.path.name] = self._score(flight, flown.struck_s, detector)
         write_json(self._path, self._kept)
 
     def of(self, flown: Flown, detector: str) -> float | None:
@@ -66,9 +103,9 @@ class Scores:
         score = kept[flown.path.name]
         return math.inf if score is None else score
 
-    def _score(self, columns: Columns, struck_s: float | None, detector: str) -> float:
+    def _score(self, flight: _Kept, struck_s: float | None, detector: str) -> float:
         """The highest score from the strike on, or of the whole flight without one."""
-        if not columns:  # it ended before the first tick
+        if not flight.columns:  # it ended before the first tick
             return 0.0
         path = self._plan.model_path(detector)
         fresh = find(detector, model=path if self._plan.models is not None else None)
@@ -76,7 +113,11 @@ class Scores:
         params = None if path is None else preprocessing(path)
         from_s = -math.inf if struck_s is None else struck_s - 1e-9
         highest = 0.0
-        for judged in replay(columns, fresh, params, protect=protect):
+        judgements = replay(
+            flight.columns, fresh, params, protect=protect,
+            plans=flight.plans, strikes=flight.strikes,
+        )  # fmt: skip
+        for judged in judgements:
             if judged.stamp_s >= from_s and not judged.score <= highest:
                 highest = judged.score
                 if math.isnan(highest):
