@@ -13,8 +13,8 @@ from typing import ClassVar
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray, Stage
-from mavfi_cli.detect.fitted import FittedDetector, Shapes
-from mavfi_cli.detect.preprocess import COUNT, Codes
+from mavfi_cli.detect.fitted import OF_CONTROL, PASSED, FittedDetector, Shapes
+from mavfi_cli.detect.preprocess import COUNT, DELTA, Codes, IntArray, plan_deltas, take_tick
 
 HIDDEN, CODED = 6, 3
 WEIGHTS: Shapes = {
@@ -35,26 +35,6 @@ _B2 = _W2 + CODED * HIDDEN
 _W3 = _B2 + CODED
 _B3 = _W3 + COUNT * CODED
 _WORK = _B3 + COUNT
-
-
-class AutoencoderDetector(FittedDetector):
-    """Autoencoder-based anomaly detection.
-
-    Weights are (outputs, inputs).
-    """
-
-    name: ClassVar[str] = "aad"
-    per_stage = False
-    scratch: ClassVar[int] = COUNT + HIDDEN + CODED
-    shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,), **WEIGHTS}
-
-    def score(self, deltas: Codes, stage: Stage) -> float:
-        """Reconstruction error: mean square over the 13 scaled deltas."""
-        error: float = reconstruction_error(self._flat, deltas)
-        return error
-
-    def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Nothing: the net is trained beforehand."""
 
 
 @compiled
@@ -80,3 +60,58 @@ def reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
             total += memory[_W3 + place * CODED + unit] * work[COUNT + HIDDEN + unit]
         error += (total - work[place]) * (total - work[place])
     return error / COUNT
+
+
+@compiled
+def judge_tick(
+    memory: FloatArray,
+    work: Codes,
+    waypoints: FloatArray,
+    row: int,
+    velocity_enu_mps: FloatArray,
+    yaw_rad: float,
+    keep_report: bool,
+) -> tuple[float, int]:
+    """Deltas of a tick and their score; see `FittedDetector.tick_judge`."""
+    take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
+    error = reconstruction_error(memory, work[DELTA])
+    return error, PASSED if error <= memory[0] else OF_CONTROL
+
+
+@compiled
+def judge_plan(
+    memory: FloatArray,
+    work: Codes,
+    waypoints: FloatArray,
+    first: int,
+    steps: IntArray,
+    changes: Codes,
+    scores: FloatArray,
+) -> int:
+    """Steps of a plan and their scores; see `FittedDetector.plan_judge`."""
+    count = plan_deltas(waypoints, first, work, steps, changes)
+    for number in range(count):
+        scores[number] = reconstruction_error(memory, changes[number])
+    return count
+
+
+class AutoencoderDetector(FittedDetector):
+    """Autoencoder-based anomaly detection.
+
+    Weights are (outputs, inputs).
+    """
+
+    name: ClassVar[str] = "aad"
+    per_stage = False
+    scratch: ClassVar[int] = COUNT + HIDDEN + CODED
+    shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,), **WEIGHTS}
+    tick_judge = staticmethod(judge_tick)
+    plan_judge = staticmethod(judge_plan)
+
+    def score(self, deltas: Codes, stage: Stage) -> float:
+        """Reconstruction error: mean square over the 13 scaled deltas."""
+        error: float = reconstruction_error(self._flat, deltas)
+        return error
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Nothing: the net is trained beforehand."""

@@ -1,9 +1,13 @@
-"""What our own detectors share: they come from a model file, and remember in one flat array."""
+"""What our own detectors share: they come from a model file, and remember in one flat array.
+
+One that is to be cheap judges a whole tick in one compiled call, and so a whole plan. A call costs
+more than the arithmetic in it: in flight, where the caches hold other things, several times more.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -13,6 +17,11 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.detect import model as model_file
 
 Shapes = dict[str, tuple[int, ...]]
+# (memory, work, waypoints, row, velocity, yaw, keep_report) -> score, and whose it is.
+TickJudge = Callable[..., tuple[float, int]]
+# (memory, work, waypoints, first, steps, changes, scores) -> how many steps there are.
+PlanJudge = Callable[..., int]
+PASSED, OF_PLANNING, OF_CONTROL = range(3)  # which stage's score is above the threshold
 
 
 class FittedDetector:
@@ -22,11 +31,15 @@ class FittedDetector:
         shapes: names and shapes of the pieces of the memory, in their order; the first one, a
             single number, is the threshold.
         scratch: numbers that compiled code wants for itself, after the pieces.
+        tick_judge: `preprocess.take_tick`, then score and learn as the gate does, in one call.
+        plan_judge: `preprocess.plan_deltas`, and the score of each step that it finds.
     """
 
     name: ClassVar[str]
     shapes: ClassVar[Shapes]
     scratch: ClassVar[int] = 0
+    tick_judge: ClassVar[TickJudge | None] = None
+    plan_judge: ClassVar[PlanJudge | None] = None
 
     def __init__(self, arrays: Mapping[str, FloatArray]) -> None:
         pieces = [np.asarray(arrays[name], np.float64).ravel() for name in self.shapes]
@@ -45,6 +58,11 @@ class FittedDetector:
     def memory(self) -> Mapping[str, FloatArray]:
         """Views of all that decides; a change takes effect with the next sample."""
         return self._memory
+
+    @property
+    def flat(self) -> FloatArray:
+        """All of the memory in one array, as compiled code takes it."""
+        return self._flat
 
     @property
     def threshold(self) -> float:

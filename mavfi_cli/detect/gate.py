@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.detect.base import Detector
+from mavfi_cli.detect.fitted import OF_PLANNING, PASSED, FittedDetector
 from mavfi_cli.detect.preprocess import (
     CODE,
     COUNT,
@@ -41,6 +42,7 @@ from mavfi_cli.detect.preprocess import (
 )
 
 _NO_WAYPOINTS = np.zeros((0, 10))
+_TICK, _TICK_AND_WAYPOINT = (Stage.CONTROL,), (Stage.PLANNING, Stage.CONTROL)
 ALL_STAGES = frozenset(Stage)
 
 
@@ -85,6 +87,13 @@ class Gate:
         self._judged: tuple[Trajectory | None, int] = (None, -1)
         self._pending = False  # a report's deltas wait for the next tick
         self._ignored = [slice(*SPANS[stage]) for stage in Stage if stage not in protect]
+        self._steps = np.empty(0, np.int64)  # room for the steps of a plan, see `_look`
+        self._changes = np.empty((0, COUNT), np.int16)
+        self._scores = np.empty(0)
+        fitted = detector if isinstance(detector, FittedDetector) else None
+        self._flat = None if fitted is None else fitted.flat
+        self._tick_judge = None if fitted is None or self._ignored else fitted.tick_judge
+        self._plan_judge = None if fitted is None else fitted.plan_judge
 
     @property
     def deltas(self) -> Codes:
@@ -137,13 +146,10 @@ class Gate:
         if Stage.PLANNING not in self.protect or len(trajectory.waypoints) < 2:
             return None
         rows = len(trajectory.waypoints)
-        steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
-        count = plan_deltas(trajectory.waypoints, first, self._work, steps, changes)
-        threshold = self.threshold
-        stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
+        scores = self._look(trajectory, first)
+        threshold, steps, changes = self.threshold, self._steps, self._changes
         bad: tuple[int, float] | None = None
-        for number in range(count):
-            score = self.detector.score(changes[number], stage)
+        for number, score in enumerate(scores):
             if score <= threshold:
                 continue
             if bad is None:
@@ -157,6 +163,23 @@ class Gate:
         step = int(steps[bad[0]])
         only_first = step == max(first, 0) and step + 2 < rows
         return self._plan_alarm(changes[bad[0]], bad[1], step if only_first else step + 1)
+
+    def _look(self, trajectory: Trajectory, first: int) -> list[float]:
+        """Scores of the steps in which a code changes; `_steps` and `_changes` say which."""
+        waypoints = trajectory.waypoints
+        if len(waypoints) > len(self._steps):
+            self._steps = np.empty(len(waypoints), np.int64)
+            self._changes = np.empty((len(waypoints), COUNT), np.int16)
+            self._scores = np.empty(len(waypoints))
+        if self._plan_judge is not None:
+            count = self._plan_judge(
+                self._flat, self._work, waypoints, first, self._steps, self._changes, self._scores
+            )
+            scores: list[float] = self._scores[:count].tolist()
+            return scores
+        count = plan_deltas(waypoints, first, self._work, self._steps, self._changes)
+        stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
+        return [self.detector.score(self._changes[number], stage) for number in range(count)]
 
     def _plan_alarm(self, deltas: Codes, score: float, waypoint: int) -> Alarm:
         stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
@@ -172,11 +195,20 @@ class Gate:
         """
         if trajectory is None or (trajectory is self._trajectory and index == self._index):
             waypoints, row = _NO_WAYPOINTS, -1
-            self.fresh = (Stage.CONTROL,)
+            self.fresh = _TICK
         else:
             waypoints, row = trajectory.waypoints, index
-            self.fresh = (Stage.PLANNING, Stage.CONTROL)
+            self.fresh = _TICK_AND_WAYPOINT
         self._judged = (trajectory, index)
+        if self._tick_judge is not None:
+            score, verdict = self._tick_judge(
+                self._flat, self._work, waypoints, row,
+                command.velocity_enu_mps, command.yaw_rad, self._pending,
+            )  # fmt: skip
+            self._pending = False
+            if row >= 0 and (verdict == PASSED or (self._per_stage and verdict != OF_PLANNING)):
+                self._trajectory, self._index = trajectory, index
+            return None if verdict == PASSED else self._tick_alarm(score, verdict)
         take_tick(
             waypoints, row, command.velocity_enu_mps, command.yaw_rad, self._pending, self._work
         )
@@ -195,6 +227,14 @@ class Gate:
         if row >= 0:
             self._trajectory, self._index = trajectory, index
         return None
+
+    def _tick_alarm(self, score: float, verdict: int) -> Alarm:
+        """Of a tick that was judged in one call."""
+        of_control = self._per_stage and verdict != OF_PLANNING
+        for stage in _TICK if of_control else self.fresh:
+            self._reject(stage)
+        stage = Stage.PLANNING if verdict == OF_PLANNING else Stage.CONTROL
+        return self._alarm(stage, score, self.threshold, self._deltas)
 
     def _judge_stages(self, new_waypoint: bool) -> Alarm | None:
         detector, threshold = self.detector, self.threshold

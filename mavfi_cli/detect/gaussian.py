@@ -19,8 +19,17 @@ import numpy as np
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray, Stage
-from mavfi_cli.detect.fitted import FittedDetector, Shapes
-from mavfi_cli.detect.preprocess import COUNT, Codes, span
+from mavfi_cli.detect.fitted import OF_CONTROL, OF_PLANNING, PASSED, FittedDetector, Shapes
+from mavfi_cli.detect.preprocess import (
+    COUNT,
+    DELTA,
+    SPANS,
+    Codes,
+    IntArray,
+    plan_deltas,
+    span,
+    take_tick,
+)
 
 N_SIGMA = 5.0
 # In codes. Commands come 25 times as often as waypoints and change the less from one to the next.
@@ -29,40 +38,7 @@ _FLOOR = 1  # places in the flat array
 _COUNT = _FLOOR + COUNT
 _MEAN = _COUNT + COUNT
 _SUM = _MEAN + COUNT
-
-
-class GaussianDetector(FittedDetector):
-    """Gaussian-based anomaly detection."""
-
-    name: ClassVar[str] = "gad"
-    per_stage = True
-    shapes: ClassVar[Shapes] = {
-        "n_sigma": (1,),
-        "sigma_floor": (COUNT,),
-        "count": (COUNT,),
-        "mean": (COUNT,),
-        "sum_of_squares": (COUNT,),
-    }
-
-    @classmethod
-    def cold(cls, n_sigma: float = N_SIGMA) -> GaussianDetector:
-        """One that has not seen any sample."""
-        arrays = {name: np.zeros(shape) for name, shape in cls.shapes.items()}
-        arrays["n_sigma"][0] = n_sigma
-        for stage, floor in SIGMA_FLOORS.items():
-            arrays["sigma_floor"][slice(*span(stage))] = floor
-        return cls(arrays)
-
-    def score(self, deltas: Codes, stage: Stage) -> float:
-        """Sigmas between the stage's most anomalous delta and its mean."""
-        first, end = span(stage)
-        distance: float = farthest(self._flat, deltas, first, end)
-        return distance
-
-    def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Equations 1 and 2, for each state of the stage."""
-        first, end = span(stage)
-        welford(self._flat, deltas, first, end)
+_PLANNING, _CONTROL = SPANS[Stage.PLANNING]
 
 
 @compiled
@@ -96,3 +72,81 @@ def welford(memory: FloatArray, deltas: Codes, first: int, end: int) -> None:
             memory[_SUM + place] += (value - mean) * (value - updated)
         memory[_COUNT + place] = count
         memory[_MEAN + place] = updated
+
+
+@compiled
+def judge_tick(
+    memory: FloatArray,
+    work: Codes,
+    waypoints: FloatArray,
+    row: int,
+    velocity_enu_mps: FloatArray,
+    yaw_rad: float,
+    keep_report: bool,
+) -> tuple[float, int]:
+    """Deltas of a tick, judged and learned stage by stage; see `FittedDetector.tick_judge`."""
+    take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
+    deltas = work[DELTA]
+    if row >= 0:
+        score = farthest(memory, deltas, _PLANNING, _CONTROL)
+        if not score <= memory[0]:
+            return score, OF_PLANNING
+        welford(memory, deltas, _PLANNING, _CONTROL)
+    score = farthest(memory, deltas, _CONTROL, COUNT)
+    if not score <= memory[0]:
+        return score, OF_CONTROL
+    welford(memory, deltas, _CONTROL, COUNT)
+    return score, PASSED
+
+
+@compiled
+def judge_plan(
+    memory: FloatArray,
+    work: Codes,
+    waypoints: FloatArray,
+    first: int,
+    steps: IntArray,
+    changes: Codes,
+    scores: FloatArray,
+) -> int:
+    """Steps of a plan and their scores; see `FittedDetector.plan_judge`."""
+    count = plan_deltas(waypoints, first, work, steps, changes)
+    for number in range(count):
+        scores[number] = farthest(memory, changes[number], _PLANNING, _CONTROL)
+    return count
+
+
+class GaussianDetector(FittedDetector):
+    """Gaussian-based anomaly detection."""
+
+    name: ClassVar[str] = "gad"
+    per_stage = True
+    shapes: ClassVar[Shapes] = {
+        "n_sigma": (1,),
+        "sigma_floor": (COUNT,),
+        "count": (COUNT,),
+        "mean": (COUNT,),
+        "sum_of_squares": (COUNT,),
+    }
+    tick_judge = staticmethod(judge_tick)
+    plan_judge = staticmethod(judge_plan)
+
+    @classmethod
+    def cold(cls, n_sigma: float = N_SIGMA) -> GaussianDetector:
+        """One that has not seen any sample."""
+        arrays = {name: np.zeros(shape) for name, shape in cls.shapes.items()}
+        arrays["n_sigma"][0] = n_sigma
+        for stage, floor in SIGMA_FLOORS.items():
+            arrays["sigma_floor"][slice(*span(stage))] = floor
+        return cls(arrays)
+
+    def score(self, deltas: Codes, stage: Stage) -> float:
+        """Sigmas between the stage's most anomalous delta and its mean."""
+        first, end = span(stage)
+        distance: float = farthest(self._flat, deltas, first, end)
+        return distance
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Equations 1 and 2, for each state of the stage."""
+        first, end = span(stage)
+        welford(self._flat, deltas, first, end)

@@ -70,14 +70,11 @@ class _Probe:
         self.name = "none" if detector is None else detector.name
         self.per_stage = detector is not None and detector.per_stage
         self.highest = -np.inf
-        self.patient = False  # nothing is an alarm, so that a plan is looked through to its end
         self._detector = detector
 
     @property
     def threshold(self) -> float:
-        if self.patient or self._detector is None:
-            return np.inf
-        return self._detector.threshold
+        return np.inf if self._detector is None else self._detector.threshold
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
@@ -142,9 +139,7 @@ def replay(
                     continue
                 ahead = flown.ahead(row, stamp_s)
                 if ahead is not None:
-                    probe.patient = True
                     gate.judge_ahead(*ahead)
-                    probe.patient = False
                 alarm = gate.judge_tick(messages.waypoint(row), 0, command)
             judged = Judgement(
                 stamp_s=stamp_s,

@@ -44,6 +44,8 @@ LIMIT = 32767  # of a code and of a delta
 UNKNOWN = -32768  # reference of a state of which no sample was accepted yet
 NAN_CODE = 16384
 
+_MANTISSA_BITS, _EXPONENT_MASK, _BIAS = 52, 0x7FF, 1023  # of a float64
+
 # Rows of the working array.
 REFERENCE, PREVIOUS, CODE, DELTA, FLOOR, CEILING, KIND = range(7)
 ROWS = 7
@@ -147,10 +149,9 @@ def encode(value: float, floor: int, ceiling: int, kind: int) -> int:
         return NAN_CODE
     if kind == _INTEGER:
         return int(min(max(value, -LIMIT), LIMIT))
-    if value == 0.0:
-        return 0
-    exponent = 1024 if math.isinf(value) else math.frexp(value)[1] - 1
-    magnitude = max(0, min(exponent, ceiling) - floor)
+    pattern = np.float64(value).view(np.int64)
+    exponent = int(pattern >> _MANTISSA_BITS & _EXPONENT_MASK) - _BIAS  # 1024 for an infinity
+    magnitude = max(0, min(exponent, ceiling) - floor)  # of 0 and subnormals 0, under any floor
     return -magnitude if value < 0.0 else magnitude
 
 
@@ -222,18 +223,23 @@ def plan_deltas(waypoints: FloatArray, first: int, work: Codes, steps: IntArray,
         How many there are.
     """
     count = 0
-    for row in range(max(first, 0), waypoints.shape[0] - 1):
+    columns = _CONTROL - _PLANNING
+    codes = np.empty(columns, np.int64)
+    for row in range(max(first, 0), waypoints.shape[0]):
+        begins = row == max(first, 0)
         changed = False
-        out[count, :] = 0
-        for column in range(_CONTROL - _PLANNING):
+        for column in range(columns):
             place = _PLANNING + column
-            floor, ceiling, kind = work[FLOOR, place], work[CEILING, place], work[KIND, place]
-            before = encode(waypoints[row, column], floor, ceiling, kind)
-            after = encode(waypoints[row + 1, column], floor, ceiling, kind)
-            delta = difference(before, after, floor, kind)
-            out[count, place] = delta
-            changed = changed or delta != 0
+            floor, kind = work[FLOOR, place], work[KIND, place]
+            code = encode(waypoints[row, column], floor, work[CEILING, place], kind)
+            if not begins:
+                delta = difference(codes[column], code, floor, kind)
+                out[count, place] = delta
+                changed = changed or delta != 0
+            codes[column] = code
         if changed:
-            steps[count] = row
+            out[count, :_PLANNING] = 0
+            out[count, _CONTROL:] = 0
+            steps[count] = row - 1
             count += 1
     return count

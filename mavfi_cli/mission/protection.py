@@ -122,7 +122,7 @@ class Protection(NoProtection):
 
     def report(self, report: CollisionReport, stamp_s: float) -> Response:
         """Judge perception's message on its arrival."""
-        alarm = self._judge("report", lambda: self.gate.judge_report(report))
+        alarm = self._judge("report", self.gate.judge_report, report)
         if alarm is None:
             self._recovered(Stage.PERCEPTION, stamp_s)
             return Response.PASS
@@ -133,7 +133,7 @@ class Protection(NoProtection):
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Response:
         """Judge a plan on its arrival."""
-        alarm = self._judge("plan", lambda: self.gate.judge_plan(plan))
+        alarm = self._judge("plan", self.gate.judge_plan, plan)
         if alarm is None:
             self._recovered(Stage.PLANNING, stamp_s)
             return Response.PASS
@@ -143,7 +143,7 @@ class Protection(NoProtection):
         self, plan: Trajectory, first: int, only: int | None, stamp_s: float
     ) -> tuple[Response, Alarm | None]:
         """Look through the flown plan, from the present waypoint on; or look at one waypoint."""
-        alarm = self._judge("ahead", lambda: self.gate.judge_ahead(plan, first))
+        alarm = self._judge("ahead", self.gate.judge_ahead, plan, first)
         if alarm is None or only not in (None, alarm.waypoint):
             return Response.PASS, None
         return self._respond(alarm, "ahead", alarm.stage, stamp_s), alarm
@@ -152,7 +152,7 @@ class Protection(NoProtection):
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> tuple[Response, Stage]:
         """Judge the followed waypoint and the command that would go out; and who is to blame."""
-        alarm = self._judge("tick", lambda: self.gate.judge_tick(trajectory, index, command))
+        alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         if alarm is None:
             self._recovered(Stage.CONTROL, stamp_s)
             if Stage.PLANNING in self.gate.fresh:
@@ -163,10 +163,10 @@ class Protection(NoProtection):
             self.gate.accept_tick()
         return response, alarm.stage
 
-    def _judge(self, kind: str, check: Callable[[], Alarm | None]) -> Alarm | None:
+    def _judge(self, kind: str, check: Callable[..., Alarm | None], *message: Any) -> Alarm | None:
         self._checks[kind] += 1
         begun_s = perf_counter()
-        alarm = check()
+        alarm = check(*message)
         self._wall.add("gate", perf_counter() - begun_s)
         return alarm
 

@@ -216,3 +216,51 @@ def test_shipped_detectors_pass_a_quiet_flight_and_catch_a_wild_command(name):
     assert alarm is not None
     assert alarm.stage is Stage.CONTROL
     assert alarm.states[0] == "command_vx"
+
+
+class Plain:
+    """A fitted detector as the gate sees one of another package: score and learn, nothing else."""
+
+    def __init__(self, fitted):
+        self._fitted = fitted
+        self.name, self.per_stage = fitted.name, fitted.per_stage
+        self.score, self.learn = fitted.score, fitted.learn
+
+    threshold = property(lambda self: self._fitted.threshold)
+    memory = property(lambda self: self._fitted.memory)
+
+
+@pytest.mark.parametrize("name", ["aad", "gad"])
+@pytest.mark.parametrize("accepted", [False, True])
+def test_one_compiled_call_judges_as_single_ones_do(name, accepted):
+    fused, plain = Gate(registry.find(name)), Gate(Plain(registry.find(name)))
+    assert fused._tick_judge is not None
+    assert plain._tick_judge is None
+    rng = np.random.default_rng(4)
+    kinds = set()
+    for number in range(60):
+        flown = plan(speed=rng.uniform(1.0, 3.0))
+        if number % 3 == 0:
+            row, column = rng.integers(20), rng.integers(7)
+            flown = corrupted(flown, row, column, rng.choice([1e300, -1e-300, np.nan, 64.0]))
+        for index in range(0, 20, 3):
+            said = report(rng.choice([np.inf, 3.0, 1e-9, np.nan]), int(rng.integers(4)) ** 8)
+            sent = command(*rng.choice([0.0, 1.0, 2.0, -1e200], 3, p=[0.3, 0.4, 0.25, 0.05]))
+            for judge in (
+                lambda gate, said=said: gate.judge_report(said),
+                lambda gate, flown=flown, index=index: gate.judge_ahead(flown, index),
+                lambda gate, flown=flown, index=index, sent=sent: gate.judge_tick(
+                    flown, index, sent
+                ),
+            ):
+                alarms = [judge(fused), judge(plain)]
+                assert repr(alarms[0]) == repr(alarms[1])  # a NaN is not equal to itself
+                if alarms[0] is not None:
+                    kinds.add((alarms[0].stage, alarms[0].waypoint is None))
+            if accepted:
+                fused.accept_tick()
+                plain.accept_tick()
+        for part in fused.memory:
+            np.testing.assert_array_equal(fused.memory[part], plain.memory[part])
+    assert (Stage.CONTROL, True) in kinds
+    assert (Stage.PLANNING if name == "gad" else Stage.CONTROL, False) in kinds
