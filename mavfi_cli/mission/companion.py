@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.autonomy import occupancy, tracking
+from mavfi_cli.autonomy import occupancy
 from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFailure
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.trajectory import waypoint_index
@@ -36,7 +36,7 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels
+from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels, tracking_inputs
 from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
 from mavfi_cli.mission.protection import NoProtection
 from mavfi_cli.mission.recovery import Recovery, Retry, Setpoint
@@ -239,19 +239,10 @@ class Companion:
     ) -> Setpoint | None:
         """Have control compute a command, due when its latency has passed."""
         fresh, attempt = (None, 0) if retry is None else (retry.fresh, retry.attempt)
-        inputs = tracking.TrackingInputs(
-            stamp_s=stamp_s,
-            position_enu_m=state.position_enu_m,
-            velocity_enu_mps=state.velocity_enu_mps,
-            trajectory=directive.trajectory,
-            time_s=directive.time_s,
-            rate=directive.rate,
-            rate_change_per_s=directive.rate_change_per_s,
-            hold_enu_m=directive.hold_enu_m,
-            hold_yaw_rad=directive.hold_yaw_rad,
-        )
         due_s = stamp_s + self._control_delay_s()
-        job = ControlInput(inputs=inputs, fresh=fresh, yaw_rad=state.yaw_rad)
+        job = ControlInput(
+            inputs=tracking_inputs(stamp_s, state, directive), fresh=fresh, yaw_rad=state.yaw_rad
+        )
         command: Command | None = self.executor.call("control", job, stamp_s)
         if command is None:
             return None
