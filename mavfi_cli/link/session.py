@@ -6,6 +6,7 @@ the stamp; send what `tick` returns, in that order.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -14,14 +15,18 @@ from mavfi_cli.core.errors import CommandRefused, LinkError, NoAutopilot
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.camera import CameraClient
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.commands import CommandChannel
-from mavfi_cli.link.errand import Errand, Question
+from mavfi_cli.link.commands import CommandChannel, Ticket, Verdict
 from mavfi_cli.link.replies import Replies
 from mavfi_cli.link.setpoint import Target
 from mavfi_cli.link.telemetry import LandedState, Telemetry
 from mavfi_cli.link.texts import Text
 
 _HEIGHT_REACHED_M = 0.3  # so close below the wanted height counts as there
+_SETTLE_S = 0.5  # an autopilot's words may follow its refusal
+_EFFECT_S = 3.0  # what was accepted shows an effect within this
+_MODE_TRIES = 5
+_MODE_PATIENCE_S = 1.5  # HEARTBEAT comes once a second
+_LOOK_INTERVAL_S = 0.2
 _HOME_INTERVAL_S = 1.0
 _DISARM_AFTER_S = 5.0  # on the ground, where the autopilot should have done so by itself
 _WARNING = dialect.MAV_SEVERITY_WARNING
@@ -85,11 +90,15 @@ class OffboardSession:
         self._replies = Replies()
         self._now_s = 0.0
         self._phase_since_s: float | None = None
-        self._errand = Errand(self._commands, self.telemetry, self._refuse)
-        self._home = Question(
-            self._commands, dialect.MAVLINK_MSG_ID_HOME_POSITION, _HOME_INTERVAL_S
-        )
+        self._next_look_s = -math.inf
+        self._ticket: Ticket | None = None  # the one command that the phase hangs on
+        self._look: Ticket | None = None
+        self._home: Ticket | None = None
+        self._next_home_s = -math.inf
+        self._mode_since_s = -math.inf
+        self._mode_tries = 0
         self._texts_before = 0
+        self._decided_s: float | None = None
         self._ground_m: float | None = None
         self._was_up = False
         self._down_since_s: float | None = None
@@ -220,8 +229,10 @@ class OffboardSession:
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
         self._phase_since_s = self._now_s
-        self._errand.begin()
+        self._ticket = None
+        self._mode_since_s, self._mode_tries = -math.inf, 0
         self._texts_before = self.telemetry.texts.total
+        self._decided_s = None
 
     def _elapsed_s(self) -> float:
         since = self._phase_since_s
@@ -264,10 +275,10 @@ class OffboardSession:
             return
         autopilot = telemetry.autopilot
         in_mode = telemetry.mode in autopilot.arming_modes
-        if not in_mode and not self._errand.seek_mode(autopilot.arming_modes[0]):
+        if not in_mode and not self._seek_mode(autopilot.arming_modes[0]):
             return
         if autopilot.takeoff_amsl and telemetry.home_amsl_m is None:
-            self._home.ask(self._now_s)
+            self._ask_home()
         elif in_mode and telemetry.ready and telemetry.state is not None:
             self._ground_m = float(telemetry.state.position_enu_m[2])
             self._enter(Phase.ARMING)
@@ -283,11 +294,18 @@ class OffboardSession:
             return "no home position"
         return "not ready to arm"
 
+    def _ask_home(self) -> None:
+        if self._now_s >= self._next_home_s and not (self._home and self._home.pending):
+            self._next_home_s = self._now_s + _HOME_INTERVAL_S
+            self._home = self._commands.submit(
+                dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HOME_POSITION
+            )
+
     def _arming(self) -> None:
         if self.telemetry.armed:
             self._enter(Phase.TAKING_OFF)
-        elif self._errand.insist("arming", dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0):
-            self._errand.look_at_heartbeat()
+        elif self._insist("arming", dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0):
+            self._look_at_heartbeat()
             if self._elapsed_s() >= self._settings.arm_timeout_s:
                 self._refuse("arming", "accepted, but it did not arm")
 
@@ -298,12 +316,14 @@ class OffboardSession:
             return
         self._was_up = self._was_up or self._climbed()
         if self._was_up:
-            if self._errand.seek_mode(telemetry.autopilot.offboard_mode):
+            if telemetry.mode == telemetry.autopilot.offboard_mode or self._seek_mode(
+                telemetry.autopilot.offboard_mode
+            ):
                 self._enter(Phase.OFFBOARD)
             return
-        if not self._errand.asked or not telemetry.in_air:
+        if self._ticket is None or not telemetry.in_air:
             parameters = [telemetry.autopilot.unused] * 6 + [self._takeoff_altitude_m()]
-            self._errand.insist("take-off", dialect.MAV_CMD_NAV_TAKEOFF, *parameters)
+            self._insist("take-off", dialect.MAV_CMD_NAV_TAKEOFF, *parameters)
         timeout_s = self._settings.takeoff_timeout_s
         if self.phase is Phase.TAKING_OFF and self._elapsed_s() >= timeout_s:
             self._refuse("take-off", f"height not reached within {timeout_s:g} s")
@@ -336,10 +356,8 @@ class OffboardSession:
         if not telemetry.armed:
             self._enter(Phase.DONE)
         elif telemetry.mode != telemetry.autopilot.land_mode:
-            self._errand.insist(
-                "landing", dialect.MAV_CMD_NAV_LAND, unused=telemetry.autopilot.unused
-            )
-            self._errand.look_at_heartbeat()
+            self._insist("landing", dialect.MAV_CMD_NAV_LAND, unused=telemetry.autopilot.unused)
+            self._look_at_heartbeat()
         elif telemetry.landed_state is LandedState.ON_GROUND:
             self._disarm_late()
         timeout_s = self._settings.land_timeout_s
@@ -355,6 +373,61 @@ class OffboardSession:
 
     def _ended(self) -> None:
         """Nothing more to ask for; the setpoints go on, for the other end may wait for them."""
+
+    # Helpers of the phases ----------------------------------------------------------------------
+
+    def _insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
+        """Bring one command home; True once it is accepted. A final refusal ends the session.
+
+        An accepted one that shows no effect is sent again, for as long as the phase calls this.
+        """
+        if self._ticket is None:
+            self._ticket = self._commands.submit(command, *parameters, unused=unused, refusals=2)
+            self._decided_s = None
+        ticket = self._ticket
+        if ticket.pending:
+            return False
+        if self._decided_s is None:
+            self._decided_s = self._now_s
+        waited_s = self._now_s - self._decided_s
+        if ticket.verdict is Verdict.ACCEPTED:
+            if waited_s >= _EFFECT_S:
+                self._ticket = None
+            return True
+        if waited_s >= _SETTLE_S:
+            self._refuse(name, ticket.result)
+        return False
+
+    def _seek_mode(self, mode: str) -> bool:
+        """Ask for a mode until HEARTBEAT shows it; an acknowledgement alone is not believed."""
+        if self.telemetry.mode == mode:
+            return True
+        pending = self._ticket is not None and self._ticket.pending
+        if not pending and self._now_s - self._mode_since_s >= _MODE_PATIENCE_S:
+            if self._mode_tries >= _MODE_TRIES:
+                result = self._ticket.result if self._ticket is not None else ""
+                self._refuse(f"mode {mode}", f"{result}, mode stays {self.telemetry.mode}")
+                return False
+            self._mode_tries += 1
+            self._mode_since_s = self._now_s
+            enabled = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+            if self.telemetry.armed:
+                enabled |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+            self._ticket = self._commands.submit(
+                dialect.MAV_CMD_DO_SET_MODE,
+                enabled,
+                *self.telemetry.autopilot.mode_parameters(mode),
+            )
+        self._look_at_heartbeat()
+        return False
+
+    def _look_at_heartbeat(self) -> None:
+        """Ask for a HEARTBEAT now, to see a change sooner than once a second shows it."""
+        if self._now_s >= self._next_look_s and not (self._look and self._look.pending):
+            self._next_look_s = self._now_s + _LOOK_INTERVAL_S
+            self._look = self._commands.submit(
+                dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HEARTBEAT
+            )
 
 
 _STEPS = {
