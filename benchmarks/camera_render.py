@@ -58,6 +58,7 @@ def main() -> None:
     level = np.array([1.0, 0.0, 0.0, 0.0])
 
     def frame() -> None:
+        """One image: rendered, packed into messages, encoded."""
         for message in camera.poll(next(stamps) * 0.02, np.array([0.0, 0.0, 5.0]), level):
             codec.encode(message)
 

@@ -18,6 +18,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "campaign_missions"))
 
 from killing import complete_with_kills, marked, results_of
+from missions import MAVFI
 
 SPEC = """
 name = "kills"
@@ -41,7 +42,7 @@ stage = "planning"
 
 def start(spec: Path, folder: Path) -> subprocess.Popen[bytes]:
     """Begin the campaign, or go on with it."""
-    line = [sys.executable, "-m", "mavfi_cli", "campaign", "run", str(spec), "--out", str(folder)]
+    line = [*MAVFI, "campaign", "run", str(spec), "--out", str(folder)]
     return subprocess.Popen([*line, "--quiet"], stdout=subprocess.DEVNULL, env=marked(str(folder)))
 
 

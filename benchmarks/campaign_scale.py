@@ -50,6 +50,7 @@ class _Last(Spectator):
     progress: Progress
 
     def on_progress(self, progress: Progress) -> None:
+        """The newest replaces the one before."""
         self.progress = progress
 
 

@@ -13,39 +13,14 @@ same flight; else a faulty flight that is longer or shorter shows in the ratio.
 from __future__ import annotations
 
 import argparse
-import json
-import resource
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
-from dataclasses import dataclass
-from typing import Any
+
+from missions import fly, fly_pairs
 
 LIMIT = 1.3
 NODES = ("point_cloud", "octomap", "collision_check", "control", "rrtstar", "rrt", "rrtconnect")
 PLANNERS = ("rrtstar", "rrt", "rrtconnect")
-MAVFI = (sys.executable, "-m", "mavfi_cli")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cost:
-    """One command."""
-
-    wall_s: float
-    cpu_s: float  # of all its processes
-    result: dict[str, Any]
-
-
-def command(line: list[str]) -> Cost:
-    """Run a mission to its end."""
-    before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    run = subprocess.run([*MAVFI, *line], capture_output=True, text=True, check=True)
-    wall_s = time.perf_counter() - begun
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Cost(wall_s=wall_s, cpu_s=cpu_s, result=json.loads(run.stdout))
 
 
 def ratio(attacked: list[float], golden: list[float]) -> str:
@@ -58,15 +33,11 @@ def ratio(attacked: list[float], golden: list[float]) -> str:
 def row(node: str, seed: int, given: argparse.Namespace, out: str) -> str:
     """One line of the table."""
     planner = node if node in PLANNERS else "rrtstar"
-    plain = ["fly", "--world", given.world, "--seed", str(given.seed), "--planner", planner]
-    plain += ["--out", out, "--no-picture", "--quiet", "--json"]
+    plain = ["--world", given.world, "--seed", str(given.seed), "--planner", planner, "--out", out]
     fault = ["--level", "instruction", "--inject", "planner" if node in PLANNERS else node]
     fault += ["--fault-seed", str(seed)] + (["--null-injection"] if given.null else [])
-    first = command(plain + fault)
-    golden, attacked = [], []
-    for _ in range(given.pairs):
-        golden.append(command(plain))
-        attacked.append(command(plain + fault))
+    first = fly(*plain, *fault)
+    golden, attacked = fly_pairs(plain, plain + fault, given.pairs)
     wall = ([c.wall_s for c in attacked], [c.wall_s for c in golden])
     cpu = ([c.cpu_s for c in attacked], [c.cpu_s for c in golden])
     simulated_s = [c.result["simulated_s"] for c in (golden[0], attacked[0])]

@@ -17,13 +17,13 @@ import numpy as np
 
 from mavfi_cli import autonomy
 from mavfi_cli.autonomy import collision, planners, planning, point_cloud, tracking
-from mavfi_cli.autonomy.occupancy import OccupancyMap, OccupancyParams
+from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
 from mavfi_cli.autonomy.smoothing import Departure, Sequence
 from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.frames import quaternion_from_euler
-from mavfi_cli.core.types import DepthFrame
+from mavfi_cli.core.types import DepthFrame, Trajectory
 from sitl.camera.depth import render_depth
-from sitl.world import load_world
+from sitl.world import World, load_world
 
 TICK_S = 0.02
 TICKS_A_FRAME = 14
@@ -44,91 +44,115 @@ class Stopwatch:
         return result
 
 
-def fly(world, seed: int, watch: Stopwatch) -> float:
-    """Fly one mission; returns its simulated duration."""
-    bounds = world.bounds_enu_m.copy()
-    bounds[2], bounds[5] = 1.0, min(bounds[5], 10.0)
-    position, yaw = world.start_enu_m + np.array([0.0, 0.0, 5.0]), math.atan2(40.0, 30.0)
-    occupancy, planner = OccupancyMap(OccupancyParams()), planners.find("rrtstar")
-    check_state = collision.CollisionState()
-    track_state = tracking.TrackingState(yaw_rad=yaw, stamp_s=0.0)
-    trajectory = following = None
-    plans = 0
-    for tick in range(10_000):
-        now_s = tick * TICK_S
-        if tick % TICKS_A_FRAME == 0:
-            attitude = quaternion_from_euler(0.0, 0.0, yaw)
-            levels = render_depth(world.boxes_enu_m, position, attitude, 64, 48, math.pi / 2)
-            frame = DepthFrame(
-                stamp_s=now_s,
-                depth_m=np.where(levels == 255, np.inf, levels * 0.1),
-                hfov_rad=math.pi / 2,
-                position_enu_m=position,
-                quaternion=attitude,
-            )
-            cloud = watch.call(
-                "point cloud", point_cloud.generate, frame, point_cloud.PointCloudParams()
-            )
-            watch.call("octomap insert", occupancy.insert, cloud)
-            snapshot = watch.call("octomap snapshot", occupancy.snapshot)
-            time_s = now_s - trajectory.stamp_s if trajectory else 0.0
-            check_state, report = watch.call(
-                "collision check",
-                collision.step,
-                check_state,
-                collision.CollisionInputs(
-                    stamp_s=now_s, snapshot=snapshot, trajectory=trajectory, time_s=time_s
-                ),
-                collision.CollisionParams(),
-            )
-            if following is None and (trajectory is None or report.collision):
-                start, velocity = position, np.zeros(3)
-                if trajectory is not None:
-                    row = reference_waypoint(trajectory, time_s + LEAD_S)
-                    start, velocity = row[0:3], row[4:7]
-                plans += 1
-                planned = watch.call(
-                    "planner + smoothing",
-                    planning.plan,
-                    planner,
-                    planning.StageInputs(
-                        snapshot=snapshot,
-                        position_enu_m=start,
-                        departure=Departure(
-                            stamp_s=now_s + LEAD_S, velocity_enu_mps=velocity, yaw_rad=yaw
-                        ),
-                        goal_enu_m=world.goal_enu_m,
-                        bounds_enu_m=bounds,
-                        sequence=Sequence(trajectory_seq=plans),
-                        seed=1000 * seed + plans,
-                    ),
-                    planning.StageParams(),
-                )
-                following = planned.trajectory
-        if following is not None and now_s >= following.stamp_s:
-            trajectory, following = following, None
-        time_s = now_s - trajectory.stamp_s if trajectory else 0.0
-        track_state, command = watch.call(
-            "tracking",
-            tracking.step,
-            track_state,
-            tracking.TrackingInputs(
-                stamp_s=now_s,
-                position_enu_m=position,
-                velocity_enu_mps=np.zeros(3),
-                trajectory=trajectory,
-                time_s=time_s,
-                hold_enu_m=position,
-                hold_yaw_rad=yaw,
-            ),
-            tracking.TrackingParams(),
+class Flight:
+    """One mission, its vehicle always where its trajectory says.
+
+    Args:
+        world: with start, goal and boxes.
+        seed: of the planner.
+        watch: times every kernel.
+    """
+
+    def __init__(self, world: World, seed: int, watch: Stopwatch) -> None:
+        self._world, self._seed, self._watch = world, seed, watch
+        self._bounds = world.bounds_enu_m.copy()
+        self._bounds[2], self._bounds[5] = 1.0, min(self._bounds[5], 10.0)
+        self._position = world.start_enu_m + np.array([0.0, 0.0, 5.0])
+        self._yaw = math.atan2(40.0, 30.0)
+        self._map, self._planner = OccupancyMap(OccupancyParams()), planners.find("rrtstar")
+        self._check_state = collision.CollisionState()
+        self._track_state = tracking.TrackingState(yaw_rad=self._yaw, stamp_s=0.0)
+        self._trajectory: Trajectory | None = None
+        self._next: Trajectory | None = None
+        self._plans = 0
+
+    def fly(self) -> float:
+        """Fly to the goal; the simulated duration, s."""
+        for tick in range(10_000):
+            now_s = tick * TICK_S
+            if tick % TICKS_A_FRAME == 0:
+                snapshot, blocked = self._perceive(now_s)
+                if self._next is None and (self._trajectory is None or blocked):
+                    self._plan(now_s, snapshot)
+            if self._next is not None and now_s >= self._next.stamp_s:
+                self._trajectory, self._next = self._next, None
+            self._track(now_s)
+            if np.linalg.norm(self._position - self._world.goal_enu_m) < 1.0:
+                break
+        return now_s
+
+    def _flown_s(self, now_s: float) -> float:
+        return now_s - self._trajectory.stamp_s if self._trajectory else 0.0
+
+    def _perceive(self, now_s: float) -> tuple[MapSnapshot, bool]:
+        """From a depth frame to the newest map, and whether the trajectory is blocked in it."""
+        attitude = quaternion_from_euler(0.0, 0.0, self._yaw)
+        boxes = self._world.boxes_enu_m
+        levels = render_depth(boxes, self._position, attitude, 64, 48, math.pi / 2)
+        frame = DepthFrame(
+            stamp_s=now_s,
+            depth_m=np.where(levels == 255, np.inf, levels * 0.1),
+            hfov_rad=math.pi / 2,
+            position_enu_m=self._position,
+            quaternion=attitude,
         )
-        yaw = command.yaw_rad
-        if trajectory is not None:
-            position = reference_waypoint(trajectory, time_s)[0:3]
-        if np.linalg.norm(position - world.goal_enu_m) < 1.0:
-            break
-    return now_s
+        call = self._watch.call
+        cloud = call("point cloud", point_cloud.generate, frame, point_cloud.PointCloudParams())
+        call("octomap insert", self._map.insert, cloud)
+        snapshot = call("octomap snapshot", self._map.snapshot)
+        inputs = collision.CollisionInputs(
+            stamp_s=now_s,
+            snapshot=snapshot,
+            trajectory=self._trajectory,
+            time_s=self._flown_s(now_s),
+        )
+        self._check_state, report = call(
+            "collision check",
+            collision.step,
+            self._check_state,
+            inputs,
+            collision.CollisionParams(),
+        )
+        return snapshot, report.collision
+
+    def _plan(self, now_s: float, snapshot: MapSnapshot) -> None:
+        """From where the vehicle will be when the plan is there."""
+        start, velocity = self._position, np.zeros(3)
+        if self._trajectory is not None:
+            row = reference_waypoint(self._trajectory, self._flown_s(now_s) + LEAD_S)
+            start, velocity = row[0:3], row[4:7]
+        self._plans += 1
+        departure = Departure(stamp_s=now_s + LEAD_S, velocity_enu_mps=velocity, yaw_rad=self._yaw)
+        inputs = planning.StageInputs(
+            snapshot=snapshot,
+            position_enu_m=start,
+            departure=departure,
+            goal_enu_m=self._world.goal_enu_m,
+            bounds_enu_m=self._bounds,
+            sequence=Sequence(trajectory_seq=self._plans),
+            seed=1000 * self._seed + self._plans,
+        )
+        self._next = self._watch.call(
+            "planner + smoothing", planning.plan, self._planner, inputs, planning.StageParams()
+        ).trajectory
+
+    def _track(self, now_s: float) -> None:
+        """One control tick; then the vehicle is where it should be."""
+        inputs = tracking.TrackingInputs(
+            stamp_s=now_s,
+            position_enu_m=self._position,
+            velocity_enu_mps=np.zeros(3),
+            trajectory=self._trajectory,
+            time_s=self._flown_s(now_s),
+            hold_enu_m=self._position,
+            hold_yaw_rad=self._yaw,
+        )
+        self._track_state, command = self._watch.call(
+            "tracking", tracking.step, self._track_state, inputs, tracking.TrackingParams()
+        )
+        self._yaw = command.yaw_rad
+        if self._trajectory is not None:
+            self._position = reference_waypoint(self._trajectory, self._flown_s(now_s))[0:3]
 
 
 def main() -> None:
@@ -141,7 +165,8 @@ def main() -> None:
     autonomy.warm_up()
     print(f"warm-up {time.perf_counter() - begin:.2f} s")
     watch = Stopwatch()
-    flown_s = fly(load_world(options.world, seed=options.seed), options.seed, watch)
+    world = load_world(options.world, seed=options.seed)
+    flown_s = Flight(world, options.seed, watch).fly()
     print(f"{options.world} {options.seed}: {flown_s:.1f} s flown")
     print(f"{'kernel':22}{'calls':>7}{'mean ms':>10}{'max ms':>9}{'ms / simulated s':>18}")
     total_ms = 0.0

@@ -10,21 +10,11 @@ Prints the tables of docs/results.md:
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
-import subprocess
-import sys
 import tempfile
 from typing import Any
 
-
-def fly(world: str, seed: int, out: str) -> dict[str, Any]:
-    """One mission in a fresh process."""
-    line = [sys.executable, "-m", "mavfi_cli", "fly", "--world", world, "--seed", str(seed)]
-    line += ["--out", out, "--no-picture", "--quiet", "--json"]
-    run = subprocess.run(line, capture_output=True, text=True, check=True)
-    result: dict[str, Any] = json.loads(run.stdout)
-    return result
+from missions import fly
 
 
 def stages(title: str, results: list[dict[str, Any]], key: str) -> None:
@@ -47,8 +37,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=3)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as out:
-        fly(given.world, given.seed, out)  # warms the caches
-        results = [fly(given.world, given.seed, out) for _ in range(given.runs)]
+        line = ["--world", given.world, "--seed", str(given.seed), "--out", out]
+        fly(*line)  # warms the caches
+        results = [fly(*line).result for _ in range(given.runs)]
     factors = sorted(r["simulated_s"] / r["host"]["flight_wall_s"] for r in results)
     startups = [r["host"]["startup_s"] for r in results]
     memory = {

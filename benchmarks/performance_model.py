@@ -8,9 +8,10 @@ from __future__ import annotations
 import argparse
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
+
+from missions import MAVFI
 
 LIMIT_S = 2.0
 
@@ -18,7 +19,7 @@ LIMIT_S = 2.0
 def run_s(*options: str) -> float:
     """Host seconds of one `mavfi vpm`."""
     begun = time.perf_counter()
-    line = [sys.executable, "-m", "mavfi_cli", "vpm", *options]
+    line = [*MAVFI, "vpm", *options]
     subprocess.run(line, capture_output=True, check=True)
     return time.perf_counter() - begun
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 import argparse
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 
+from missions import MAVFI
+
 HELP_LIMIT_S, TICK_LIMIT_S = 0.3, 3.0
-MAVFI = (sys.executable, "-m", "mavfi_cli")
 FIRST_TICK = "waiting until ready"  # what the first control tick makes the mission say
 
 

@@ -8,32 +8,25 @@ Prints the table of docs/results.md:
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
+from missions import fly
 from scipy.stats import binomtest
 
 WORLDS = ("farm", "factory", "sparse", "dense")
 REQUIRED = {"farm": 0.99, "factory": 0.99, "sparse": 0.95, "dense": 0.85}
 
 
-def fly(world: str, seed: int, planner: str, out: Path) -> dict[str, Any]:
-    """One mission in a fresh process, pinned to the core of its worker by the system."""
-    line = [sys.executable, "-m", "mavfi_cli", "fly", "--world", world, "--seed", str(seed)]
-    line += ["--planner", planner, "--out", str(out), "--no-picture", "--quiet", "--json"]
-    run = subprocess.run(line, capture_output=True, text=True, check=False)
-    if run.returncode != 0:
-        raise SystemExit(f"{world} seed {seed}: {run.stderr.strip()}")
-    result: dict[str, Any] = json.loads(run.stdout)
-    return result
+def outcome_of(world: str, seed: int, planner: str, out: str) -> dict[str, Any]:
+    """The record of one golden mission."""
+    line = ["--world", world, "--seed", str(seed), "--planner", planner, "--out", out]
+    return fly(*line).result
 
 
 def row(world: str, results: list[dict[str, Any]]) -> str:
@@ -44,6 +37,7 @@ def row(world: str, results: list[dict[str, Any]]) -> str:
     flown = [r for r in results if r["outcome"] == "success"]
 
     def median(*path: str) -> float:
+        """Of one number of result.json, named by its path; NaN where no flight succeeded."""
         values = []
         for result in flown:
             value: Any = result
@@ -79,7 +73,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
         for world in given.world or WORLDS:
-            flights = [pool.submit(fly, world, s, given.planner, Path(folder)) for s in seeds]
+            flights = [pool.submit(outcome_of, world, s, given.planner, folder) for s in seeds]
             results = [flight.result() for flight in flights]
             print(row(world, results), flush=True)
             lost = [r["config"]["seed"] for r in results if r["outcome"] != "success"]

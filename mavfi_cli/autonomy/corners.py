@@ -143,6 +143,13 @@ class _Phases:
     def add(
         self, duration_s: float, velocity: FloatArray, acceleration: FloatArray, corner: int = -1
     ) -> None:
+        """A phase at an even acceleration; one that takes no time is left out.
+
+        Args:
+            velocity: (3,), at its beginning, m/s.
+            acceleration: (3,), m/s^2.
+            corner: the vertex that it rounds; -1 for none.
+        """
         if not duration_s > 0.0:
             return
         self.rows.append((self.now_s, self.position, velocity, acceleration, corner))

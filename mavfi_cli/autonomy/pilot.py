@@ -5,8 +5,7 @@ puts out is a directive: which trajectory to track, at which point of it, how fa
 and whether a new plan is wanted.
 
 Slowing down and stopping run the trajectory's own clock slower, so the vehicle stays on the path
-that was checked. The rate of that clock is ramped within the braking limit: along a path flown
-at speed v, a rate r gives the velocity r v and a ramp dr/dt the acceleration v dr/dt.
+that was checked: see `flown`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.autonomy.trajectory import reference_waypoint
+from mavfi_cli.autonomy.flown import FlownPlan
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
 
@@ -108,17 +107,24 @@ class Counters:
 
 
 class Pilot:
-    """The state machine. Drive it with the messages, then ask `update` once a control tick."""
+    """The state machine. Drive it with the messages, then ask `update` once a control tick.
+
+    Args:
+        params: limits and patience.
+        goal_enu_m: (3,), m.
+
+    Attributes:
+        flown: the plan that is flown, and how far.
+        mode: what it is doing.
+        counters: for the record.
+    """
 
     def __init__(self, params: PilotParams, goal_enu_m: FloatArray) -> None:
         self.params = params
         self.goal_enu_m = goal_enu_m
         self.counters = Counters()
         self.mode = Mode.WAITING
-        self.trajectory: Trajectory | None = None
-        self.time_s = 0.0
-        self._rate = 0.0
-        self._rate_change = 0.0
+        self.flown = FlownPlan(params.v_max_mps, params.brake_mps2)
         self._next: Trajectory | None = None
         self._hold: FloatArray | None = None
         self._hold_yaw = 0.0
@@ -128,7 +134,7 @@ class Pilot:
         self._asked_s = 0.0  # start of the plan that is awaited
         self._asked_rate = 1.0  # rate of the clock when it was asked for
         self._abandoned: set[float] = set()  # starts of plans that are on their way for nothing
-        self._flown = False  # whether any plan has been adopted yet
+        self._adopted = False  # whether any plan has been adopted yet
         self._wanted = True
         self._not_before_s = 0.0
         self._failures = 0
@@ -144,7 +150,7 @@ class Pilot:
         if report.future_collision_seq < self._collision_seq:
             self.counters.reports_ignored += 1
             return False
-        if not report.collision or self.trajectory is None:
+        if not report.collision or self.flown.trajectory is None:
             return False
         if report.future_collision_seq > self._collision_seq:
             self.counters.collisions_foreseen += 1
@@ -160,14 +166,14 @@ class Pilot:
     def holds(self, trajectory: object) -> bool:
         """Whether a trajectory is flown, or about to be."""
         return trajectory is not None and (
-            trajectory is self.trajectory or trajectory is self._next
+            trajectory is self.flown.trajectory or trajectory is self._next
         )
 
     def _react(self, report: CollisionReport) -> None:
         """Go on, slow down or stop: whichever the time to the collision still allows."""
         p = self.params
         left_s = report.time_to_collision_s - (self._stamp_s - report.stamp_s)
-        brake_s = self._rate * self._planned_speed() / p.brake_mps2 + p.margin_s
+        brake_s = self.flown.stopping_s() + p.margin_s
         if not left_s > brake_s:  # a NaN is no time at all
             mode = Mode.STOPPING
         elif left_s <= brake_s + p.plan_lead_s + p.late_plan_s:
@@ -217,7 +223,7 @@ class Pilot:
             or result.future_collision_seq < self._collision_seq
             or result.stamp_s != self._asked_s
         )
-        late = self._rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
+        late = self.flown.rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
         if stale or late:
             self.counters.plans_ignored += 1
             self._wanted = True
@@ -252,7 +258,7 @@ class Pilot:
         self._not_before_s = self._stamp_s + self.params.retry_s
         if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
             return
-        if self.trajectory is not None:
+        if self.flown.trajectory is not None:
             self._brake()
         if self._failures >= self.params.attempts_max:
             self.mode = Mode.GAVE_UP
@@ -275,15 +281,15 @@ class Pilot:
             if distance_m <= self.params.goal_tolerance_m:
                 self.mode = Mode.ARRIVED
                 self._hold, self._hold_yaw = self.goal_enu_m, state.yaw_rad
-                self._stand()
+                self.flown.stand()
         plan = self._plan_request(stamp_s, state)
         assert self._hold is not None
         return Directive(
             mode=self.mode,
-            trajectory=self.trajectory,
-            time_s=self.time_s,
-            rate=self._rate,
-            rate_change_per_s=self._rate_change,
+            trajectory=self.flown.trajectory,
+            time_s=self.flown.time_s,
+            rate=self.flown.rate,
+            rate_change_per_s=self.flown.rate_change_per_s,
             hold_enu_m=self._hold,
             hold_yaw_rad=self._hold_yaw + self._look_round_angle(stamp_s),
             plan=plan,
@@ -293,40 +299,35 @@ class Pilot:
         """Switch to the next trajectory once its start has come."""
         if self._next is None or stamp_s < self._next.stamp_s:
             return
-        self.counters.replans += self._flown
-        self._flown = True
+        self.counters.replans += self._adopted
+        self._adopted = True
         moving = self.mode not in (Mode.WAITING, Mode.STOPPING)
         late_s = stamp_s - self._next.stamp_s
-        self.trajectory, self._next = self._next, None
-        self.time_s = max(0.0, late_s) if moving else 0.0
-        # The plan departs at the velocity of its request: its clock goes on as the old one went.
-        self._rate = min(1.0, self._rate / self._asked_rate) if moving else 1.0
-        self._rate_change = 0.0
+        self.flown.begin(
+            self._next,
+            time_s=max(0.0, late_s) if moving else 0.0,
+            # It departs at the velocity of its request: its clock goes on as the old one went.
+            rate=min(1.0, self.flown.rate / self._asked_rate) if moving else 1.0,
+        )
+        self._next = None
         self.mode = Mode.FLYING
 
     def _advance(self, step_s: float) -> None:
-        """Run the trajectory's clock, ramping its rate towards what the mode asks for."""
-        if self.trajectory is None:
+        """Run the trajectory's clock at the rate that the mode asks for; hover where it ends."""
+        if self.flown.trajectory is None:
             return
-        target = {Mode.STOPPING: 0.0, Mode.SLOWING: self.params.slow_rate}.get(self.mode, 1.0)
-        speed = max(self._planned_speed(), 0.5)
-        ramp = self.params.brake_mps2 / speed * step_s
-        change = min(max(target - self._rate, -ramp), ramp)
-        before = self._rate
-        self._rate += change
-        self._rate_change = change / step_s if step_s > 0.0 else 0.0
-        self.time_s += 0.5 * (before + self._rate) * step_s
-        if (self.mode is Mode.STOPPING and self._rate <= 0.0) or (
-            not self.time_s < self.trajectory.duration_s and self._next is None
-        ):
+        slower = {Mode.STOPPING: 0.0, Mode.SLOWING: self.params.slow_rate}
+        self.flown.advance(step_s, slower.get(self.mode, 1.0))
+        stopped = self.mode is Mode.STOPPING and self.flown.rate <= 0.0
+        if stopped or (self.flown.over and self._next is None):
             self._stop_here()
 
     def _guard(self, state: VehicleState) -> None:
         """Too far from where the trajectory says it should be: stop and plan from here."""
-        if self.trajectory is None:
+        if self.flown.trajectory is None:
             return
-        reference = self._reference_position()
-        error_m = float(np.linalg.norm(state.position_enu_m - reference))
+        reference_enu_m = self.flown.reference()[0:3]
+        error_m = float(np.linalg.norm(state.position_enu_m - reference_enu_m))
         if not error_m <= self.params.tracking_error_max_m:
             self.abandon(state)
 
@@ -335,7 +336,7 @@ class Pilot:
         if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
             return
         self._hold_here(state)
-        self._stand()
+        self.flown.stand()
         self._next = None
         self._plan_anew()
         self.mode = Mode.WAITING
@@ -343,18 +344,12 @@ class Pilot:
 
     def _stop_here(self) -> None:
         """The trajectory is over, or its clock stands: hover there and want a plan."""
-        self._hold = self._reference_position()
-        self._hold_yaw = self._reference_yaw()
-        self._stand()
+        reference = self.flown.reference()
+        self._hold, self._hold_yaw = reference[0:3].copy(), float(reference[3])
+        self.flown.stand()
         if not self._awaiting_plan:
             self._wanted = True
         self.mode = Mode.WAITING
-
-    def _stand(self) -> None:
-        self.trajectory = None
-        self.time_s = 0.0
-        self._rate = 0.0
-        self._rate_change = 0.0
 
     def _hold_here(self, state: VehicleState) -> None:
         self._hold = state.position_enu_m.copy()
@@ -369,7 +364,7 @@ class Pilot:
         self._awaiting_plan = True
         self.counters.plans_requested += 1
         start = self._start_of_plan(stamp_s, state)
-        self._asked_s, self._asked_rate = start[0], self._rate or 1.0
+        self._asked_s, self._asked_rate = start[0], self.flown.rate or 1.0
         return PlanRequest(
             stamp_s=start[0],
             position_enu_m=start[1],
@@ -385,33 +380,17 @@ class Pilot:
         self, stamp_s: float, state: VehicleState
     ) -> tuple[float, FloatArray, FloatArray, float]:
         """Stamp, position, velocity and yaw at which the next trajectory takes over."""
-        if self.trajectory is None:
+        if self.flown.trajectory is None:
             assert self._hold is not None
             return stamp_s, self._hold.copy(), np.zeros(3), state.yaw_rad
         lead_s = self.params.plan_lead_s
-        waypoint = reference_waypoint(self.trajectory, self.time_s + self._rate * lead_s)
+        waypoint = self.flown.reference(lead_s)
         return (
             stamp_s + lead_s,
             waypoint[0:3].copy(),
-            self._rate * waypoint[4:7],
+            self.flown.rate * waypoint[4:7],
             float(waypoint[3]),
         )
-
-    def _planned_speed(self) -> float:
-        """Speed that the trajectory asks for at its present point and rate 1, m/s."""
-        if self.trajectory is None:
-            return 0.0
-        speed = float(np.linalg.norm(reference_waypoint(self.trajectory, self.time_s)[4:7]))
-        return min(speed, self.params.v_max_mps) if math.isfinite(speed) else self.params.v_max_mps
-
-    def _reference_position(self) -> FloatArray:
-        assert self.trajectory is not None
-        position: FloatArray = reference_waypoint(self.trajectory, self.time_s)[0:3].copy()
-        return position
-
-    def _reference_yaw(self) -> float:
-        assert self.trajectory is not None
-        return float(reference_waypoint(self.trajectory, self.time_s)[3])
 
     def _look_round_angle(self, stamp_s: float) -> float:
         """Angle of the look round that failed plans have started, rad: one turn in 6 s."""

@@ -34,8 +34,8 @@ def reference_waypoint(trajectory: Trajectory, time_s: float) -> FloatArray:
 
 
 def waypoint_index(trajectory: Trajectory, time_s: float) -> int:
-    """Index of the waypoint that is followed at that time."""
-    return int(locate(trajectory.durations_s, time_s)[0])
+    """Index of the waypoint that is followed at that time; 0 where the trajectory has none."""
+    return max(0, int(locate(trajectory.durations_s, time_s)[0]))
 
 
 def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:

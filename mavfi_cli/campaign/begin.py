@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -61,42 +62,25 @@ def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool 
     """
     if missing_only and not (folder / LEDGER).is_file():
         raise ConfigError("no campaign was begun there", path=folder)
-    text = to_toml(spec)
-    if (folder / LEDGER).is_file():
-        ledger = Ledger(folder, writing=True)
-        try:
-            if ledger.meta("spec") == text:  # the list is what it would expand to
-                require_versions(ledger)
-                return ledger
-            return _planned(ledger, spec, text, append=append)
-        except BaseException:
-            ledger.close()
-            raise
+    text, missions = to_toml(spec), None
+    if not (folder / LEDGER).is_file():
+        missions = _flyable(spec)  # before there is a folder
+    with contextlib.ExitStack() as undo:
+        ledger = undo.enter_context(Ledger(folder, writing=True))
+        if missions is None and ledger.meta("spec") == text:  # the list is what it would expand to
+            require_versions(ledger)
+        else:
+            store_plan(ledger, missions or _flyable(spec), append=append)
+            ledger.set_meta({"spec": text, "name": spec.name})
+            write_text(ledger.folder / SPEC, text)
+        undo.pop_all()
+    return ledger
+
+
+def _flyable(spec: Spec) -> list[PlannedMission]:
     missions = spec.missions()
     _check(missions)
-    ledger = Ledger(folder, writing=True)
-    try:
-        return _planned(ledger, spec, text, append=append, missions=missions)
-    except BaseException:
-        ledger.close()
-        raise
-
-
-def _planned(
-    ledger: Ledger,
-    spec: Spec,
-    text: str,
-    *,
-    append: bool,
-    missions: list[PlannedMission] | None = None,
-) -> Ledger:
-    if missions is None:
-        missions = spec.missions()
-        _check(missions)
-    store_plan(ledger, missions, append=append)
-    ledger.set_meta({"spec": text, "name": spec.name})
-    write_text(ledger.folder / SPEC, text)
-    return ledger
+    return missions
 
 
 def _check(missions: list[PlannedMission]) -> None:
@@ -105,6 +89,7 @@ def _check(missions: list[PlannedMission]) -> None:
     asked: set[str] = set()
 
     def vehicle(config: MissionConfig) -> None:
+        """Have the vehicle process judge a mission's world, vehicle and places, once a kind."""
         simple = replace(golden_of(config), seed=0)
         key = canonical({**changes_of(simple), "planner": None, "platform": None})
         if key not in asked:

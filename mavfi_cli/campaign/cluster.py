@@ -52,11 +52,10 @@ class Cluster(Seats):
         self._done: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._threads, self._looked_s = 0, 0.0
         self._client = _connect(address)
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._client.close)
             _require_workers(self._client, address, self._versions)
-        except BaseException:
-            self._client.close()
-            raise
+            undo.pop_all()
 
     @property
     def free(self) -> int:

@@ -37,6 +37,7 @@ def export(ledger: Ledger, path: Path) -> int:
     found = table(ledger)
 
     def write(file: Any) -> None:
+        """Write the table in the format of the name."""
         if path.suffix == ".csv":
             from pyarrow import csv
 

@@ -79,23 +79,19 @@ class Ledger:
         self._path = folder / LEDGER
         self._lock: Any = None
         self._writing = writing
-        if writing:
-            self._become_writer()
-        elif not self._path.is_file():
-            raise RecordError(f"{folder}: no campaign there (no {LEDGER})")
-        try:
-            self._db = self._connect()
+        with contextlib.ExitStack() as undo:
+            if writing:
+                self._become_writer()
+                undo.callback(self._unlock)
+            elif not self._path.is_file():
+                raise RecordError(f"{folder}: no campaign there (no {LEDGER})")
             try:
+                self._db = self._connect()
+                undo.callback(self._db.close)
                 self._check()
-            except BaseException:
-                self._db.close()
-                raise
-        except sqlite3.Error as error:
-            self._unlock()
-            raise RecordError(f"{self._path}: {error}") from None
-        except BaseException:
-            self._unlock()
-            raise
+            except sqlite3.Error as error:
+                raise RecordError(f"{self._path}: {error}") from None
+            undo.pop_all()
 
     def __enter__(self) -> Ledger:
         return self
@@ -155,17 +151,14 @@ class Ledger:
     def _transaction(self) -> Iterator[None]:
         try:
             self._db.execute("BEGIN IMMEDIATE")
-            try:
-                yield
-            except BaseException:
-                self._db.execute("ROLLBACK")
-                raise
+            yield
             self._db.execute("COMMIT")
         except sqlite3.Error as error:
-            if self._db.in_transaction:
+            raise RecordError(f"{self._path}: {error}") from None
+        finally:
+            if self._db.in_transaction:  # it was not committed
                 with contextlib.suppress(sqlite3.Error):
                     self._db.execute("ROLLBACK")
-            raise RecordError(f"{self._path}: {error}") from None
 
     # What the campaign is -------------------------------------------------------------------------
 

@@ -85,6 +85,7 @@ class Spec:
             raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
 
         def share(count: int) -> int:
+            """So many repetitions, scaled, at least one."""
             return max(1, round(count * scale))
 
         settings = tuple(
@@ -187,6 +188,7 @@ class _Reader:
         self._path = path
 
     def spec(self, data: Mapping[str, Any]) -> Spec:
+        """The whole file."""
         self._known(data, _TOP, "")
         settings = data.get("setting", [{}])
         if not isinstance(settings, list):

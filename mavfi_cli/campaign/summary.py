@@ -89,10 +89,12 @@ def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) 
 
 def _cell(group: Group, confidence: float) -> Cell:
     def success(fates: frozenset[str]) -> Share:
+        """Success rate over the missions of some fates."""
         chosen = group.succeeded[group.of(fates)]
         return rate(int(chosen.sum()), len(chosen), confidence)
 
     def metric(name: str) -> Interval:
+        """Mean of a metric over successful missions, with its interval."""
         values = group.successes(name, COUNTED)
         return interval(values, confidence=confidence, resamples=RESAMPLES)
 

@@ -6,8 +6,7 @@ each, the world of every flight from a seed of its own.
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.dataset import Dataset, Flight
@@ -31,7 +29,7 @@ from mavfi_cli.mission.run_folder import load_run
 WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
 FLIGHTS = 25  # of each world
 FIRST_SEED = 10_000  # far from the seeds that people fly and evaluate with
-FLIGHTS_FOLDER, DATASET, LOSS = "flights", "dataset.parquet", "loss.svg"
+FLIGHTS_FOLDER, DATASET = "flights", "dataset.parquet"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,31 +141,4 @@ def train(
         path = folder / f"{kind}.json"
         model_file.save(path, model)
         models[kind] = (model, path)
-    if "aad" in fitted:
-        write_loss_curve(folder / LOSS, fitted["aad"].provenance["loss_curve"]["rows"])
     return Trained(dataset=dataset, models=models, failed=failed)
-
-
-def write_loss_curve(path: Path, curve: Sequence[Sequence[float]]) -> None:
-    """Draw the autoencoder's training over its epochs, as SVG.
-
-    Args:
-        curve: rows of epoch, error on training and on validation flights.
-    """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    epochs, training, validation = zip(*curve, strict=True)
-    axes.plot(epochs, training, color="#1b4965", linewidth=1.4, label="training")
-    axes.plot(epochs, validation, color="#e4572e", linewidth=1.4, label="validation")
-    axes.set_yscale("log")
-    axes.set_xlabel("epoch")
-    axes.set_ylabel("mean squared error of scaled deltas")
-    axes.grid(visible=True, color="#edf0f4", linewidth=0.6)
-    axes.legend(frameon=False, fontsize=8)
-    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
-    write_atomically(path, lambda file: file.write(buffer.getvalue()))

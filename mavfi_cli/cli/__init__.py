@@ -34,9 +34,11 @@ class _LazyGroup(click.Group):
     """Loads a command's module when the command is used or its own help is asked for."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names, in the order of the help."""
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command's module; None where there is no such command."""
         if cmd_name not in _COMMANDS:
             return None
         module = importlib.import_module(_COMMANDS[cmd_name][0])
@@ -44,12 +46,14 @@ class _LazyGroup(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list in the help, from the table: importing every command would be slow."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does, but an unknown command names the nearest one."""
         from mavfi_cli.core.errors import UnknownName
 
         if args and args[0] not in _COMMANDS and not args[0].startswith("-"):

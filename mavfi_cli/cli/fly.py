@@ -30,6 +30,7 @@ class _Place(click.ParamType[Any]):
     name = "X,Y,Z"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, float, float]:
+        """(east, north, up), or a usage error."""
         if isinstance(value, tuple):
             return value
         try:
@@ -45,6 +46,7 @@ class _Size(click.ParamType[Any]):
     name = "WxH"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
+        """(columns, rows), or a usage error."""
         if isinstance(value, tuple):
             return value
         try:

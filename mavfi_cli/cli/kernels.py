@@ -142,6 +142,7 @@ def _model(options: dict[str, Any]) -> Any:
     from mavfi_cli.fi.native.fault import FaultModel, Role, Site
 
     def named(kind: Any, name: str, what: str) -> Any:
+        """A member of an enum by its value; an unknown one names the nearest."""
         try:
             return kind(name)
         except ValueError:

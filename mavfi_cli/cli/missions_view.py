@@ -24,6 +24,7 @@ class _Plain(Spectator):
         self._next_s = self._last_s = 0.0
 
     def on_progress(self, progress: Progress) -> None:
+        """A line now and then, and one at the end."""
         if progress.elapsed_s < self._last_s:  # the next campaign
             self._next_s = 0.0
         self._last_s = progress.elapsed_s
@@ -32,6 +33,7 @@ class _Plain(Spectator):
             click.echo(progress_line(progress), err=True)
 
     def on_note(self, text: str) -> None:
+        """A line of its own."""
         click.echo(text, err=True)
 
 
@@ -42,9 +44,11 @@ class _Live(Spectator):
         self._live = live
 
     def on_progress(self, progress: Progress) -> None:
+        """Rewrite the line."""
         self._live.update(progress_line(progress), refresh=True)
 
     def on_note(self, text: str) -> None:
+        """Print above the line; not markup, whatever it says."""
         from rich.text import Text
 
         self._live.console.print(Text(text))

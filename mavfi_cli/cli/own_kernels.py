@@ -81,6 +81,7 @@ def _progress(plan: Plan) -> Iterator[Any]:
         reached = 0
 
         def show(kernel: str, done: int) -> None:
+            """Move the bar to a kernel's so many runs."""
             nonlocal reached
             position = plan.kernels.index(kernel) * plan.runs + done
             bar.update(position - reached, kernel)

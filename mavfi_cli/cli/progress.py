@@ -29,11 +29,13 @@ class _Plain(Watcher):
         self._next_s = _PLAIN_EVERY_S
 
     def on_progress(self, progress: Progress) -> None:
+        """A line now and then, by simulated time."""
         if progress.stamp_s >= self._next_s:
             self._next_s = progress.stamp_s + _PLAIN_EVERY_S
             click.echo(_line(progress), err=True)
 
     def on_event(self, event: Event) -> None:
+        """A line, where people want to hear of it."""
         if self._title:  # only now, so that a mission that cannot begin gets one line
             click.echo(self._title, err=True)
             self._title = ""
@@ -49,9 +51,11 @@ class _Live(Watcher):
         self._title = title
 
     def on_progress(self, progress: Progress) -> None:
+        """Rewrite the line."""
         self._live.update(_line(progress), refresh=True)
 
     def on_event(self, event: Event) -> None:
+        """Print above the line, where people want to hear of it."""
         from rich.text import Text  # not markup: an autopilot may say anything
 
         if self._title:

@@ -46,6 +46,7 @@ def train(
     from mavfi_cli.campaign.training import train as run
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.detect.fit import KINDS
+    from mavfi_cli.report.training_plot import write_loss_curve
 
     plan = TrainingPlan(
         worlds=worlds or WORLDS,
@@ -57,6 +58,9 @@ def train(
     )
     with missions_view(quiet=quiet) as view:
         trained = run(plan, out, Options(jobs=jobs), view, view.on_note)
+    if "aad" in trained.models:
+        model, _ = trained.models["aad"]
+        write_loss_curve(model.provenance["loss_curve"]["rows"], out / "loss.svg")
     if as_json:
         told = {kind: dict(model.provenance) for kind, (model, _) in trained.models.items()}
         click.echo(json.dumps(told, indent=2))

@@ -89,6 +89,7 @@ def _read(path: Path) -> str:
 
 def _strict(kind: type, *accepted: type) -> Any:
     def hook(value: Any, _cls: Any) -> Any:
+        """Refuse, with TypeError or ValueError, what is of another type or not finite."""
         if isinstance(value, bool) is not (kind is bool) or not isinstance(
             value, (kind, *accepted)
         ):

@@ -45,10 +45,12 @@ class State:
 
 def _field(name: str) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
     def read(message: Message, _index: int) -> Scalar:
+        """The field's value."""
         value: Scalar = getattr(message, name)
         return value
 
     def write(message: Message, _index: int, value: Scalar) -> Message:
+        """A copy of the message with another value."""
         return replace(message, **{name: value})  # type: ignore[arg-type]
 
     return read, write
@@ -60,12 +62,15 @@ def _element(
     """Row `index` of an array, or of one of its columns."""
 
     def place(index: int) -> int | tuple[int, int]:
+        """Where in the array."""
         return index if column is None else (index, column)
 
     def read(message: Message, index: int) -> Scalar:
+        """The element's value."""
         return float(getattr(message, array)[place(index)])
 
     def write(message: Message, index: int, value: Scalar) -> Message:
+        """A copy of the message with another value; its array is a copy, too."""
         changed = np.array(getattr(message, array))
         changed[place(index)] = value
         return replace(message, **{array: changed})  # type: ignore[arg-type]

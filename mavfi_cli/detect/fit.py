@@ -207,6 +207,7 @@ def _provenance(
     dataset: Dataset, parts: Split, seed: int, threshold: float, told: Mapping[str, Any]
 ) -> dict[str, Any]:
     def named(places: tuple[int, ...]) -> list[str]:
+        """Flights as world/seed."""
         return [f"{dataset.flights[p].world}/{dataset.flights[p].seed}" for p in places]
 
     return {

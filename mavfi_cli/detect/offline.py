@@ -74,23 +74,28 @@ class _Probe:
 
     @property
     def threshold(self) -> float:
+        """The detector's; infinite without one."""
         return np.inf if self._detector is None else self._detector.threshold
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
+        """The detector's."""
         return {} if self._detector is None else self._detector.memory
 
     def score(self, deltas: Codes, stage: Stage) -> float:
+        """The detector's, remembered if it is the highest or NaN; 0 without one."""
         score = 0.0 if self._detector is None else self._detector.score(deltas, stage)
         if not score <= self.highest:
             self.highest = score
         return score
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Handed on."""
         if self._detector is not None:
             self._detector.learn(deltas, stage)
 
     def look(self) -> float:
+        """The highest score since the last look; minus infinity where there was none."""
         highest, self.highest = self.highest, -np.inf
         return highest
 

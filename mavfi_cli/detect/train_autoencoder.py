@@ -71,6 +71,7 @@ def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) ->
         weights[f"{name}_biases"] = torch.zeros(after, dtype=torch.float64).requires_grad_()
 
     def loss_of(rows: Any) -> Any:
+        """Mean squared error (n,) of each of the vectors (n, COUNT)."""
         hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
         coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
         output = coded @ weights["output_weights"].T + weights["output_biases"]

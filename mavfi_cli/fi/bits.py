@@ -125,9 +125,11 @@ class _Coding:
 
 def _struct_coding(value_format: str, pattern_format: str) -> _Coding:
     def to_pattern(value: Scalar) -> int:
+        """The bits of a value, as an unsigned integer."""
         return int(struct.unpack(pattern_format, struct.pack(value_format, value))[0])
 
     def to_value(pattern: int) -> Scalar:
+        """The value of these bits."""
         value: Scalar = struct.unpack(value_format, struct.pack(pattern_format, pattern))[0]
         return value
 

@@ -72,6 +72,7 @@ def _reader(cls: Any) -> Callable[[tuple[Any, ...]], Sequence[Any]]:
         return getter
 
     def read(values: tuple[Any, ...]) -> Sequence[Any]:
+        """Arrays as lists, texts without their padding."""
         fields = [
             values[start] if length == 1 else list(values[start : start + length])
             for start, length in spans
@@ -93,6 +94,7 @@ def _writer(cls: Any) -> Callable[[Message], Sequence[Any]]:
     fields = list(zip(names, cls.lengths, strict=True))
 
     def values(message: Message) -> Sequence[Any]:
+        """Arrays laid out flat."""
         flat: list[Any] = []
         for name, length in fields:
             value = getattr(message, name)

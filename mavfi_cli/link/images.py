@@ -53,6 +53,7 @@ class _Shape:
 
     @property
     def size(self) -> int:
+        """Bytes of the whole image, one a pixel."""
         return self.columns * self.rows
 
 

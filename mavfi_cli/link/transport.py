@@ -134,6 +134,7 @@ class _OnePeer:
         self.url = transport.url
 
     def accept_ready(self) -> list[Transport]:
+        """The peer, the first time; nobody after."""
         fresh, self._fresh = self._fresh, []
         return fresh
 

@@ -5,21 +5,21 @@
                                      +------------> planner <-----+--+
 
 Every message that one kernel hands to the next passes through one of the `_take_...` methods.
+What the detector gate withholds there, and what follows, is in `mission.recovery`.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.autonomy import occupancy, tracking
+from mavfi_cli.autonomy import occupancy
 from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFailure
 from mavfi_cli.autonomy.planners import Planner
-from mavfi_cli.autonomy.trajectory import waypoint_index, without_waypoint
-from mavfi_cli.core.states import Message, of_stage
+from mavfi_cli.autonomy.trajectory import waypoint_index
+from mavfi_cli.core.states import of_stage
 from mavfi_cli.core.types import (
     CollisionReport,
     Command,
@@ -36,9 +36,10 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels
+from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels, tracking_inputs
 from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
-from mavfi_cli.mission.protection import NoProtection, Response
+from mavfi_cli.mission.protection import NoProtection
+from mavfi_cli.mission.recovery import Recovery, Retry, Setpoint
 from mavfi_cli.mission.response import Reaction
 
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
@@ -49,19 +50,7 @@ FOLLOWED_STATES = {s.name for s in of_stage(Stage.PLANNING) if s.name.startswith
 PLAN_STATES = {s.name for s in of_stage(Stage.PLANNING)} - FOLLOWED_STATES
 CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 COMMAND_STATES = {state.name for state in of_stage(Stage.CONTROL)}
-ATTEMPTS = 2  # a command is computed again in one tick
 BRAKE_SHARE = 0.6  # of a_max that stopping counts on, as planned motion does
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Setpoint:
-    """A command on its way, and what it was computed from."""
-
-    due_s: float
-    command: Command
-    directive: Directive
-    waypoint: int
-    attempt: int = 0  # how often it was computed again
 
 
 class Companion:
@@ -90,6 +79,7 @@ class Companion:
             ),
             briefing.goal_enu_m,
         )
+        self._recovery = Recovery(protection, self.pilot, injection.follower, self._exchange)
         self._latency = LatencyModel(platform, config.seed)
         self.executor = Executor(
             draw_latency_s=self._latency.draw_s,
@@ -109,8 +99,7 @@ class Companion:
             self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
         self._checked: Trajectory | None = None
-        self._looked: tuple[Trajectory | None, int] = (None, -1)
-        self._commands: deque[_Setpoint] = deque()
+        self._commands: deque[Setpoint] = deque()
         self._frame: DepthFrame | None = None
         self._state: VehicleState | None = None
         self.report: CollisionReport | None = None
@@ -139,12 +128,9 @@ class Companion:
     def _take_report(self, checked: tuple[CollisionReport, float], stamp_s: float) -> None:
         report, self._fresh_frame_s = checked
         report = self._injection.pass_on(report, self._moment(stamp_s))
-        response = self.protection.report(report, stamp_s)
-        if response in (Response.RECOMPUTE, Response.HOLD):
-            self._withheld(report)
-            self._recompute_perception()
-            if response is Response.HOLD:
-                self._hold()
+        if not self._recovery.admit_report(report, stamp_s):
+            if self._frame is not None:  # look anew: point cloud, OctoMap, collision check
+                self.executor.submit("point_cloud", self._frame)
             return
         self.report = report
         timely = self.pilot.on_report(report)
@@ -155,68 +141,12 @@ class Companion:
     def _take_plan(self, result: Trajectory | PlanFailure, stamp_s: float) -> None:
         if isinstance(result, Trajectory):
             result = self._injection.pass_on(result, self._moment(stamp_s))
-            if self.pilot.expects(result):
-                response = self.protection.plan(result, stamp_s)
-                if response in (Response.RECOMPUTE, Response.HOLD):
-                    self._withheld(result)
-                    self.pilot.reject_plan()
-                    if response is Response.HOLD:
-                        self._hold()
-                    return
+            if self.pilot.expects(result) and not self._recovery.admit_plan(result, stamp_s):
+                return
             self.plans.append(result)
             if self._injection.follower is not None:
                 self._injection.follower.read(result, "mission logic", stamp_s, PLAN_STATES)
         self.pilot.on_plan(result)
-
-    # What the gate has computed again
-
-    def _recompute_perception(self) -> None:
-        """From the newest frame on: point cloud, OctoMap, collision check."""
-        if self._frame is not None:
-            self.executor.submit("point_cloud", self._frame)
-
-    def _hold(self) -> None:
-        """Hover, and plan anew from there."""
-        if self._state is not None:
-            self.pilot.abandon(self._state)
-
-    def _without(self, flown: Trajectory, waypoint: int) -> Trajectory:
-        """The flown plan without a waypoint, flown from now on; like a flip, it causes no check."""
-        bridged = without_waypoint(flown, waypoint)
-        self._withheld(flown)
-        if self.pilot.trajectory is flown:
-            self.pilot.trajectory = bridged
-        if self._checked is flown:
-            self._checked = bridged
-        return bridged
-
-    def _withheld(self, message: Message) -> None:
-        if self._injection.follower is not None:
-            self._injection.follower.withheld(message)
-
-    def _recompute_control(self, stamp_s: float, setpoint: _Setpoint, stage: Stage) -> None:
-        """Compute a command again; where that did not help, from the next waypoint and afresh.
-
-        A waypoint that raised the alarm itself is dropped at once. The controller then begins from
-        the last command that went out.
-        """
-        assert self._state is not None
-        directive, fresh = setpoint.directive, None
-        if stage is Stage.PLANNING or setpoint.attempt > 0:
-            if directive.trajectory is not None:
-                bridged = self._without(directive.trajectory, setpoint.waypoint)
-                directive = replace(directive, trajectory=bridged)
-            if self.command is not None:
-                last = self.command
-                fresh = tracking.TrackingState(yaw_rad=last.yaw_rad, stamp_s=last.stamp_s)
-        renewed = self._track(stamp_s, self._state, directive, fresh)
-        if renewed is None:
-            return
-        renewed = replace(renewed, attempt=setpoint.attempt + 1)
-        if renewed.due_s <= stamp_s:
-            self._take_command(stamp_s, renewed)
-        else:
-            self._commands.append(renewed)
 
     def _on_start(self, node: str, value: Any, start_s: float) -> None:
         """A node begins to work on its input: it has read it."""
@@ -225,53 +155,17 @@ class Companion:
 
     def _check(self, stamp_s: float) -> None:
         """Have the present trajectory checked against the newest map."""
-        self._look_ahead(stamp_s)
-        trajectory = self.pilot.trajectory
+        self._recovery.look_ahead(stamp_s)
+        trajectory = self.pilot.flown.trajectory
         if self._snapshot is None or trajectory is None:
             return
         self._checked = trajectory
         self.executor.submit(
             "collision_check",
-            CheckInput(snapshot=self._snapshot, trajectory=trajectory, time_s=self.pilot.time_s),
+            CheckInput(
+                snapshot=self._snapshot, trajectory=trajectory, time_s=self.pilot.flown.time_s
+            ),
         )
-
-    def _look_ahead(self, stamp_s: float, only: int | None = None) -> None:
-        """Drop what the gate finds wrong on the way ahead, before others take it for true.
-
-        Args:
-            only: nothing but this waypoint is dropped.
-        """
-        while self.pilot.trajectory is not None:
-            flown = self.pilot.trajectory
-            response, alarm = self.protection.ahead(flown, self._waypoint(), only, stamp_s)
-            if response is Response.HOLD:
-                self._hold()
-            elif response is Response.RECOMPUTE and alarm is not None:
-                assert alarm.waypoint is not None
-                self._without(flown, alarm.waypoint)
-                if alarm.stage is Stage.PLANNING:
-                    self.pilot.want_plan()
-                if self.pilot.trajectory is not flown:
-                    continue
-            return
-
-    def _look_round(self, stamp_s: float, unharmed: Trajectory) -> None:
-        """Before the mission logic works with the flown plan: what has changed since the last tick?
-
-        With a new plan, or a waypoint that is begun, the whole way ahead is looked through. In
-        between only the waypoint that is followed is watched, in every tick: looking through the
-        whole plan 50 times a second would be another order of cost.
-
-        Args:
-            unharmed: the plan before this tick's strike; the gate has seen that one already.
-        """
-        if self.pilot.trajectory is None:
-            return
-        at, (seen, seen_at) = self._waypoint(), self._looked
-        if self.pilot.trajectory is not seen or at != seen_at:
-            known = unharmed is seen and at == seen_at
-            self._look_ahead(stamp_s, at if known else None)
-        self._looked = (self.pilot.trajectory, at)
 
     # The control tick
 
@@ -290,12 +184,12 @@ class Companion:
         if not self.sees:
             return None
         self._ticks += 1
-        self._state = state
+        self._state = self._recovery.state = state
         self._injection.strike_memory(self._moment(stamp_s))
-        if self.pilot.trajectory is not None:
-            flown = self.pilot.trajectory
+        if self.pilot.flown.trajectory is not None:
+            flown = self.pilot.flown.trajectory
             self._strike_latched(flown, stamp_s)
-            self._look_round(stamp_s, flown)
+            self._recovery.look_round(stamp_s, flown)
         if self._injection.follower is not None:
             self._follow(self._injection.follower, stamp_s)
         directive = self.directive = self.pilot.update(stamp_s, state)
@@ -312,19 +206,26 @@ class Companion:
         return self.command
 
     def _strike_latched(self, flown: Trajectory, stamp_s: float) -> None:
-        """A fault in the memory of the flown trajectory; nobody is told, so no check follows."""
-        struck = self._injection.strike_latched(flown, self._moment(stamp_s), self._waypoint())
-        self.pilot.trajectory = struck
+        """A fault in the memory of the flown trajectory."""
+        struck = self._injection.strike_latched(
+            flown, self._moment(stamp_s), self.pilot.flown.waypoint
+        )
+        self._exchange(flown, struck)
+
+    def _exchange(self, flown: Trajectory, changed: Trajectory) -> None:
+        """Fly a changed version of a plan; nobody is told, so no check follows."""
+        if self.pilot.flown.trajectory is flown:
+            self.pilot.flown.trajectory = changed
         if self._checked is flown:
-            self._checked = struck
+            self._checked = changed
 
     def _follow(self, follower: Follower, stamp_s: float) -> None:
         """Mission logic and control are about to read the followed waypoint, and the next yaw."""
         if not follower.waits:
             return
-        flown = self.pilot.trajectory
+        flown = self.pilot.flown.trajectory
         if flown is not None:
-            at = self._waypoint()
+            at = self.pilot.flown.waypoint
             follower.read(flown, "control", stamp_s, FOLLOWED_STATES, at)
             follower.read(flown, "control", stamp_s, {"waypoint_yaw"}, at + 1)
         follower.settle(lambda message: message is self.report or self.pilot.holds(message))
@@ -334,53 +235,41 @@ class Companion:
         stamp_s: float,
         state: VehicleState,
         directive: Directive,
-        fresh: tracking.TrackingState | None = None,
-    ) -> _Setpoint | None:
+        retry: Retry | None = None,
+    ) -> Setpoint | None:
         """Have control compute a command, due when its latency has passed."""
-        inputs = tracking.TrackingInputs(
-            stamp_s=stamp_s,
-            position_enu_m=state.position_enu_m,
-            velocity_enu_mps=state.velocity_enu_mps,
-            trajectory=directive.trajectory,
-            time_s=directive.time_s,
-            rate=directive.rate,
-            rate_change_per_s=directive.rate_change_per_s,
-            hold_enu_m=directive.hold_enu_m,
-            hold_yaw_rad=directive.hold_yaw_rad,
-        )
+        fresh, attempt = (None, 0) if retry is None else (retry.fresh, retry.attempt)
         due_s = stamp_s + self._control_delay_s()
-        job = ControlInput(inputs=inputs, fresh=fresh, yaw_rad=state.yaw_rad)
+        job = ControlInput(
+            inputs=tracking_inputs(stamp_s, state, directive), fresh=fresh, yaw_rad=state.yaw_rad
+        )
         command: Command | None = self.executor.call("control", job, stamp_s)
         if command is None:
             return None
         flown = directive.trajectory
-        waypoint = 0 if flown is None else max(0, waypoint_index(flown, directive.time_s))
-        return _Setpoint(due_s=due_s, command=command, directive=directive, waypoint=waypoint)
+        return Setpoint(
+            due_s=due_s,
+            command=command,
+            directive=directive,
+            waypoint=0 if flown is None else waypoint_index(flown, directive.time_s),
+            attempt=attempt,
+        )
 
     def _control_delay_s(self) -> float:
         latency_s = self._latency.draw_s("control")
         self._control.busy_s += latency_s
         return latency_s if latency_s >= SAME_TICK_S else 0.0
 
-    def _take_command(self, stamp_s: float, setpoint: _Setpoint) -> None:
+    def _take_command(self, stamp_s: float, setpoint: Setpoint) -> None:
         """A command is due: through the gate, and out.
 
-        One that is withheld is computed again, at once where the platform is fast enough. What
-        raises an alarm ATTEMPTS times leaves the last command in force until the next tick.
+        One that is withheld is computed again, at once where the platform is fast enough.
         """
         command = self._injection.pass_on(setpoint.command, self._moment(stamp_s))
-        flown = setpoint.directive.trajectory
-        response, stage = self.protection.tick(flown, setpoint.waypoint, command, stamp_s)
-        if response in (Response.RECOMPUTE, Response.HOLD):
-            self._withheld(command)
-        if response is Response.HOLD:
-            self._hold()
-            return
-        if response is Response.RECOMPUTE:
-            if stage is Stage.PLANNING:
-                self.pilot.want_plan()
-            if setpoint.attempt < ATTEMPTS:
-                self._recompute_control(stamp_s, setpoint, stage)
+        passes, retry = self._recovery.admit_command(command, setpoint, self.command, stamp_s)
+        if retry is not None:
+            self._compute_again(stamp_s, retry)
+        if not passes:
             return
         self.command = command
         if self._injection.follower is not None:
@@ -391,6 +280,16 @@ class Companion:
             )
             self._fresh_frame_s = None
 
+    def _compute_again(self, stamp_s: float, retry: Retry) -> None:
+        assert self._state is not None
+        renewed = self._track(stamp_s, self._state, retry.directive, retry)
+        if renewed is None:
+            return
+        if renewed.due_s <= stamp_s:
+            self._take_command(stamp_s, renewed)
+        else:
+            self._commands.append(renewed)
+
     def _moment(self, stamp_s: float) -> Moment:
         takeover_s = stamp_s if self._takeover_s is None else self._takeover_s
         return Moment(
@@ -400,18 +299,13 @@ class Companion:
             phase=self.pilot.mode.value,
         )
 
-    def _waypoint(self) -> int:
-        """Index of the waypoint that is followed at present."""
-        assert self.pilot.trajectory is not None
-        return max(0, waypoint_index(self.pilot.trajectory, self.pilot.time_s))
-
     @property
     def tracked(self) -> tuple[Trajectory, int] | None:
         """The tracked trajectory and the index of its present waypoint."""
-        trajectory = self.pilot.trajectory
+        trajectory = self.pilot.flown.trajectory
         if trajectory is None or not len(trajectory.waypoints):
             return None
-        return trajectory, self._waypoint()
+        return trajectory, self.pilot.flown.waypoint
 
     @property
     def mode(self) -> Mode:

@@ -94,6 +94,7 @@ def plan_fault(
     folder = out / CACHE / _key(golden, versions)
 
     def fly() -> tuple[Briefing, dict[str, list[Order]]]:
+        """The briefing of the golden flight, and what it asked of its nodes, by node."""
         recorder = Recorder()
         fly_golden(golden, folder, recorder)
         assert recorder.briefing is not None

@@ -98,6 +98,7 @@ def _traced(
         scope = spawned.begin(setup)
 
         def trace(armed: Armed) -> T:
+            """On the node's own processor: handing over between two would cost as much again."""
             linux.share_processor(spawned.pid)
             return work(spawned.pid, scope, armed)
 
@@ -114,6 +115,7 @@ def _traced(
 
 def _whole(setup: Setup, orders: Sequence[Order], invocation: int) -> KernelProfile:
     def work(pid: int, scope: KernelScope, armed: Armed) -> InvocationProfile:
+        """Step through the whole invocation."""
         return profile_invocation(
             pid,
             scope.entry,
@@ -148,6 +150,7 @@ def _sampled(
     drawn = sorted(1 + rng.choice(counts[which], size=number, replace=False))
 
     def work(pid: int, scope: KernelScope, armed: Armed) -> list[InvocationProfile]:
+        """Step through the drawn windows."""
         return _windows(pid, scope, invocation, which, [int(m) for m in drawn], armed)
 
     found = _traced(setup, orders, work)

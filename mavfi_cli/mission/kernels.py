@@ -8,10 +8,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
-from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
+from mavfi_cli.autonomy.pilot import Directive, PlanFailure, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.seeds import Stream, derive
-from mavfi_cli.core.types import CollisionReport, Command, DepthFrame, PointCloud, Trajectory
+from mavfi_cli.core.types import (
+    CollisionReport,
+    Command,
+    DepthFrame,
+    PointCloud,
+    Trajectory,
+    VehicleState,
+)
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 
@@ -32,6 +39,23 @@ class ControlInput:
     inputs: tracking.TrackingInputs
     fresh: tracking.TrackingState | None  # compute from this state instead of one's own
     yaw_rad: float  # the vehicle's, for a controller that begins
+
+
+def tracking_inputs(
+    stamp_s: float, state: VehicleState, directive: Directive
+) -> tracking.TrackingInputs:
+    """What the controller works on, as the pilot directs it in the tick of that state."""
+    return tracking.TrackingInputs(
+        stamp_s=stamp_s,
+        position_enu_m=state.position_enu_m,
+        velocity_enu_mps=state.velocity_enu_mps,
+        trajectory=directive.trajectory,
+        time_s=directive.time_s,
+        rate=directive.rate,
+        rate_change_per_s=directive.rate_change_per_s,
+        hold_enu_m=directive.hold_enu_m,
+        hold_yaw_rad=directive.hold_yaw_rad,
+    )
 
 
 class Kernels:

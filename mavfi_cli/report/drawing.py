@@ -1,4 +1,4 @@
-"""What the pictures of the performance model share: how they are saved, and their colours."""
+"""What the pictures share: how they are saved, and colours."""
 
 from __future__ import annotations
 

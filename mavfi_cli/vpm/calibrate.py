@@ -49,6 +49,7 @@ def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
     known = {scheme.name: scheme for scheme in SCHEMES}
 
     def setting(value: float) -> Setting:
+        """The vehicle with a trial value of the parameter."""
         pull_n, compute_s = vehicle.rotor_pull_n, vehicle.response_s
         if plan.parameter == "rotor_pull_n":
             pull_n = value
@@ -63,6 +64,7 @@ def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
         )  # fmt: skip
 
     def ratio(value: float, scheme: str) -> float:
+        """Flight time of a scheme over the reference's; infinite where one cannot fly."""
         fast = setting(value).velocity_mps(named(SCHEMES, REFERENCE))
         slow = setting(value).velocity_mps(known[scheme])
         return math.inf if fast is None or slow is None else fast / slow

@@ -229,6 +229,7 @@ class Autopilot:
             down = float(self.snapshot.home_ned_m[2]) - height
 
         def finished() -> None:
+            """Hold at the height that was asked for, but no lower than half a metre below here."""
             place = np.array(self.snapshot.truth.position_ned_m)
             place[2] = min(down, float(place[2]) + 0.5)
             self._hold = Hold(place)
@@ -263,7 +264,10 @@ class Autopilot:
 
     def _handler_table(self) -> dict[int, Handler]:
         def addressed(service: Callable[[Autopilot, Any, Link], None]) -> Handler:
+            """A service that ignores messages for other components."""
+
             def handler(message: Any, link: Link) -> None:
+                """Serve a message if it is for us."""
                 if self._is_for_me(message):
                     service(self, message, link)
 

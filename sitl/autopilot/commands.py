@@ -132,6 +132,7 @@ def _down(autopilot: Autopilot, command: Command) -> float:
 
 def _mode_command(mode: Mode) -> Callable[[Autopilot, Command, Link], Result]:
     def handler(autopilot: Autopilot, _command: Command, _link: Link) -> Result:
+        """Enter the mode; whether it was accepted."""
         return autopilot.enter_mode(mode)
 
     return handler

@@ -140,6 +140,7 @@ def _run_until_stopped(station: Station) -> None:
     stopped: list[int] = []
 
     def stop(number: int, _frame: Any) -> None:
+        """Note the signal; the loop ends after its turn."""
         stopped.append(number)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}

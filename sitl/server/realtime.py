@@ -72,6 +72,7 @@ class Realtime:
 
     def _tell_others(self, speaker: Client, frame: bytes) -> None:
         def forward(client: Client) -> None:
+            """To all but the one who spoke."""
             if client is not speaker:
                 client.forward([frame])
 

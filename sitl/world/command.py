@@ -32,6 +32,7 @@ class _Place(click.ParamType[tuple[float, ...]]):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
+        """(3,) finite numbers, or a usage error."""
         try:
             place = tuple(float(part) for part in str(value).split(","))
         except ValueError:
@@ -216,6 +217,7 @@ def _world_json(made: World) -> dict[str, Any]:
 
 def _check_json(found: WorldCheck) -> dict[str, Any]:
     def finite(value: float) -> float | None:
+        """JSON knows no infinity: None."""
         return value if math.isfinite(value) else None
 
     return {

@@ -550,7 +550,7 @@ def test_no_sequence_of_messages_breaks_it(plan):
             driver.tick(ticks, at=state(*place, yaw=yaw))
         assert 0.0 <= driver.last.rate <= 1.0
         assert driver.last.time_s >= 0.0
-        hovers = driver.pilot.trajectory is None
+        hovers = driver.pilot.flown.trajectory is None
         assert hovers or driver.pilot.mode not in (Mode.WAITING, Mode.ARRIVED)
 
 

@@ -74,7 +74,7 @@ def test_an_endless_duration_is_followed_for_ever():
 
 def test_no_waypoints_give_no_reference():
     assert np.isnan(reference_waypoint(made(np.empty((0, 10))), 0.0)).all()
-    assert waypoint_index(made(np.empty((0, 10))), 0.0) == -1
+    assert waypoint_index(made(np.empty((0, 10))), 0.0) == 0
 
 
 def test_dropping_a_waypoint_fills_its_time_from_the_next():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Any
 
 from mavfi_cli.link.autopilots import ARDUCOPTER, PX4, Autopilot
@@ -18,7 +19,7 @@ _UNSUPPORTED = dialect.MAV_RESULT_UNSUPPORTED
 _GROUND, _AIR, _TAKEOFF, _LANDING = 1, 2, 3, 4
 
 
-class FakeAutopilot:
+class FakeAutopilot(ABC):
     """What both have in common; a subclass answers commands its own way."""
 
     autopilot: Autopilot
@@ -113,14 +114,14 @@ class FakeAutopilot:
             self._home()
         self._ack(dialect.MAV_CMD_REQUEST_MESSAGE, _ACCEPTED)
 
-    def _set_mode(self, message: Message) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _set_mode(self, message: Message) -> None: ...
 
-    def _arm(self, message: Message) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _arm(self, message: Message) -> None: ...
 
-    def _takeoff(self, message: Message) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _takeoff(self, message: Message) -> None: ...
 
     def _move(self) -> None:
         height = self.position_enu_m[2]
@@ -142,7 +143,7 @@ class FakeAutopilot:
             for axis, speed in enumerate((s.vy, s.vx, -s.vz)):
                 self.position_enu_m[axis] += speed * DT_S
 
-    def _arrived(self) -> None:
+    def _arrived(self) -> None:  # noqa: B027 (not every autopilot does something)
         """The take-off height is reached."""
 
     def _due(self, period_s: float) -> bool:

@@ -94,6 +94,7 @@ def _space(grid: ObstacleGrid) -> tuple[Any, Any]:
     arguments = (grid.blocked, grid.origin_enu_m, grid.resolution_m, grid.bounds_enu_m)
 
     def valid(state: Any) -> bool:
+        """Whether a state (east, north, up, m) lies in free space."""
         x, y, z = state[0], state[1], state[2]
         free: bool = segment_free(*arguments, x, y, z, x, y, z)
         return free

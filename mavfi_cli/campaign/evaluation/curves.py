@@ -100,6 +100,7 @@ def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, 
     z = z_of(0.95)
 
     def spread(of: float) -> float:
+        """Half width of the interval around an area (Hanley and McNeil 1982)."""
         q1, q2 = of / (2.0 - of), 2.0 * of**2 / (1.0 + of)
         variance = (
             of * (1.0 - of) + (positives - 1) * (q1 - of**2) + (negatives - 1) * (q2 - of**2)

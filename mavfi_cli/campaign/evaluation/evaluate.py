@@ -64,6 +64,7 @@ def _scored(
     scores.score_all(itertools.chain(*wanted), spectator.on_note)
 
     def of(detector: str) -> tuple[list[tuple[FaultPair, float]], list[float]]:
+        """A detector's scores of harmful faults, each with its pair, and of error-free flights."""
         positive = [(pair, scores.of(pair.faulty, detector)) for pair in harmful]
         negative = [scores.of(flown, detector) for flown in wanted[1]]
         return (

@@ -259,6 +259,7 @@ def recoveries_compared(
     """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
 
     def key(pair: FaultPair) -> tuple[object, ...]:
+        """What two detectors' pairs of the same fault have in common."""
         return pair.world, pair.seed, pair.level, pair.stage, pair.target, pair.field
 
     other = {key(pair): pair for pair in second}
@@ -293,6 +294,7 @@ def _worst(pairs: Sequence[FaultPair]) -> WorstFlight:
     faulty, protected = faulty[usable], protected[usable]
 
     def recovered(rows: IntArray) -> FloatArray:
+        """What protection takes off the worst increase (k,), for resamples of missions (k, n)."""
         # A sample without any successful flight of a kind has no worst one: as if none was longer.
         worst = [np.maximum(each[rows].max(axis=-1), 0.0) for each in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])

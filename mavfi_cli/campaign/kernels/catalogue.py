@@ -52,6 +52,7 @@ def _point_cloud(inputs: KernelInputs) -> Call:
     params = point_cloud.PointCloudParams()
 
     def call() -> Output:
+        """One depth frame to points, ENU, m."""
         cloud = point_cloud.generate(inputs.frame, params)
         return {"points_enu_m": cloud.points_enu_m, "origin_enu_m": cloud.origin_enu_m}
 
@@ -64,6 +65,7 @@ def _octomap(inputs: KernelInputs) -> Call:
         world.insert(cloud)
 
     def call() -> Output:
+        """One more cloud into the map; its serialised tree and number of nodes."""
         world.insert(inputs.cloud)
         payload = np.frombuffer(world.snapshot().payload, np.uint8)
         return {"payload": payload, "nodes": np.array(world.nodes)}
@@ -75,6 +77,7 @@ def _collision_check(inputs: KernelInputs) -> Call:
     params = collision.CollisionParams()
 
     def call() -> Output:
+        """One check of the rest of a trajectory."""
         _, report = collision.step(collision.CollisionState(), inputs.check, params)
         return {
             "collision": np.array(report.collision),
@@ -87,12 +90,14 @@ def _collision_check(inputs: KernelInputs) -> Call:
 
 def _planner(name: str) -> Callable[[KernelInputs], Call]:
     def prepare(inputs: KernelInputs) -> Call:
+        """A planner's call on the recorded task, the problem posed beforehand."""
         task, planner = inputs.task, planners.find(name)
         problem = pose_problem(
             task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
         )
 
         def call() -> Output:
+            """One search; the path (n, 3), ENU, m."""
             result = planner.plan(problem, task.seed)
             return {"found": np.array(result.found), "path_enu_m": result.path_enu_m}
 
@@ -103,6 +108,7 @@ def _planner(name: str) -> Callable[[KernelInputs], Call]:
 
 def _control(inputs: KernelInputs) -> Call:
     def call() -> Output:
+        """One control tick: the command and the integral part of its PID."""
         state, command = tracking.step(
             inputs.tracking_state, inputs.tracking, inputs.tracking_params
         )

@@ -105,15 +105,14 @@ class Place:
                 cwd="/",
                 start_new_session=True,
             )
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
             self._control.sendall(len(template.data).to_bytes(LENGTH_BYTES, "little"))
             self._control.sendall(template.data)
             self._receive(1)
             if look_up:
                 self.layout = self._layout(layout)
-        except BaseException:
-            self.close()
-            raise
+            undo.pop_all()
 
     def _layout(self, known: Layout | None) -> Layout:
         if known is not None and known.digest == _digest(self._process.pid):

@@ -27,6 +27,7 @@ from mavfi_cli.mission import briefing
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
+from mavfi_cli.mission.kernels import tracking_inputs
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.vehicle_process import VehicleProcess
@@ -37,6 +38,11 @@ class _Tick:
     stamp_s: float
     state: VehicleState
     directive: Directive
+
+    @property
+    def inputs(self) -> tracking.TrackingInputs:
+        """What control was given."""
+        return tracking_inputs(self.stamp_s, self.state, self.directive)
 
 
 @dataclass(slots=True)
@@ -103,9 +109,11 @@ def _listen(companion: Companion, recording: _Recording) -> None:
     nodes = companion.executor.nodes
 
     def tap(name: str, note: Callable[[Any, float], None]) -> None:
+        """Have a note taken of every input of a node."""
         run = nodes[name].run
 
         def noted(value: Any, stamp_s: float) -> Any:
+            """The kernel's own work, its input and start stamp noted."""
             note(value, stamp_s)
             return run(value, stamp_s)
 
@@ -118,6 +126,7 @@ def _listen(companion: Companion, recording: _Recording) -> None:
     tick = companion.tick
 
     def noted_tick(stamp_s: float, state: VehicleState) -> Command | None:
+        """The companion's own tick; noted where the pilot decided something in it."""
         before = companion.directive
         command = tick(stamp_s, state)
         if companion.directive is not None and companion.directive is not before:
@@ -190,23 +199,8 @@ def _tracked(
     state = tracking.TrackingState(yaw_rad=first.state.yaw_rad, stamp_s=first.stamp_s)
     chosen = following[len(following) // 2]
     for tick in ticks[:chosen]:
-        state, _ = tracking.step(state, _inputs_of(tick), params)
-    return state, _inputs_of(ticks[chosen]), params
-
-
-def _inputs_of(tick: _Tick) -> tracking.TrackingInputs:
-    directive = tick.directive
-    return tracking.TrackingInputs(
-        stamp_s=tick.stamp_s,
-        position_enu_m=tick.state.position_enu_m,
-        velocity_enu_mps=tick.state.velocity_enu_mps,
-        trajectory=directive.trajectory,
-        time_s=directive.time_s,
-        rate=directive.rate,
-        rate_change_per_s=directive.rate_change_per_s,
-        hold_enu_m=directive.hold_enu_m,
-        hold_yaw_rad=directive.hold_yaw_rad,
-    )
+        state, _ = tracking.step(state, tick.inputs, params)
+    return state, ticks[chosen].inputs, params
 
 
 def inputs_of_flight(config: MissionConfig, folder: Path) -> tuple[Path, str, str]:

@@ -6,6 +6,7 @@ on the number of workers nor on which kernels are attacked beside it.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -83,13 +84,16 @@ class _Bench:
 
     @property
     def stream(self) -> tuple[str, ...]:
+        """Of its random numbers: a kernel's own."""
         return (self.kernel,)
 
     def open(self) -> Attacker[KernelVerdict]:
+        """Start the kernel's process, in this worker."""
         template = template_of(self.kernel, self.plan.inputs)
         return self.attacker(Place(self.kernel, template, layout=self.layout))
 
     def attacker(self, place: Place) -> Attacker[KernelVerdict]:
+        """Attacks in a place that is open already."""
         kernel = catalogue.find(self.kernel)
         return attacker_of(kernel, place, self.golden, tolerance=self.plan.tolerance)
 
@@ -148,15 +152,13 @@ def _prepare(plan: Plan, name: str) -> tuple[Prepared, Place]:
     begun = time.perf_counter()
     kernel, template = catalogue.find(name), template_of(name, plan.inputs)
     load(name, template)
-    place = Place(name, template)
-    try:
+    with contextlib.ExitStack() as undo:
+        place = undo.enter_context(contextlib.closing(Place(name, template)))
         golden, profile = golden_run(place), None
         if plan.strategy().rule is Rule.INSTRUCTION:
             rng = generator(plan.seed, Stream.FAULT, name, "profile")
             profile = profile_kernel(place, rng, windows=plan.windows, sampled=kernel.too_long)
-    except BaseException:
-        place.close()
-        raise
+        undo.pop_all()
     prepared = Prepared(
         kernel=name,
         layout=place.layout,

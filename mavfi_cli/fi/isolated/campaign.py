@@ -66,6 +66,7 @@ class _Bench:
     stream: tuple[str, ...] = ()
 
     def open(self) -> Attacker[ProgramVerdict]:
+        """Attacks on the program, from this process."""
         return Workplace(self.plan.target).attacker(self.golden)
 
 

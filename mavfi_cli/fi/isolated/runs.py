@@ -202,6 +202,7 @@ class _Open:
 
     @classmethod
     def of(cls, bench: Bench) -> Attacker[Any]:
+        """The attacker of a bench: the one that is open, or a new one in its place."""
         if cls.attacker is None or cls.stream != bench.stream:
             cls.keep(bench, bench.open())
         assert cls.attacker is not None
@@ -209,11 +210,13 @@ class _Open:
 
     @classmethod
     def keep(cls, bench: Bench, attacker: Attacker[Any]) -> None:
+        """Keep an attacker open for what comes, and close the one before."""
         cls.close()
         cls.attacker, cls.stream = attacker, bench.stream
 
     @classmethod
     def close(cls) -> None:
+        """Close what is open, if anything is."""
         if cls.attacker is not None:
             cls.attacker.place.close()
             cls.attacker = None

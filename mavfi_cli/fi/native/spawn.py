@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -73,15 +74,14 @@ def spawn(
         with theirs:
             pid = _launch(command, stdout, stderr, theirs.fileno())
         tracee = Tracee(pid, pid, -pid, mechanism or best_mechanism())
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(os.waitpid, pid, 0)
+            undo.callback(os.kill, pid, signal.SIGKILL)
             if not ours.recv(1):
                 raise TargetError(command.argv[0], "the launching shell could not start")
             linux.seize(pid, kill_with_tracer=True)
             ours.send(b"\n")
-        except BaseException:
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
-            raise
+            undo.pop_all()
     _await_exec(tracee, command)
     return tracee
 

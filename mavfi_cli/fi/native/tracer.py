@@ -22,9 +22,10 @@ class TracerThread(Generic[T]):
         self._error: BaseException | None = None
 
         def run() -> None:
+            """The thread's whole life."""
             try:
                 self._result.append(work(self._armed.set))
-            except BaseException as error:
+            except BaseException as error:  # the thread's boundary: who awaits it raises it again
                 self._error = error
             finally:
                 self._armed.set()

@@ -196,6 +196,7 @@ def _memory(found: Any) -> list[MemoryUse]:
         return []
 
     def name(number: int) -> str | None:
+        """Of a register by capstone's number; None for none."""
         return str(found.reg_name(number)) if number else None
 
     return [

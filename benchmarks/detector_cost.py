@@ -1,0 +1,89 @@
+"""What a detector costs: times the gate itself, as the control loop calls it.
+
+python benchmarks/detector_cost.py
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter_ns
+
+import numpy as np
+
+from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
+from mavfi_cli.detect import registry
+from mavfi_cli.detect.gate import Gate
+
+TICK_S = 0.02
+REPORT_EVERY = 15  # ticks
+WAYPOINT_TICKS = 25
+
+
+def main() -> None:
+    """Time a minute of flight, over and over; the best of several rounds."""
+    ticks = 3000
+    angles = np.arange(ticks) * 0.004
+    waypoints = np.zeros((ticks // WAYPOINT_TICKS + 1, 10))
+    waypoints[:, 0] = np.arange(len(waypoints)) * 1.2
+    waypoints[:, 4] = 2.4
+    trajectory = Trajectory(
+        stamp_s=0.0,
+        waypoints=waypoints,
+        durations_s=np.full(len(waypoints), 0.5),
+        trajectory_seq=1,
+        future_collision_seq=0,
+    )
+    commands = [
+        Command(
+            stamp_s=i * TICK_S,
+            yaw_rad=0.5 * np.sin(a),
+            velocity_enu_mps=np.array([2.0 + 0.4 * np.sin(a), np.sin(a), 0.05]),
+        )
+        for i, a in enumerate(angles.tolist())
+    ]
+    report = CollisionReport(stamp_s=0.0, collision=False, time_to_collision_s=np.inf,
+                             future_collision_seq=1)  # fmt: skip
+
+    def loop(judge: Callable[[Trajectory, int, Command], object]) -> float:
+        """Nanoseconds a tick of judging the whole flight."""
+        begun = perf_counter_ns()
+        for i, command in enumerate(commands):
+            judge(trajectory, i // WAYPOINT_TICKS, command)
+        return (perf_counter_ns() - begun) / ticks
+
+    def timed(gate: Gate) -> float:
+        """The same for a gate, after a first round in which it must stay silent."""
+        for stage in Stage:
+            gate.forget(stage)
+        assert not any(gate.judge_tick(trajectory, i // WAYPOINT_TICKS, c) for i, c in
+                       enumerate(commands)), "this flight is error-free"  # fmt: skip
+        for stage in Stage:
+            gate.forget(stage)
+        return loop(gate.judge_tick)
+
+    empty = min(loop(lambda *_: None) for _ in range(7))
+    print(f"{'detector':10} {'a check, us':>12} {'with waypoint':>15} {'share of 50 Hz':>15}"
+          f" {'a report, us':>13}")  # fmt: skip
+    for name in registry.names():
+        gate = Gate(registry.find(name))
+        each = min(timed(gate) for _ in range(7)) - empty
+        fresh = []
+        for i in range(100):
+            begun = perf_counter_ns()
+            gate.judge_tick(trajectory, 100 - i, commands[-1])
+            fresh.append(perf_counter_ns() - begun)
+        begun = perf_counter_ns()
+        for _ in range(ticks):
+            gate.judge_report(report)
+        a_report = (perf_counter_ns() - begun) / ticks
+        print(f"{name:10} {each / 1e3:12.2f} {np.median(fresh) / 1e3:15.2f}"
+              f" {each / (TICK_S * 1e9):15.4%} {a_report / 1e3:13.2f}")  # fmt: skip
+    print(
+        f"\nA check is one control tick through Gate.judge_tick, a new waypoint every "
+        f'{WAYPOINT_TICKS}th; "with waypoint" has one\neach time (median). Reports come every '
+        f"{REPORT_EVERY} ticks. The loop itself, {empty / 1e3:.2f} us, is taken off."
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""Golden runs on the disk, and when a message carried which state, for the detector benchmarks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.core.types import Stage
+from mavfi_cli.detect.offline import columns_of
+from mavfi_cli.detect.preprocess import NAMES, SPANS
+
+MATERIAL = {"m": 1.0, "m/s": 1.0, "rad": 0.5, "s": 1.0}  # change of a value that can matter
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One golden run."""
+
+    world: str
+    seed: int
+    columns: dict[str, Any]
+
+    @property
+    def training(self) -> bool:
+        """Whether its world is one to train on."""
+        return self.world.startswith("train-")
+
+    @property
+    def duration_s(self) -> float:
+        """Simulated seconds."""
+        stamps = np.asarray(self.columns["stamp_s"], np.float64)
+        return float(stamps[-1] - stamps[0])
+
+
+def golden_runs(folder: Path) -> list[Run]:
+    """All runs without a fault below a folder, each world and seed once."""
+    import pyarrow.parquet as pq
+
+    found: dict[tuple[str, int], Run] = {}
+    for path in sorted(folder.rglob("result.json")):
+        result = json.loads(path.read_text())
+        trace = path.with_name("trace.parquet")
+        if result["fault"] is not None or not trace.is_file():
+            continue
+        world, seed = result["config"]["world"], result["config"]["seed"]
+        found[world, seed] = Run(world, seed, columns_of(pq.read_table(trace)))
+    if not found:
+        raise SystemExit(f"error: no golden runs below {folder}")
+    return [found[key] for key in sorted(found)]
+
+
+def apart(runs: list[Run]) -> tuple[list[Run], list[Run]]:
+    """The runs of the training worlds, and the others."""
+    return [run for run in runs if run.training], [run for run in runs if not run.training]
+
+
+def samples_of(run: Run, name: str) -> np.ndarray:
+    """Values of a state, one a message."""
+    values = np.ma.filled(run.columns[name].astype(np.float64), np.nan)
+    return np.asarray(values)[fresh_rows(run, name)]
+
+
+def fresh_rows(run: Run, name: str) -> list[int]:
+    """Rows in which a new message carried the state."""
+    state = BY_NAME[name]
+    mates = NAMES[slice(*SPANS[state.stage])]
+    values = np.column_stack(
+        [np.ma.filled(run.columns[mate].astype(np.float64), np.nan) for mate in mates]
+    )
+    present = ~np.ma.getmaskarray(run.columns[name])
+    if state.stage is Stage.CONTROL:
+        return np.flatnonzero(present).tolist()
+    patterns = values.view(np.int64)
+    new = present.copy()
+    new[1:] &= (patterns[1:] != patterns[:-1]).any(axis=1) | ~present[:-1]
+    return np.flatnonzero(new).tolist()

@@ -1,0 +1,42 @@
+"""How the autoencoder's training went: its loss over the epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mavfi_cli.report.drawing import write_svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def write_loss_curve(curve: Sequence[Sequence[float]], path: Path) -> None:
+    """Draw the loss curve as SVG, atomically; equal ones give equal bytes.
+
+    Raises:
+        RecordError: the file could not be written.
+    """
+    write_svg(draw_loss_curve(curve), path)
+
+
+def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:
+    """A matplotlib figure: mean squared errors of scaled deltas, logarithmic, over the epochs.
+
+    Args:
+        curve: rows of epoch, error on training and on validation flights.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    epochs, training, validation = zip(*curve, strict=True)
+    axes.plot(epochs, training, color="#1b4965", linewidth=1.4, label="training")
+    axes.plot(epochs, validation, color="#e4572e", linewidth=1.4, label="validation")
+    axes.set_yscale("log")
+    axes.set_xlabel("epoch")
+    axes.set_ylabel("mean squared error of scaled deltas")
+    axes.grid(visible=True, color="#edf0f4", linewidth=0.6)
+    axes.legend(frameon=False, fontsize=8)
+    return figure
