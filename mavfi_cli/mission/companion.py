@@ -104,7 +104,7 @@ class Companion:
         add("octomap", kernels.octomap, self._take_snapshot)
         add("collision_check", kernels.collision_check, self._take_report)
         add("planner", kernels.planner, self._take_plan)
-        self._control = add("control", kernels.control, lambda _output, _stamp_s: None)
+        add("control", kernels.control, lambda _output, _stamp_s: None)
         if injection.follower is not None:
             self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
@@ -348,7 +348,7 @@ class Companion:
             hold_enu_m=directive.hold_enu_m,
             hold_yaw_rad=directive.hold_yaw_rad,
         )
-        due_s = stamp_s + self._control_delay_s()
+        due_s = stamp_s + self._control_delay_s(stamp_s)
         job = ControlInput(inputs=inputs, fresh=fresh, yaw_rad=state.yaw_rad)
         command: Command | None = self.executor.call("control", job, stamp_s)
         if command is None:
@@ -357,9 +357,9 @@ class Companion:
         waypoint = 0 if flown is None else max(0, waypoint_index(flown, directive.time_s))
         return _Setpoint(due_s=due_s, command=command, directive=directive, waypoint=waypoint)
 
-    def _control_delay_s(self) -> float:
+    def _control_delay_s(self, stamp_s: float) -> float:
         latency_s = self._latency.draw_s("control")
-        self._control.busy_s += latency_s
+        self.executor.book("control", stamp_s, latency_s)
         return latency_s if latency_s >= SAME_TICK_S else 0.0
 
     def _take_command(self, stamp_s: float, setpoint: _Setpoint) -> None:
