@@ -190,20 +190,24 @@ def _compared(quantity: Quantity, first: float, second: float) -> float:
 
 
 def _worst_rows(plan: ComparePlan, table: _Table, platform: str) -> list[dict[str, Any]]:
-    """The longest successful flight of each setting, and what of the worst case it recovers.
+    """The worst successful flights of each setting, and what detectors recover of the worst case.
 
-    Two measures: over the mean golden flight, as the paper (`increase`), and over the golden
-    flight of its own mission (`lengthening`), in which worlds of unequal length have no part.
+    Two measures. Over the golden flight of its own mission: the paper flies one fixed world, so
+    this is its measure where worlds differ. Over the mean golden flight: the longest flight of
+    all, whatever mission it is of; faults that are no worse than the worst golden flight leave
+    nothing to recover there.
     """
     golden, faulty = table.won(platform, GOLDEN), table.won(platform, NONE)
     own = {each.seed: each.flight_time_s for each in golden}
+    worst = _over_own(faulty, own)
+    beyond = max(_times(faulty), default=math.nan) > max(_times(golden), default=math.nan)
     rows = []
     for setting in plan.settings:
         flights = table.won(platform, setting)
         protected = setting not in (GOLDEN, NONE)
         found = worst_case(_times(golden), _times(flights))
         case = worst_case(_times(golden), _times(faulty), _times(flights) if protected else ())
-        lengthening, longest = _lengthening(flights, own), _lengthening(faulty, own)
+        mine = _over_own(flights, own)
         rows.append(
             {
                 "platform": platform,
@@ -211,13 +215,13 @@ def _worst_rows(plan: ComparePlan, table: _Table, platform: str) -> list[dict[st
                 "flights": len(flights),
                 "golden_mean_s": found.golden,
                 "worst_s": found.faulty_worst,
-                "increase": found.increase,
-                "recovered_share": case.recovered_share,
-                "lengthening": lengthening,
-                "lengthening_recovered_share": (longest - lengthening) / longest
-                if protected and longest > 0.0
+                "over_own_ratio": mine,
+                "over_own_recovered_share": (worst - mine) / (worst - 1.0)
+                if protected and worst > 1.0
                 else math.nan,
-                "worst_flight": _named(flights),
+                "over_mean_ratio": 1.0 + found.increase,
+                "over_mean_recovered_share": case.recovered_share if beyond else math.nan,
+                "worst_flight": _named(flights, own),
             }
         )
     return rows
@@ -227,18 +231,17 @@ def _times(flights: Sequence[Flown]) -> list[float]:
     return [each.flight_time_s for each in flights]
 
 
-def _lengthening(flights: Sequence[Flown], own: Mapping[int, float]) -> float:
-    """By what part the worst flight is longer than the golden one of its own mission."""
-    return max(
-        (e.flight_time_s / own[e.seed] - 1.0 for e in flights if e.seed in own), default=math.nan
-    )
+def _over_own(flights: Sequence[Flown], own: Mapping[int, float]) -> float:
+    """The largest flight time over that of the golden flight of the same mission."""
+    return max((e.flight_time_s / own[e.seed] for e in flights if e.seed in own), default=math.nan)
 
 
-def _named(flights: Sequence[Flown]) -> dict[str, Any] | None:
-    """The longest flight, so that it can be flown again."""
-    if not flights:
+def _named(flights: Sequence[Flown], own: Mapping[int, float]) -> dict[str, Any] | None:
+    """The flight that is longest over its own golden one, so that it can be flown again."""
+    known = [each for each in flights if each.seed in own]
+    if not known:
         return None
-    most = max(flights, key=lambda each: (each.flight_time_s, -each.seed))
+    most = max(known, key=lambda each: (each.flight_time_s / own[each.seed], -each.seed))
     return {"seed": most.seed, "target": most.target, "fault_seed": most.fault_seed}
 
 

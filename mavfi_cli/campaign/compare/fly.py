@@ -6,7 +6,7 @@ its whole record.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from mavfi_cli.campaign.begin import begin
 from mavfi_cli.campaign.compare.figures import figures
 from mavfi_cli.campaign.compare.flights import Flown, flights_of
 from mavfi_cli.campaign.compare.plan import GOLDEN, ComparePlan, differences, titles
-from mavfi_cli.campaign.compare.timeline import timeline_of
+from mavfi_cli.campaign.compare.timeline import timelines
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
 from mavfi_cli.campaign.missions import PlannedMission
@@ -116,7 +116,7 @@ def _timelines(
     folder: Path,
     options: Options,
     spectator: Spectator,
-) -> list[dict[str, Any]]:
+) -> dict[str, Any]:
     """What the kernels of a golden flight did, a row a platform; of those that flew."""
     seed = timeline_seed(plan, flights)
     missions = {name: _golden(plan, name, seed) for name in plan.platforms}
@@ -125,13 +125,12 @@ def _timelines(
         list(missions.values()), folder, replace(options, keep=Keep.ALL), spectator, append=True
     ) as ledger:
         paths = {each.mission.pair: each.path for each in ledger.results()}
-    rows: list[dict[str, Any]] = []
-    for name, mission in missions.items():
-        path = paths.get(mission.pair)
-        found: Mapping[str, Any] | None = None if path is None else timeline_of(load_run(path))
-        if found is not None:
-            rows.append({"platform": name, "seed": seed, **found})
-    return rows
+    runs = {
+        name: load_run(path)
+        for name, mission in missions.items()
+        if (path := paths.get(mission.pair)) is not None
+    }
+    return {"seed": seed, "platforms": timelines(runs)}
 
 
 def timeline_seed(plan: ComparePlan, flights: Sequence[Flown]) -> int:
