@@ -71,6 +71,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
 
 def _plan(options: dict[str, Any]) -> Any:
     from mavfi_cli.campaign.compare.plan import ComparePlan
+    from mavfi_cli.core.errors import ConfigError
 
     chosen: dict[str, Any] = {name: options[name] for name in ("world", "field", "missions",
                                                                "first_seed", "seed")}  # fmt: skip
@@ -78,6 +79,8 @@ def _plan(options: dict[str, Any]) -> Any:
         chosen["platforms"] = options["platforms"]
     if options["inject"] is not None:
         targets = _names(options["inject"])
+        if not targets:
+            raise ConfigError("name at least one, or none", key="inject")
         chosen["inject"] = () if targets == ("none",) else targets
     if options["detectors"] is not None:
         chosen["detectors"] = _names(options["detectors"])

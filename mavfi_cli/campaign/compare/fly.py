@@ -51,7 +51,7 @@ def compare(
         flights, errors = flights_of(ledger)
     return {
         "schema": SCHEMA,
-        "plan": _plan(plan),
+        "plan": plan_told(plan),
         "versions": installed_versions(),
         "errors": errors,
         **figures(plan, flights),
@@ -84,7 +84,8 @@ def _campaign(asked: Spec, folder: Path) -> tuple[Spec, bool]:
     return ours, grows
 
 
-def _plan(plan: ComparePlan) -> dict[str, Any]:
+def plan_told(plan: ComparePlan) -> dict[str, Any]:
+    """What is compared, with what the platforms are, as plain values."""
     names = titles(plan.platforms)
     return {
         **asdict(plan),

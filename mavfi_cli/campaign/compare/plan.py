@@ -46,8 +46,9 @@ class ComparePlan:
     field: str | None = None
 
     def __post_init__(self) -> None:
-        if not self.platforms:
-            raise ConfigError("name at least one", key="platform")
+        for key, names in (("platform", self.platforms), ("detector", self.detectors)):
+            if not names:
+                raise ConfigError("name at least one", key=key)
         if self.missions < 1:
             raise ConfigError(f"must be at least 1, got {self.missions}", key="missions")
         for key, least in (("first_seed", 0), ("seed", 0)):

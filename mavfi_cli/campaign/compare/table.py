@@ -38,10 +38,10 @@ def table(told: Row) -> list[str]:
         "",
         f"{len(told['errors'])} missions could not be flown. In brackets: {share:g} % intervals, "
         "Wilson for success, bootstrap",
-        "for the rest. Energy: the paper's regression; that of the propellers is in compare.json. "
-        "Response:",
-        "of each flight the median and 95th percentile from depth frame to setpoint; here the "
-        "median flight's.",
+        "for the rest. Energy: the paper's regression; that of the propellers is in compare.json.",
+        "Response, depth frame to setpoint: each flight's median and 95th percentile; here the "
+        "median",
+        "over the flights.",
     ]
 
 
@@ -134,7 +134,7 @@ def _ratio_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
             setting_title(row["setting"]),
             f"{row['pairs']}",
             _spread(found["flight_time_s"], digits=3),
-            _spread(found["energy_regression_j"], digits=3),
+            _spread(found["energy_regression_j"], digits=2),
             _spread(found["response_median_s"], digits=2),
             "-"
             if math.isnan(difference)
