@@ -69,7 +69,8 @@ def _caption(told: Row) -> str:
         bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
         struck = f"{bits} in {', '.join(plan['inject'])}"
     return (
-        f"{plan['missions']} missions in {plan['world']} from seed {plan['first_seed']} on, the "
+        f"{plan['missions']} {'mission' if plan['missions'] == 1 else 'missions'} in "
+        f"{plan['world']} from seed {plan['first_seed']} on, the "
         f"same on each platform; {struck}; whiskers: {share:g} % intervals"
     )
 
@@ -115,7 +116,7 @@ def _times(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
         ]
         if not times:
             continue
-        spread = [x + 0.62 * width * ((n * _TURN) % 1.0 - 0.5) for n in range(len(times))]
+        spread = [x + 0.62 * width * ((0.5 + n * _TURN) % 1.0 - 0.5) for n in range(len(times))]
         axes.plot(spread, times, "o", color=colour, markersize=4.2, alpha=0.45, markeredgewidth=0.0)
         middle = row["quantities"]["flight_time_s"]["median"]
         axes.hlines(middle["value"], x - 0.38 * width, x + 0.38 * width, color=INK, linewidth=1.8)
@@ -266,6 +267,8 @@ def _worst(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
     _frame(axes, "Worst case and recovery (paper, Fig. 16)", "y")
     if not known:
         axes.text(0.5, 0.5, "no faults", ha="center", color=NOTE, transform=axes.transAxes)
+        axes.set_xticks([])
+        axes.set_yticks([])
         return
     _recovered(axes, rows, settings, colours)
     axes.set_ylim(min(0.0, *known, 0.0), 1.45 * max(1.0, *known, 1.0))

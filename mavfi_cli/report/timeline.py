@@ -26,6 +26,7 @@ _ANSWER = "#c22f2f"
 _HEIGHT = 0.62
 _THINNEST = 0.0022  # of the window; a shorter invocation would not be seen
 _ROOM = 0.085  # of the window, for a duration inside its bar
+_LATE, _ANSWER_LATE = 0.93, 0.7  # of the window; from there on texts stand to the left
 Row = Mapping[str, Any]
 
 
@@ -67,17 +68,16 @@ def _caption(told: Row) -> str:
 
 def _panel(axes: Axes, row: Row, platform: Row, shown: list[float]) -> None:
     width_s = shown[1] - shown[0]
+    axes.set_xlim(*shown)
     for lane, (kernel, (_, strong, pale)) in enumerate(_LANES.items()):
         axes.axhspan(lane - 0.5, lane + 0.5, color="#f7f8fa" if lane % 2 else "white", zorder=0)
-        for span in row["lanes"][kernel]:
-            _bar(axes, lane, span, pale, width_s, zorder=2)
+        _others(axes, lane, row["lanes"][kernel], pale, width_s)
         if kernel in row["chain"]:
-            _bar(axes, lane, row["chain"][kernel], strong, width_s, zorder=4)
+            _bar(axes, lane, row["chain"][kernel], strong, width_s)
             _duration(axes, lane, row["chain"][kernel], strong, width_s)
     axes.vlines(
         row["setpoints_s"], _SETPOINT - 0.16, _SETPOINT + 0.16, color="#b9c0ca", linewidth=0.7
     )
-    axes.set_xlim(*shown)
     _steps(axes, row)
     _answers(axes, row, width_s)
     axes.set_ylim(_SETPOINT + 1.5, -1.25)
@@ -92,16 +92,23 @@ def _panel(axes: Axes, row: Row, platform: Row, shown: list[float]) -> None:
                    color=INK)  # fmt: skip
 
 
-def _bar(
-    axes: Axes, lane: int, span: list[float], colour: str, width_s: float, zorder: int
-) -> None:
-    length = max(span[1] - span[0], _THINNEST * width_s)
-    if span[1] - span[0] <= length / 2:  # nothing to part from its neighbour
-        axes.barh(lane, length, left=span[0], height=_HEIGHT, color=colour, zorder=zorder)
-        return
-    axes.barh(lane, length, left=span[0], height=_HEIGHT, color=colour, zorder=zorder)
-    axes.vlines(span[1], lane - _HEIGHT / 2, lane + _HEIGHT / 2, color="white", linewidth=0.8,
-                zorder=zorder)  # fmt: skip
+def _length(span: list[float], width_s: float) -> float:
+    return max(span[1] - span[0], _THINNEST * width_s)
+
+
+def _others(axes: Axes, lane: int, spans: list[list[float]], colour: str, width_s: float) -> None:
+    """All that a kernel did, with a gap between neighbours that have room for one."""
+    low = lane - _HEIGHT / 2
+    axes.broken_barh(
+        [(span[0], _length(span, width_s)) for span in spans], (low, _HEIGHT), color=colour,
+        linewidth=0, zorder=2,
+    )  # fmt: skip
+    long = [span[1] for span in spans if span[1] - span[0] > 2 * _THINNEST * width_s]
+    axes.vlines(long, low, low + _HEIGHT, color="white", linewidth=0.8, zorder=3)
+
+
+def _bar(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) -> None:
+    axes.barh(lane, _length(span, width_s), left=span[0], height=_HEIGHT, color=colour, zorder=4)
 
 
 def _duration(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) -> None:
@@ -112,12 +119,13 @@ def _duration(axes: Axes, lane: int, span: list[float], colour: str, width_s: fl
             (span[0] + span[1]) / 2, lane, told, ha="center", va="center", fontsize=8,
             color="white", zorder=6,
         )  # fmt: skip
-    else:
-        axes.text(
-            max(span[1], span[0] + _THINNEST * width_s) + 0.005 * width_s, lane, told, ha="left",
-            va="center", fontsize=8, color=colour, zorder=6,
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85},
-        )  # fmt: skip
+        return
+    late = span[1] > _LATE * axes.get_xlim()[1]
+    axes.text(
+        span[0] - 0.005 * width_s if late else span[0] + _length(span, width_s) + 0.005 * width_s,
+        lane, told, ha="right" if late else "left", va="center", fontsize=8, color=colour,
+        zorder=6, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85},
+    )  # fmt: skip
 
 
 def _time(seconds: float) -> str:
@@ -160,9 +168,12 @@ def _answers(axes: Axes, row: Row, width_s: float) -> None:
         arrowprops={"arrowstyle": "<->", "color": _ANSWER, "shrinkA": 0, "shrinkB": 0,
                     "linewidth": 1.1},
     )  # fmt: skip
+    late = answer_s > _ANSWER_LATE * axes.get_xlim()[1]
     axes.text(
-        answer_s + 0.008 * width_s, -0.85, f"{_time(answer_s)} from depth frame to setpoint",
-        color=_ANSWER, fontsize=9, va="center", weight="bold",
+        answer_s + (-0.02 if late else 0.008) * width_s, -0.85,
+        f"{_time(answer_s)} from depth frame to setpoint", color=_ANSWER, fontsize=9, va="center",
+        weight="bold", ha="right" if late else "left",
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
     )  # fmt: skip
     axes.plot(answer_s, _SETPOINT, marker="D", color=_ANSWER, markersize=6, zorder=7)
     _acts(axes, answer_s, row["answer"], _ANSWER, 0.68, width_s)
@@ -176,7 +187,7 @@ def _answers(axes: Axes, row: Row, width_s: float) -> None:
 
 def _acts(axes: Axes, stamp_s: float, told: str, colour: str, below: float, width_s: float) -> None:
     """What the vehicle does from a setpoint on, written below it."""
-    late = stamp_s > 0.7 * axes.get_xlim()[1]
+    late = stamp_s > _ANSWER_LATE * axes.get_xlim()[1]
     axes.text(
         stamp_s + (-0.004 if late else 0.006) * width_s, _SETPOINT + below, told, fontsize=8,
         color=colour, va="center", ha="right" if late else "left", zorder=8,
