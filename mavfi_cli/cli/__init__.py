@@ -22,6 +22,7 @@ _COMMANDS = {
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
     "detect": ("mavfi_cli.cli.detect", "Detectors: which there are, what they are worth."),
     "campaign": ("mavfi_cli.cli.campaign", "Plan and run thousands of missions."),
+    "compare": ("mavfi_cli.cli.compare", "The same missions on several computers."),
     "vpm": ("mavfi_cli.cli.vpm", "What DMR and TMR cost in speed, time and energy."),
     "platforms": ("mavfi_cli.cli.platforms", "Compute platforms and their latencies."),
     "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),

@@ -94,7 +94,7 @@ class Companion:
         add("octomap", kernels.octomap, self._take_snapshot)
         add("collision_check", kernels.collision_check, self._take_report)
         add("planner", kernels.planner, self._take_plan)
-        self._control = add("control", kernels.control, lambda _output, _stamp_s: None)
+        add("control", kernels.control, lambda _output, _stamp_s: None)
         if injection.follower is not None:
             self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
@@ -239,7 +239,7 @@ class Companion:
     ) -> Setpoint | None:
         """Have control compute a command, due when its latency has passed."""
         fresh, attempt = (None, 0) if retry is None else (retry.fresh, retry.attempt)
-        due_s = stamp_s + self._control_delay_s()
+        due_s = stamp_s + self._control_delay_s(stamp_s)
         job = ControlInput(
             inputs=tracking_inputs(stamp_s, state, directive), fresh=fresh, yaw_rad=state.yaw_rad
         )
@@ -255,9 +255,9 @@ class Companion:
             attempt=attempt,
         )
 
-    def _control_delay_s(self) -> float:
+    def _control_delay_s(self, stamp_s: float) -> float:
         latency_s = self._latency.draw_s("control")
-        self._control.busy_s += latency_s
+        self.executor.book("control", stamp_s, latency_s)
         return latency_s if latency_s >= SAME_TICK_S else 0.0
 
     def _take_command(self, stamp_s: float, setpoint: Setpoint) -> None:

@@ -117,6 +117,7 @@ class Executor:
         restart_s: from a node's end until its successor is ready, simulated.
         watchdog_s: an invocation that has not ended after so long is killed, simulated.
         losses: of all nodes, in order.
+        timetable: every invocation, in the order in which they started.
         on_start: hears of every invocation: node, input, start stamp.
     """
 
@@ -190,6 +191,12 @@ class Executor:
         """All nodes by name, in the order in which they were added."""
         return self._nodes
 
+    def book(self, name: str, start_s: float, latency_s: float) -> None:
+        """Put work outside the queue, as of `call`, into the time table."""
+        self._nodes[name].busy_s += latency_s
+        end_s = start_s + latency_s
+        self.timetable.append(Invocation(node=name, start_s=start_s, end_s=end_s))
+
     def submit(self, name: str, value: Any) -> None:
         """Give a node its newest input at the present simulated time; `value` is not None."""
         node = self._nodes[name]
@@ -232,14 +239,12 @@ class Executor:
         node.pending = None
         node.busy = True
         node.invocations += 1
-        node.busy_s += latency_s
+        self.book(node.name, job.start_s, latency_s)
         self.on_start(node.name, job.input, job.start_s)
         self._working += 1
         self._uncomputed.append(job)
         self._jobs[node.name] = job
-        end_s = self.now_s + latency_s
-        self.timetable.append(Invocation(node=node.name, start_s=self.now_s, end_s=end_s))
-        self._at(end_s, lambda stamp_s: self._finish(job, stamp_s))
+        self._at(self.now_s + latency_s, lambda stamp_s: self._finish(job, stamp_s))
 
     def _at(self, stamp_s: float, event: _Event) -> None:
         heapq.heappush(self._events, (stamp_s, self._count, event))

@@ -38,6 +38,7 @@ from mavfi_cli.mission.response import response_times
 from mavfi_cli.mission.run_folder import CRASH, RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.spawned_node import SpawnedNode
 from mavfi_cli.mission.statistics import mission_statistics, plan_lines
+from mavfi_cli.mission.timetable import timetable_of, write_timetable
 from mavfi_cli.mission.trace import write_trace
 from mavfi_cli.mission.vehicle_process import VehicleProcess
 
@@ -272,6 +273,7 @@ def _write(
     }
     write_trace(folder.trace, flight.trace.table(truth))
     write_plans(folder.plans, companion.plans if companion else [])
+    write_timetable(folder.kernels, timetable_of(companion))
     told = [loss.traceback for loss in companion.executor.losses] if companion else []
     if errors := [text for text in (*told, crash) if text]:
         (folder.path / CRASH).write_text("\n".join(errors))

@@ -1,4 +1,7 @@
-"""The folder of one run: result.json, trace.parquet, plans.parquet, flight.tlog, flight.svg."""
+"""The folder of one run: result.json, flight.svg, flight.tlog, and tables.
+
+The tables are trace.parquet, plans.parquet and kernels.parquet.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
 RESULT = "result.json"
 TRACE = "trace.parquet"
 PLANS = "plans.parquet"
+KERNELS = "kernels.parquet"
 TLOG = "flight.tlog"
 PICTURE = "flight.svg"
 FAULT = "fault.json"
@@ -45,6 +49,11 @@ class RunFolder:
     def plans(self) -> Path:
         """Every waypoint of every plan."""
         return self.path / PLANS
+
+    @property
+    def kernels(self) -> Path:
+        """When which kernel ran."""
+        return self.path / KERNELS
 
     @property
     def tlog(self) -> Path:

@@ -13,12 +13,20 @@ if TYPE_CHECKING:
 
 INK = "#1d232b"
 NOTE = "#5b6573"
+GRID = "#edf0f4"
 SCHEMES = {
     "none": "#8b93a1",
     "dmr": "#f2b134",
     "tmr": "#e4572e",
     "gad": "#5b8def",
     "aad": "#1b7f4b",
+}
+KERNELS = {  # what they are called, and their colours
+    "point_cloud": ("point cloud", "#2f7fb8"),
+    "octomap": ("OctoMap", "#1b4965"),
+    "collision_check": ("collision check", "#2a9d8f"),
+    "planner": ("planner", "#e08a1e"),
+    "control": ("control", "#7d4f9e"),
 }
 
 

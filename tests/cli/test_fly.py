@@ -18,7 +18,14 @@ def test_summary_on_stdout_progress_on_stderr_record_in_the_folder(command_line,
     assert "offboard" in err
     assert "\x1b" not in out + err
     names = {path.name for path in (tmp_path / "runs/farm-5-001").iterdir()}
-    assert names == {"result.json", "trace.parquet", "plans.parquet", "flight.tlog", "flight.svg"}
+    assert names == {
+        "result.json",
+        "trace.parquet",
+        "plans.parquet",
+        "kernels.parquet",
+        "flight.tlog",
+        "flight.svg",
+    }
 
 
 def test_json_is_the_result_and_nothing_else(command_line, tmp_path):

@@ -54,7 +54,14 @@ def test_ctrl_c_on_the_command_line_exits_with_130(flying):
     assert out.startswith("INTERRUPTED\n")
     assert load_run(folder).result["outcome"] == "interrupted"
     names = {path.name for path in folder.iterdir()}
-    assert names == {"result.json", "trace.parquet", "plans.parquet", "flight.tlog", "flight.svg"}
+    assert names == {
+        "result.json",
+        "trace.parquet",
+        "plans.parquet",
+        "kernels.parquet",
+        "flight.tlog",
+        "flight.svg",
+    }
 
 
 def test_a_killed_mission_leaves_its_tlog_and_no_vehicle(flying, mavfi, await_end):

@@ -25,7 +25,13 @@ def truth(run):
 
 def test_the_folder_is_complete_and_nothing_else_lies_in_it(short_flight):
     names = {path.name for path in short_flight.path.iterdir()}
-    assert names == {"result.json", "trace.parquet", "plans.parquet", "flight.tlog"}
+    assert names == {
+        "result.json",
+        "trace.parquet",
+        "plans.parquet",
+        "kernels.parquet",
+        "flight.tlog",
+    }
 
 
 def test_it_succeeds_and_says_so_once(run):

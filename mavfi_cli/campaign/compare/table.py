@@ -1,0 +1,293 @@
+"""A comparison as lines of at most 100 columns, and as rows for other programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from mavfi_cli.campaign.compare.figures import QUANTITIES
+from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
+
+Row = Mapping[str, Any]
+# The paper, section VII-E: on the TX2, a single bit flip in an inter-kernel state.
+PAPER = "paper: worst case x 2.8 on the TX2, of which GAD recovers 79.3 %, AAD 88.0 %"
+
+
+def setting_title(setting: str) -> str:
+    """What a setting is called."""
+    return {GOLDEN: "golden", NONE: "faults"}.get(setting, f"faults, {setting}")
+
+
+def table(told: Row) -> list[str]:
+    """The comparison in words and columns."""
+    lines = _head(told)
+    lines += ["", "Flights that count: golden, or with a fault that was read or caught; medians"]
+    lines += _columns(_flight_rows(told))
+    lines += ["", *_columns(_work_rows(told))]
+    for platform in told["plan"]["platforms"][1:]:
+        lines += ["", *_ratio_lines(told, platform)]
+    lines += ["", "Worst case (paper, Fig. 16): the longest successful flight of each setting"]
+    lines += _columns(_worst_rows(told))
+    lines += _worst_notes(told)
+    share = 100 * told["confidence"]
+    return [
+        *lines,
+        "",
+        f"{len(told['errors'])} missions could not be flown. In brackets: {share:g} % intervals, "
+        "Wilson for success, bootstrap",
+        "for the rest. Energy: the paper's regression; that of the propellers is in compare.json.",
+        "Response, depth frame to setpoint: each flight's median and 95th percentile; here the "
+        "median",
+        "over the flights.",
+    ]
+
+
+def _head(told: Row) -> list[str]:
+    plan = told["plan"]
+    last = plan["first_seed"] + plan["missions"] - 1
+    lines = [
+        f"Missions    {plan['missions']} in {plan['world']}, seeds {plan['first_seed']} to {last}, "
+        "the same on each platform",
+        f"Faults      {_faults(plan)}",
+    ]
+    for number, row in enumerate(plan["platforms"]):
+        head = "Platforms" if number == 0 else ""
+        lines.append(f"{head:<11} {row['title']}: {row['description']}, {row['cores']} cores")
+    return lines
+
+
+def _faults(plan: Row) -> str:
+    if not plan["inject"]:
+        return "none"
+    bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
+    return f"{bits} in {', '.join(plan['inject'])}: a flight with each; fault seed {plan['seed']}"
+
+
+def titles_of(told: Row) -> dict[str, str]:
+    """What the platforms are called."""
+    return {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
+
+
+def _flight_rows(told: Row) -> Iterator[list[str]]:
+    yield ["", "", "flights", "success", "flight time, s", "distance, m"]
+    for row, name, title in _settings(told):
+        found = row["quantities"]
+        yield [
+            name,
+            title,
+            f"{row['counted']} of {row['flown']}",
+            _rate(row["success"]),
+            _spread(found["flight_time_s"]["median"], digits=1),
+            _spread(found["distance_m"]["median"], digits=1),
+        ]
+
+
+def _work_rows(told: Row) -> Iterator[list[str]]:
+    yield [
+        "",
+        "",
+        "energy, kJ",
+        "replans (mean)",
+        "response, ms",
+        "95th perc., ms",
+    ]
+    for row, name, title in _settings(told):
+        found = row["quantities"]
+        yield [
+            name,
+            title,
+            _spread(found["energy_regression_j"]["median"], scale=1e-3, digits=1),
+            _spread(found["replans"]["mean"], digits=1),
+            _spread(found["response_median_s"]["median"], scale=1e3, digits=0),
+            _spread(found["response_p95_s"]["median"], scale=1e3, digits=0),
+        ]
+
+
+def _settings(told: Row) -> Iterator[tuple[Row, str, str]]:
+    """Each row with its setting, once, and its platform."""
+    titles, last = titles_of(told), ""
+    for row in told["settings"]:
+        name = setting_title(row["setting"])
+        yield row, "" if name == last else name, titles[row["platform"]]
+        last = name
+
+
+def _ratio_lines(told: Row, platform: Row) -> list[str]:
+    rows = [row for row in told["ratios"] if row["platform"] == platform["platform"]]
+    reference = titles_of(told)[rows[0]["reference"]]
+    title = f"{platform['title']} over {reference}, mission by mission"
+    return [
+        f"{title} (flights that both succeed in; response: all)",
+        *_columns(_ratio_rows(rows)),
+    ]
+
+
+def _ratio_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
+    yield ["", "pairs", "flight time, x", "energy, x", "response, x", "success, pts"]
+    for row in rows:
+        found = row["quantities"]
+        difference = row["success"]["difference"]
+        yield [
+            setting_title(row["setting"]),
+            f"{row['pairs']}",
+            _spread(found["flight_time_s"], digits=3),
+            _spread(found["energy_regression_j"], digits=2),
+            _spread(found["response_median_s"], digits=2),
+            "-"
+            if math.isnan(difference)
+            else f"{100 * difference:+.1f} (p {row['success']['p_value']:.2g})",
+        ]
+
+
+def _worst_rows(told: Row) -> Iterator[list[str]]:
+    yield ["", "", "worst, s", "over own golden", "recovered", "over mean golden", "recovered"]
+    titles, last = titles_of(told), ""
+    for row in told["worst"]:
+        title = titles[row["platform"]]
+        yield [
+            "" if title == last else title,
+            setting_title(row["setting"]),
+            _number(row["worst_s"], "{:.1f}"),
+            _number(row["over_own_ratio"], "x {:.3f}"),
+            _number(row["over_own_recovered_share"], "{:.1%}"),
+            _number(row["over_mean_ratio"], "x {:.3f}"),
+            _number(row["over_mean_recovered_share"], "{:.1%}"),
+        ]
+        last = title
+
+
+def _worst_notes(told: Row) -> list[str]:
+    titles = titles_of(told)
+    ratios = [
+        f"worst {setting_title(row['setting'])}: {titles[row['platform']]} over "
+        f"{titles[row['reference']]} x {row['worst_ratio']:.2f}"
+        for row in told["worst_ratios"]
+        if not math.isnan(row["worst_ratio"])
+    ]
+    again = [
+        line
+        for row in told["worst"]
+        if row["setting"] == NONE and row["worst_flight"] is not None
+        for line in (
+            f"worst with faults on {titles[row['platform']]}, over its own golden flight:",
+            f"  {command_of(told, row)}",
+        )
+    ]
+    return [*ratios, *again, *([PAPER] if told["plan"]["inject"] else [])]
+
+
+def command_of(told: Row, row: Row) -> str:
+    """The command that flies the worst flight of a setting without detector again."""
+    plan, flight = told["plan"], row["worst_flight"]
+    parts = [
+        f"mavfi fly --world {plan['world']} --seed {flight['seed']} --platform {row['platform']}"
+    ]
+    if flight["target"]:
+        parts.append(f"--inject {flight['target']} --fault-seed {flight['fault_seed']}")
+        parts += [] if plan["field"] is None else [f"--field {plan['field']}"]
+    return " ".join(parts)
+
+
+# Cells --------------------------------------------------------------------------------------------
+
+
+def _columns(rows: Iterator[list[str]]) -> list[str]:
+    """Rows as text: the first columns to the left, numbers to the right."""
+    cells = list(rows)
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    labels = 2 if cells[0][1] == "" else 1
+    return [
+        "  ".join(
+            cell.ljust(width) if place < labels else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
+
+
+def _rate(share: Row) -> str:
+    if math.isnan(share["share"]):
+        return "-"
+    ends = f"({100 * share['low']:.0f} to {100 * share['high']:.0f})"
+    return f"{100 * share['share']:.1f} % {ends}"
+
+
+def _spread(each: Row, *, scale: float = 1.0, digits: int) -> str:
+    value, low, high = (scale * each[name] for name in ("value", "low", "high"))
+    if math.isnan(value):
+        return "-"
+    ends = "" if math.isnan(low) else f" ({low:.{digits}f} to {high:.{digits}f})"
+    return f"{value:.{digits}f}{ends}"
+
+
+def _number(value: float, shape: str) -> str:
+    return "-" if math.isnan(value) else shape.format(value).replace("%", " %")
+
+
+# CSV ----------------------------------------------------------------------------------------------
+
+_NAMES = ("table", "platform", "reference", "setting", "quantity", "statistic", "unit", "value",
+          "low", "high", "count")  # fmt: skip
+
+
+def rows_csv(told: Row) -> str:
+    """A row a number: what it is, of which platform and setting, its unit and its interval."""
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, fieldnames=list(_NAMES), lineterminator="\n", restval="")
+    writer.writeheader()
+    writer.writerows(
+        {key: "" if isinstance(cell, float) and math.isnan(cell) else cell
+         for key, cell in row.items()}
+        for row in _csv_rows(told)
+    )  # fmt: skip
+    return buffer.getvalue()
+
+
+def _csv_rows(told: Row) -> Iterator[dict[str, Any]]:
+    for row in told["settings"]:
+        at = {"table": "settings", "platform": row["platform"], "setting": row["setting"]}
+        success = row["success"]
+        yield {**at, "quantity": "success", "statistic": "share", "unit": "1",
+               "value": success["share"], "low": success["low"], "high": success["high"],
+               "count": success["total"]}  # fmt: skip
+        for quantity in QUANTITIES:
+            found = row["quantities"][quantity.name]
+            for statistic in ("median", "mean"):
+                yield {**at, "quantity": quantity.title, "statistic": statistic,
+                       "unit": quantity.unit, **found[statistic]}  # fmt: skip
+    for row in told["ratios"]:
+        at = {"table": "ratios", **{k: row[k] for k in ("platform", "reference", "setting")}}
+        yield {**at, "quantity": "success", "statistic": "difference", "unit": "1",
+               "value": row["success"]["difference"], "count": row["pairs"]}  # fmt: skip
+        for quantity in QUANTITIES:
+            found = dict(row["quantities"][quantity.name])
+            kind = found.pop("kind")
+            unit = "1" if kind == "ratio" else found["unit"]
+            yield {**at, "quantity": quantity.title, **found, "statistic": kind, "unit": unit}
+    for row in told["worst"]:
+        at = {"table": "worst", "platform": row["platform"], "setting": row["setting"]}
+        for title, statistic, unit, key in _WORST:
+            yield {**at, "quantity": title, "statistic": statistic, "unit": unit,
+                   "value": row[key], "count": row["flights"]}  # fmt: skip
+
+
+_WORST = (
+    ("flight time", "largest", "s", "worst_s"),
+    ("flight time", "largest over own golden", "1", "over_own_ratio"),
+    (
+        "flight time",
+        "share of the increase over own golden recovered",
+        "1",
+        "over_own_recovered_share",
+    ),
+    ("flight time", "largest over mean golden", "1", "over_mean_ratio"),
+    (
+        "flight time",
+        "share of the increase over mean golden recovered",
+        "1",
+        "over_mean_recovered_share",
+    ),
+)

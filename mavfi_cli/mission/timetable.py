@@ -1,0 +1,88 @@
+"""When which kernel ran in a mission, in simulated time: kernels.parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import write_atomically
+from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.executor import Invocation
+from mavfi_cli.mission.response import Reaction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timetable:
+    """What the kernels of one mission did when.
+
+    Attributes:
+        invocations: in the order in which they started. An output takes effect at the end; that of
+            a node that died then, or was killed, never does.
+        reactions: from a depth frame to the first setpoint that knows of it.
+    """
+
+    invocations: Sequence[Invocation]
+    reactions: Sequence[Reaction]
+
+
+def timetable_of(companion: Companion | None) -> Timetable:
+    """The time table of a flight; empty where nothing was flown."""
+    if companion is None:
+        return Timetable(invocations=(), reactions=())
+    return Timetable(
+        invocations=tuple(companion.executor.timetable), reactions=tuple(companion.reactions)
+    )
+
+
+_RESPONSE = "response"  # the rows of reactions: from the frame's stamp to the setpoint's
+
+
+def write_timetable(path: Path, timetable: Timetable) -> None:
+    """Write it atomically as Parquet, a row an invocation or reaction; equal ones, equal bytes.
+
+    Columns: `kernel`, `start_s`, `end_s`. Rows of the kernel `response` are the reactions.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = [(each.node, each.start_s, each.end_s) for each in timetable.invocations]
+    rows += [(_RESPONSE, r.frame_stamp_s, r.setpoint_stamp_s) for r in timetable.reactions]
+    table = pa.table(
+        {
+            "kernel": pa.array([row[0] for row in rows], pa.string()),
+            "start_s": pa.array([row[1] for row in rows], pa.float64()),
+            "end_s": pa.array([row[2] for row in rows], pa.float64()),
+        }
+    )
+    write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
+
+
+def read_timetable(path: Path) -> Timetable:
+    """Read a time table back.
+
+    Raises:
+        RecordError: missing, damaged, or not of this shape.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+        columns = [table[name].to_pylist() for name in ("kernel", "start_s", "end_s")]
+    except (OSError, KeyError, pa.ArrowException) as error:
+        raise RecordError(f"{path}: no time table can be read ({error})") from None
+    rows = list(zip(*columns, strict=True))
+    return Timetable(
+        invocations=tuple(
+            Invocation(node=kernel, start_s=start_s, end_s=end_s)
+            for kernel, start_s, end_s in rows
+            if kernel != _RESPONSE
+        ),
+        reactions=tuple(
+            Reaction(frame_stamp_s=start_s, setpoint_stamp_s=end_s)
+            for kernel, start_s, end_s in rows
+            if kernel == _RESPONSE
+        ),
+    )

@@ -1,0 +1,297 @@
+"""Platforms side by side: every flight, success, response, ratios, and worst cases."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, write_svg
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLOURS = ("#3f74bd", "#e4572e", "#2a9d8f", "#f2b134", "#8e5aa3", "#7f5539")
+_WAIT = "#dfe3e9"
+_CHAIN = ("point_cloud", "octomap", "collision_check", "control")
+_NAMES = {"golden": "golden", "none": "faults"}
+_GOLDEN, _NONE = "golden", "none"
+_RATIOS = (
+    ("flight_time_s", "flight time"),
+    ("distance_m", "distance"),
+    ("energy_regression_j", "energy\n(regression)"),
+    ("energy_propeller_j", "energy\n(propellers)"),
+)
+_TURN = 0.6180339887498949  # golden section: spreads dots evenly, and the same way each time
+Row = Mapping[str, Any]
+
+
+def write_compare_plot(told: Row, path: Path) -> None:
+    """Draw a comparison as SVG, atomically; equal ones give equal bytes."""
+    write_svg(draw_compare_plot(told), path)
+
+
+def draw_compare_plot(told: Row) -> Figure:
+    """A matplotlib figure of five panels; colours are platforms, times in s, shares in %."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.0, 8.0), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
+    panels = figure.subplot_mosaic("TTTTSS;RRMMWW")
+    colours = {
+        row["platform"]: _COLOURS[place % len(_COLOURS)]
+        for place, row in enumerate(told["plan"]["platforms"])
+    }
+    _times(panels["T"], told, colours)
+    _success(panels["S"], told, colours)
+    _response(panels["R"], told, colours)
+    _ratios(panels["M"], told, colours)
+    _worst(panels["W"], told, colours)
+    handles = [
+        panels["S"].plot([], [], "s", color=colours[row["platform"]], markersize=9,
+                               label=f"{row['title']}: {row['description']}")[0]
+        for row in told["plan"]["platforms"]
+    ]  # fmt: skip
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=min(3, len(handles)), frameon=False,
+        fontsize=9.5,
+    )  # fmt: skip
+    figure.supxlabel(_caption(told), fontsize=8, color=NOTE)
+    return figure
+
+
+def _caption(told: Row) -> str:
+    plan, share = told["plan"], 100 * told["confidence"]
+    struck = "no faults"
+    if plan["inject"]:
+        bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
+        struck = f"{bits} in {', '.join(plan['inject'])}"
+    return (
+        f"{plan['missions']} {'mission' if plan['missions'] == 1 else 'missions'} in "
+        f"{plan['world']} from seed {plan['first_seed']} on, the "
+        f"same on each platform; {struck}; whiskers: {share:g} % intervals"
+    )
+
+
+def _frame(axes: Axes, title: str, grid: str) -> None:
+    axes.set_title(title, fontsize=10, loc="left", color=INK)
+    axes.grid(visible=True, axis=grid, color=GRID, linewidth=0.7)  # type: ignore[arg-type]
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8.5)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _places(told: Row, settings: Sequence[str]) -> tuple[dict[tuple[str, str], float], float]:
+    """Where a platform's mark of a setting stands, and the width of it."""
+    platforms = [row["platform"] for row in told["plan"]["platforms"]]
+    width = 0.76 / len(platforms)
+    return {
+        (platform, setting): group + width * (number - (len(platforms) - 1) / 2)
+        for group, setting in enumerate(settings)
+        for number, platform in enumerate(platforms)
+    }, width
+
+
+def _setting_ticks(axes: Axes, settings: Sequence[str]) -> None:
+    names = [_NAMES.get(name, f"faults, {name}") for name in settings]
+    axes.set_xticks(range(len(settings)), names, fontsize=9)
+    axes.set_xlim(-0.55, len(settings) - 0.45)
+
+
+def _times(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
+    """Every successful flight as a dot, the median with its interval, the worst one by number."""
+    settings = told["plan"]["settings"]
+    places, width = _places(told, settings)
+    flown = [f["flight_time_s"] for f in told["flights"] if _shown(f)] or [1.0]
+    room = 0.16 * max(max(flown) - min(flown), 0.1 * max(flown))
+    for row in told["settings"]:
+        key = row["platform"], row["setting"]
+        x, colour = places[key], colours[row["platform"]]
+        times = [
+            f["flight_time_s"]
+            for f in told["flights"]
+            if _shown(f) and (f["platform"], f["setting"]) == key
+        ]
+        if not times:
+            continue
+        spread = [x + 0.62 * width * ((0.5 + n * _TURN) % 1.0 - 0.5) for n in range(len(times))]
+        axes.plot(spread, times, "o", color=colour, markersize=4.2, alpha=0.45, markeredgewidth=0.0)
+        middle = row["quantities"]["flight_time_s"]["median"]
+        axes.hlines(middle["value"], x - 0.38 * width, x + 0.38 * width, color=INK, linewidth=1.8)
+        _whisker(axes, x, middle, 1.0)
+        worst = times.index(max(times))
+        axes.plot(
+            spread[worst], times[worst], "o", markersize=8, markerfacecolor="none",
+            markeredgecolor=colour, markeredgewidth=1.2,
+        )  # fmt: skip
+        axes.annotate(
+            f"{times[worst]:.1f} s", (x, times[worst]), xytext=(0, 8), textcoords="offset points",
+            ha="center", fontsize=8.5, color=colour,
+        )  # fmt: skip
+        failed = row["counted"] - len(times)
+        if failed:
+            axes.annotate(
+                f"{failed} failed", (x, 0.0), xycoords=("data", "axes fraction"), xytext=(0, 4),
+                textcoords="offset points", ha="center", fontsize=8, color=NOTE,
+            )  # fmt: skip
+    axes.set_ylim(min(flown) - 1.2 * room, max(flown) + 1.2 * room)
+    axes.set_ylabel("flight time, s", fontsize=9)
+    _setting_ticks(axes, settings)
+    _frame(axes, "Flight time of each successful mission; bar: median; ring: the worst", "y")
+
+
+def _shown(flight: Row) -> bool:
+    return bool(flight["counted"] and flight["outcome"] == "success")
+
+
+def _whisker(axes: Axes, x: float, each: Row, scale: float) -> None:
+    if not math.isnan(each["low"]):
+        axes.errorbar(
+            x, scale * each["value"],
+            [[scale * (each["value"] - each["low"])], [scale * (each["high"] - each["value"])]],
+            color=INK, elinewidth=1.1, capsize=3.0,
+        )  # fmt: skip
+
+
+def _success(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
+    settings = told["plan"]["settings"]
+    places, width = _places(told, settings)
+    for row in told["settings"]:
+        share, x = row["success"], places[row["platform"], row["setting"]]
+        if not share["total"]:
+            continue
+        axes.bar(x, 100 * share["share"], width=0.9 * width, color=colours[row["platform"]])
+        wilson = {**share, "value": share["share"]}
+        _whisker(axes, x, wilson, 100.0)
+        axes.text(
+            x, 3.0, f"{share['count']}/{share['total']}", ha="center", va="bottom", fontsize=7.5,
+            color="white", rotation=90,
+        )  # fmt: skip
+    axes.set_ylim(0.0, 104.0)
+    axes.set_ylabel("missions that reach the goal, %", fontsize=9)
+    _setting_ticks(axes, settings)
+    axes.set_xticks(range(len(settings)), [
+        _NAMES.get(name, f"faults,\n{name}") for name in settings], fontsize=9)  # fmt: skip
+    _frame(axes, "Success", "y")
+
+
+def _response(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
+    """From frame to setpoint in golden flights: what of it is kernels, and what is waiting."""
+    rows = {r["platform"]: r["quantities"] for r in told["settings"] if r["setting"] == _GOLDEN}
+    platforms = told["plan"]["platforms"]
+    for place, platform in enumerate(platforms):
+        name, left = platform["platform"], 0.0
+        found = rows[name]
+        middle_ms, late_ms = (
+            1e3 * found[key]["median"]["value"] for key in ("response_median_s", "response_p95_s")
+        )
+        for kernel in _CHAIN:
+            length = 1e3 * platform["kernel_latency_s"][kernel]
+            axes.barh(place, length, left=left, height=0.46, color=KERNELS[kernel][1],
+                      label=KERNELS[kernel][0] if place == 0 else None)  # fmt: skip
+            left += length
+        if math.isnan(middle_ms):
+            continue
+        axes.barh(place, max(0.0, middle_ms - left), left=left, height=0.46, color=_WAIT,
+                  label="waiting" if place == 0 else None)  # fmt: skip
+        axes.plot([middle_ms] * 2, [place - 0.3, place + 0.3], color=INK, linewidth=2.0,
+                  label="median" if place == 0 else None)  # fmt: skip
+        axes.plot(late_ms, place, "D", color=INK, markersize=5,
+                  label="95th percentile" if place == 0 else None)  # fmt: skip
+        axes.text(
+            0.0, place - 0.35, f"{platform['title']}: {middle_ms:.0f} ms, {late_ms:.0f} ms",
+            fontsize=9, color=colours[name], va="bottom", weight="bold",
+        )  # fmt: skip
+    axes.set_ylim(len(platforms) - 0.4, -0.75)
+    axes.set_yticks([])
+    axes.set_xlabel("response time, ms", fontsize=9)
+    axes.legend(
+        loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=4, frameon=False, fontsize=7.5,
+        columnspacing=1.0, handlelength=1.0, handletextpad=0.4,
+    )  # fmt: skip
+    _frame(axes, "Response, depth frame to setpoint (golden)", "x")
+    axes.spines["left"].set_visible(False)
+
+
+def _ratios(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
+    """Each platform over the first, mission by mission: golden flights full, faulty ones open."""
+    drawn = [row for row in told["ratios"] if row["setting"] in (_GOLDEN, _NONE)]
+    titles = {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
+    first = told["plan"]["platforms"][0]["title"]
+    step = 0.8 / max(1, len(drawn))
+    for place, (quantity, _) in enumerate(_RATIOS):
+        for number, row in enumerate(drawn):
+            each, y = row["quantities"][quantity], place + step * (number - (len(drawn) - 1) / 2)
+            if math.isnan(each["value"]):
+                continue
+            colour = colours[row["platform"]]
+            if not math.isnan(each["low"]):
+                axes.hlines(y, each["low"], each["high"], color=colour, linewidth=1.6)
+            axes.plot(
+                each["value"], y, "o", color=colour, markersize=6, markeredgewidth=1.4,
+                markerfacecolor=colour if row["setting"] == _GOLDEN else "white",
+            )  # fmt: skip
+            axes.text(
+                1.01, y, f"{each['value']:.3f}", transform=axes.get_yaxis_transform(), fontsize=8,
+                va="center", color=colour,
+            )  # fmt: skip
+    axes.axvline(1.0, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))
+    axes.set_ylim(len(_RATIOS) - 0.45, -0.55)
+    axes.set_yticks(range(len(_RATIOS)), [title for _, title in _RATIOS], fontsize=8.5)
+    others = ", ".join(dict.fromkeys(titles[row["platform"]] for row in drawn)) or "one platform"
+    axes.set_xlabel("ratio; full: golden, open: faults", fontsize=9)
+    _frame(axes, f"{others} over {first}, mission by mission", "x")
+    if not drawn:
+        axes.text(1.0, 1.5, "nothing to compare with", ha="center", fontsize=9, color=NOTE)
+
+
+def _worst(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
+    """How much longer the worst flight is than its own golden one, and what detectors recover."""
+    settings = [name for name in told["plan"]["settings"] if name != _GOLDEN]
+    places, width = _places(told, settings)
+    rows = [row for row in told["worst"] if row["setting"] in settings]
+    heights = {id(row): 100 * (row["over_own_ratio"] - 1.0) for row in rows}
+    known = [height for height in heights.values() if not math.isnan(height)]
+    for row in rows:
+        height = heights[id(row)]
+        if math.isnan(height):
+            continue
+        x = places[row["platform"], row["setting"]]
+        axes.bar(x, height, width=0.9 * width, color=colours[row["platform"]])
+        axes.annotate(
+            f"{height:+.1f}", (x, max(0.0, height)), xytext=(0, 2), textcoords="offset points",
+            ha="center", fontsize=8.5, color=INK,
+        )  # fmt: skip
+    _frame(axes, "Worst case and recovery (paper, Fig. 16)", "y")
+    if not known:
+        axes.text(0.5, 0.5, "no faults", ha="center", color=NOTE, transform=axes.transAxes)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return
+    _recovered(axes, rows, settings, colours)
+    axes.set_ylim(min(0.0, *known, 0.0), 1.45 * max(1.0, *known, 1.0))
+    axes.set_ylabel("worst flight over its own golden one, %", fontsize=9)
+    _setting_ticks(axes, settings)
+
+
+def _recovered(
+    axes: Axes, rows: Sequence[Row], settings: Sequence[str], colours: Mapping[str, str]
+) -> None:
+    """How much of the faults' increase each detector recovers: a line of numbers a platform."""
+    lines = {name: place for place, name in enumerate(colours)}
+    style: dict[str, Any] = {
+        "transform": axes.get_xaxis_transform(), "va": "top", "fontsize": 8.5, "ha": "center",
+    }  # fmt: skip
+    for row in rows:
+        if row["setting"] == _NONE:
+            continue
+        share = row["over_own_recovered_share"]
+        axes.text(
+            settings.index(row["setting"]), 0.985 - 0.055 * lines[row["platform"]],
+            "-" if math.isnan(share) else f"{100 * share:.0f} %",
+            color=colours[row["platform"]], weight="bold", **style,
+        )  # fmt: skip
+    if len(settings) > 1:
+        axes.text(0, 0.985, "recovered:", color=NOTE, **style)
