@@ -75,6 +75,16 @@ def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dic
     }
 
 
+def setting_of(vehicle: Vehicle, choices: Choices) -> Setting:
+    """What the model works with for a vehicle, its free number calibrated.
+
+    Raises:
+        ConfigError: the vehicle lacks what the choices do not give either.
+    """
+    found = calibrated(vehicle) if vehicle.calibration else None
+    return _setting(vehicle, choices, found)[0]
+
+
 def _setting(
     vehicle: Vehicle, choices: Choices, found: Calibrated | None
 ) -> tuple[Setting, list[dict[str, Any]]]:
