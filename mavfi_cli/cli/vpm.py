@@ -20,7 +20,7 @@ class _Positive(click.FloatRange):
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 
-_FLYING = ("worlds", "missions", "first_seed", "models", "jobs", "quiet")
+_FLYING = ("worlds", "missions", "first_seed", "models", "train", "jobs", "quiet")
 _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
 
 
@@ -57,6 +57,9 @@ _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
               show_default=True, help="With --fly: seeds count up from here.")  # fmt: skip
 @click.option("--models", type=click.Path(path_type=Path, file_okay=False, exists=True),
               help="With --fly: folder of detectors' models NAME.json  [the shipped].")  # fmt: skip
+@click.option("--train", type=click.IntRange(min=0), default=0, metavar="FLIGHTS",
+              help="With --fly: fit the detectors for each vehicle to so many error-free flights "
+                   "of each training world at its safe velocity first  [0: none].")  # fmt: skip
 @click.option("--jobs", type=click.IntRange(min=1),
               help="With --fly: missions at the same time  [one a core].")  # fmt: skip
 @click.option("--quiet", is_flag=True, help="With --fly: no progress on stderr.")
@@ -90,6 +93,8 @@ def vpm(
         raise click.UsageError("--json or --csv, not both")
     if not fly:
         _refuse_unused()
+    if options["models"] is not None and options["train"]:
+        raise click.UsageError("--models or --train, not both")
     chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
     known = overheads(options["overheads"])
     schemes = schemes_with(
@@ -134,6 +139,7 @@ def _flown(
         first_seed=options["first_seed"],
         folder=out,
         models=options["models"],
+        train=options["train"],
     )
     with missions_view(quiet=options["quiet"]) as view:
         return fly_and_report(ask, known, Options(jobs=options["jobs"] or 0), view)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,12 @@ from typing import Any
 
 from mavfi_cli.campaign.arms import Arm, Flown, arm_missions, fly_arms, paired_ratio
 from mavfi_cli.campaign.factors import check_names
+from mavfi_cli.campaign.missions import canonical, changes_of
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
+from mavfi_cli.campaign.training import WORLDS as TRAINING_WORLDS
+from mavfi_cli.campaign.training import TrainingPlan, train
 from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.platform import load_platform
@@ -23,7 +27,7 @@ from mavfi_cli.vpm.side_by_side import side_by_side
 from mavfi_cli.vpm.vehicle import Vehicle
 
 WORLDS = ("sparse", "dense")
-FLIGHTS, FLOWN = "flights", "flown"
+FLIGHTS, FLOWN, TRAINING = "flights", "flown", "training"
 PLATFORM = "x86"  # whose latencies are scaled where no platform is named
 BARE = "none"
 Plans = dict[tuple[str, str], FlightPlan | str]
@@ -37,6 +41,8 @@ class Ask:
         missions: of each scheme in each world.
         folder: of flights and pictures; what it has is not flown again.
         models: of the detectors; None takes those that come with them.
+        train: flights of each training world to which detectors are fitted for each vehicle; 0
+            fits none.
     """
 
     vehicles: Sequence[Vehicle]
@@ -46,6 +52,7 @@ class Ask:
     first_seed: int
     folder: Path
     models: Path | None = None
+    train: int = 0
 
 
 def fly_and_report(
@@ -67,7 +74,7 @@ def fly_and_report(
     """
     percents = {name: percent for name, (percent, _) in overheads.items()}
     sources = {name: source for name, (_, source) in overheads.items()}
-    plans = make_plans(ask, schemes_with(percents, sources))
+    plans = make_plans(ask, schemes_with(percents, sources), options, spectator)
     arms = [
         Arm(group=vehicle, name=scheme, mission=plan.mission)
         for (vehicle, scheme), plan in plans.items()
@@ -84,6 +91,7 @@ def fly_and_report(
         "worlds": list(ask.worlds),
         "missions_each": ask.missions,
         "first_seed": ask.first_seed,
+        "detectors": _models_told(ask),
         **side_by_side(told, plans, flown, paired_ratio, measured),
     }
     return told
@@ -99,8 +107,13 @@ def measured_in(flown: Mapping[tuple[str, str], Flown]) -> dict[str, Overhead]:
     )
 
 
-def make_plans(ask: Ask, schemes: Sequence[Scheme]) -> Plans:
+def make_plans(
+    ask: Ask, schemes: Sequence[Scheme], options: Options, spectator: Spectator
+) -> Plans:
     """A plan, or why there is none, for each vehicle and scheme; their files are written.
+
+    Args:
+        options, spectator: of the flights to which detectors are fitted, where that is asked for.
 
     Raises:
         UnknownName, VehicleProcessError: a world or a simulated vehicle that does not exist.
@@ -116,13 +129,13 @@ def make_plans(ask: Ask, schemes: Sequence[Scheme]) -> Plans:
     plans: Plans = {}
     for vehicle in ask.vehicles:
         setting = setting_of(vehicle, ask.choices)
+        folder = ask.folder.absolute() / FLOWN
         refused: dict[int, str | None] = {}  # by number of boards: what the simulator says
-        for scheme in schemes:
+        models = ask.models
+        for scheme in schemes:  # one board without protection comes first
             key = (vehicle.name, scheme.name)
             try:
-                plan = flight_plan(
-                    setting, scheme, platform, chain_s, ask.folder.absolute() / FLOWN, ask.models
-                )
+                plan = flight_plan(setting, scheme, platform, chain_s, folder, models)
             except CannotLift as error:
                 if scheme.name == BARE:
                     raise
@@ -132,7 +145,39 @@ def make_plans(ask: Ask, schemes: Sequence[Scheme]) -> Plans:
             if scheme.copies not in refused:
                 refused[scheme.copies] = _refusal(plan, ask, bare=scheme.name == BARE)
             plans[key] = refused[scheme.copies] or plan
+            if scheme.name == BARE and ask.train:
+                models = fitted(ask, vehicle.name, plan, options, spectator)
     return plans
+
+
+def fitted(
+    ask: Ask, vehicle: str, plan: FlightPlan, options: Options, spectator: Spectator
+) -> Path:
+    """The folder of detectors that are fitted to error-free flights of a plan.
+
+    What is there is taken: the folder's name holds a digest of the mission and of the number of
+    flights.
+
+    Raises:
+        ModelError: too few flights reached their goals, or torch is missing.
+    """
+    text = canonical([changes_of(plan.mission), ask.train])
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    folder = ask.folder / TRAINING / f"{vehicle}-{digest}"
+    if not all((folder / f"{name}.json").is_file() for name in DETECTORS):
+        spectator.on_note(f"{vehicle}: error-free flights to which its detectors are fitted")
+        training = TrainingPlan(flights=ask.train, kinds=DETECTORS, base=plan.mission)
+        train(training, folder, options, spectator, spectator.on_note)
+    return folder
+
+
+def _models_told(ask: Ask) -> str:
+    if ask.train:
+        flights = f"{ask.train} error-free flights in each of {', '.join(TRAINING_WORLDS)}"
+        return f"fitted for each vehicle to {flights} at its safe velocity"
+    if ask.models is not None:
+        return f"of {ask.models}"
+    return "the shipped ones, fitted to flights of the Solo at 3 m/s"
 
 
 def _require_distinct(names: Sequence[str], what: str) -> None:

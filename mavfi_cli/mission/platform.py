@@ -165,6 +165,8 @@ def load_platform(name_or_path: str) -> PlatformProfile:
     factor = measured_factor(name_or_path)
     if factor is not None:
         return _measured(factor)
+    if not name_or_path.endswith(".toml") and name_or_path not in platform_names():
+        raise UnknownName("platform", name_or_path, [*platform_names(), f"{MEASURED}:FACTOR"])
     path = shipped_path("platform", name_or_path, _FOLDER)
     return _resolved(load_toml(path, _PlatformFile), path)
 

@@ -87,7 +87,7 @@ def _ratios(axes: Axes, one: Mapping[str, Any], reference: str) -> None:
         for place, (name, _) in enumerate(_RATIOS):
             at = place + (number - (len(rows) - 1) / 2) * _STEP
             if f"model_{name}_ratio" in row:
-                _bar(axes, at, 0.9 * _STEP, row, f"{name}_ratio", "")
+                _bar(axes, at, 0.9 * _STEP, row, name, "_ratio")
             else:
                 _not_flown(axes, at)
     axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=(0, (5, 3)))

@@ -13,9 +13,11 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_text
+from mavfi_cli.mission.companion import BRAKE_SHARE
 from mavfi_cli.mission.config import LIMITS, MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.platform import PlatformProfile
+from mavfi_cli.vpm.model import safe_velocity_mps
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
 from mavfi_cli.vpm.setting import Setting, outcome
 
@@ -23,9 +25,8 @@ from mavfi_cli.vpm.setting import Setting, outcome
 NOT_SCALED = (
     "size, propellers and drag are those of the simulated vehicle; boards weigh, but have no "
     "size: inertia and drag do not grow with them",
-    "the model's acceleration is that of climbing at full throttle, pull / mass - g; here it is "
-    "the limit of the planned motion, of which planning uses 60 %, and the vehicle brakes by "
-    "tilting",
+    "the model's acceleration is pull / mass - g; here it is the companion's limit, of which "
+    f"planning uses {100.0 * BRAKE_SHARE:g} % to speed up and to brake",
     "the simulated companion plans with 90 % of the safe velocity, flies round obstacles, stops to "
     "plan, and speeds up and slows down; the model flies straight at one velocity",
     "flights begin at take-off height and end within the goal's tolerance; climbing there is not "
@@ -41,6 +42,7 @@ class FlightPlan:
         mission: without world and seed.
         files: TOML files that the mission names, by path.
         model_velocity_mps: the safe velocity that it flies with, where the mission can take it.
+        braking_velocity_mps: the safe velocity with the deceleration that the companion counts on.
         rotors_w: electrical power of hovering with all boards, by the model.
         boards_w: of all boards.
         cut: what of the model the mission cannot take, in words.
@@ -50,6 +52,7 @@ class FlightPlan:
     mission: MissionConfig
     files: Mapping[Path, str]
     model_velocity_mps: float
+    braking_velocity_mps: float
     rotors_w: float
     boards_w: float
     cut: tuple[str, ...] = field(default=())
@@ -102,6 +105,9 @@ def flight_plan(
         ),
         files=dict((vehicle, computer)),
         model_velocity_mps=flown.velocity_mps,
+        braking_velocity_mps=safe_velocity_mps(
+            BRAKE_SHARE * accel_mps2, setting.response_s(scheme.overhead), setting.range_m
+        ),
         rotors_w=flown.power_w - boards_w,
         boards_w=boards_w,
         cut=tuple(filter(None, (cut_v, cut_a, cut_r, cut_f))),

@@ -9,13 +9,13 @@ from mavfi_cli.vpm.table import columns, csv_of
 
 _NUMBERS = (
     # name, unit in the key, unit as printed, factor, digits, heading
-    ("velocity", "_mps", "m/s", 1.0, 2, "mean velocity against the model's safe velocity"),
-    ("top_velocity", "_mps", "m/s", 1.0, 2, "top velocity against it"),
-    ("flight_time", "_s", "s", 1.0, 1, "flight time"),
-    ("energy", "_j", "kJ", 1.0e-3, 2, "energy of rotors and boards"),
-    ("response", "_s", "s", 1.0, 3, "response time, median"),
+    ("velocity", "_mps", "m/s", 1.0, 2, "Mean velocity against the model's safe velocity"),
+    ("top_velocity", "_mps", "m/s", 1.0, 2, "Top velocity against it"),
+    ("flight_time", "_s", "s", 1.0, 1, "Flight time"),
+    ("energy", "_j", "kJ", 1.0e-3, 2, "Energy of rotors and boards"),
+    ("response", "_s", "s", 1.0, 3, "Response time, median"),
 )
-_RATIOS = (("velocity", "velocity"), ("flight_time", "flight time"), ("energy", "energy"))
+_RATIOS = (("velocity", "Velocity"), ("flight_time", "Flight time"), ("energy", "Energy"))
 
 
 def flight_table(flights: Mapping[str, Any]) -> list[str]:
@@ -25,9 +25,10 @@ def flight_table(flights: Mapping[str, Any]) -> list[str]:
         f"Flights in {', '.join(flights['worlds'])}: {flights['missions_each']} missions a scheme "
         f"and world, seeds from {flights['first_seed']}; numbers are of successful flights, "
         "(low to high) are 95 % intervals over missions",
+        f"Detectors: {flights['detectors']}",
     ]
     for one in flights["vehicles"]:
-        lines += ["", *_vehicle(one, flights["ratios_over"])]
+        lines += ["", *_vehicle(one, flights)]
     lines += ["", *_overheads(flights["overheads"]), "", "What the flights do not scale:"]
     return [*lines, *(f"  {text}" for text in flights["not_scaled"])]
 
@@ -50,30 +51,37 @@ def flight_rows_csv(flights: Mapping[str, Any]) -> str:
     return csv_of(rows)
 
 
-def _vehicle(one: Mapping[str, Any], reference: str) -> Iterator[str]:
+def _vehicle(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str]:
     yield f"== {one['vehicle']} flown, board {one['board']} =="
     rows = [row for row in one["schemes"] if row["problem"] is None]
     yield from columns(
-        ["scheme", "mass", "v-max", "a-max", "missions", "success", "ends"],
+        ["scheme", "mass", "v-max", "a-max", "safe with its braking", "missions", "success",
+         "ends"],
         [[row["scheme"], f"{row['mass_kg']:.3f} kg", f"{row['v_max_mps']:.3f} m/s",
-          f"{row['a_max_mps2']:.2f} m/s²", f"{row['missions']}", _success(row), _ends(row)]
+          f"{row['a_max_mps2']:.2f} m/s²", f"{row['braking_velocity_mps']:.3f} m/s",
+          f"{row['missions']}", _success(row), _ends(row)]
          for row in rows],
     )  # fmt: skip
     for name, key, unit, factor, digits, heading in _NUMBERS:
         yield ""
+        yield f"{heading}:"
         yield from columns(
-            [heading, "model", "flight", "", "flight - model"],
+            ["scheme", "model", "flight", "", "flight against model"],
             [_number(row, name, key, unit, factor, digits) for row in rows],
         )
     yield ""
-    yield from columns(
-        ["why flights take longer", "path", "pace", "replans", "alarms"], [_why(r) for r in rows]
-    )
-    for name, title in _RATIOS:
+    yield "Why flights take longer than the model says:"
+    yield from columns(["scheme", "path", "pace", "replans", "alarms"], [_why(r) for r in rows])
+    over, paper = flights["ratios_over"], flights["paper_ratios_over"]
+    for name, title, suffix in (
+        *((name, f"{title} over {over}", "") for name, title in _RATIOS),
+        ("flight_time", f"Flight time over {paper}, as the paper's Fig. 15", f"_over_{paper}"),
+    ):
         yield ""
+        yield f"{title}:"
         yield from columns(
-            [f"{title} over {reference}", "model", "flight", "", "flight - model"],
-            [_ratio(row, name) for row in rows if f"{name}_ratio_difference_percent" in row],
+            ["scheme", "model", "flight", "", "flight against model"],
+            [_ratio(row, name, suffix) for row in rows if f"pairs{suffix}" in row],
         )
     for row in one["schemes"]:
         yield from _remarks(row)
@@ -119,14 +127,15 @@ def _why(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _ratio(row: Mapping[str, Any], name: str) -> list[str]:
-    flight, low, high = (row[f"flight_{name}_ratio{end}"] for end in ("", "_low", "_high"))
+def _ratio(row: Mapping[str, Any], name: str, suffix: str) -> list[str]:
+    key = f"{name}{suffix}"
+    flight, low, high = (row[f"flight_{key}{end}_ratio"] for end in ("", "_low", "_high"))
     return [
         row["scheme"],
-        f"x {row[f'model_{name}_ratio']:.4f}",
+        f"x {row[f'model_{key}_ratio']:.4f}",
         f"x {flight:.4f}",
-        f"(x {low:.4f} to x {high:.4f}, {row['pairs']} pairs)",
-        f"{row[f'{name}_ratio_difference_percent']:+.1f} %",
+        f"(x {low:.4f} to x {high:.4f}, {row[f'pairs{suffix}']} pairs)",
+        f"{row[f'{key}_difference_percent']:+.1f} %",
     ]
 
 
@@ -144,10 +153,12 @@ def _overheads(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     if not rows:
         yield "Overhead of detection and recovery: no flight with a detector"
         return
-    yield "Overhead of detection and recovery, of the compute time of the same flights:"
+    yield "Overhead of detection and recovery, of the kernels' time on the flights' platform:"
     yield from columns(
-        ["detector", "measured", "of it checks", "paper", "recomputations"],
+        ["detector", "measured", "of it checks", "paper", "recomputations",
+         "checks of this host's kernel time"],
         [[row["detector"], f"{row['measured_percent']:.4g} %", f"{row['checks_percent']:.4g} %",
-          f"{row['paper_percent']:.4g} %", f"{row['alarms']} in {row['flights']} flights"]
+          f"{row['paper_percent']:.4g} %", f"{row['alarms']} in {row['flights']} flights",
+          f"{row['checks_of_host_kernels_percent']:.4g} %"]
          for row in rows],
     )  # fmt: skip

@@ -103,6 +103,11 @@ def _setting(
         compute_s, given = choices.response_s, _COMMAND
     elif choices.platform is not None:
         kernels = choices.platform.kernels
+        if choices.platform.measured_factor is not None:
+            raise ConfigError(
+                f"{choices.platform.name} has latencies only while it flies: mavfi fly --realtime",
+                key="platform",
+            )
         combined, how = CHAINS[choices.chain]
         compute_s = combined([each.latency_s for each in kernels.values()])
         if compute_s == 0.0:

@@ -12,7 +12,8 @@ from mavfi_cli.vpm.overhead import Overhead
 from mavfi_cli.vpm.schemes import REFERENCE, SCHEMES
 
 Measure = Callable[[Mapping[str, Any]], float | None]
-RATIOS = ("velocity", "flight_time", "energy")
+BASE = "none"  # ratios of flights are over one board without protection
+MODEL = {"velocity": "velocity_mps", "flight_time": "flight_time_s", "energy": "energy_j"}
 
 
 class Estimate(Protocol):
@@ -95,7 +96,8 @@ def side_by_side(
         overheads: measured in these flights, by detector.
     """
     return {
-        "ratios_over": REFERENCE,
+        "ratios_over": BASE,
+        "paper_ratios_over": REFERENCE,
         "not_scaled": list(NOT_SCALED),
         "overheads": [_overhead(each) for each in overheads.values()],
         "vehicles": [
@@ -103,7 +105,11 @@ def side_by_side(
                 "vehicle": one["vehicle"],
                 "board": one["board"],
                 "schemes": [
-                    _scheme(one["vehicle"], row, plans, flown, ratio) for row in one["schemes"]
+                    {
+                        **_scheme(one["vehicle"], row, plans, flown),
+                        **_over(one, row, plans, flown, ratio),
+                    }
+                    for row in one["schemes"]
                 ],
             }
             for one in told["vehicles"]
@@ -119,6 +125,7 @@ def _overhead(measured: Overhead) -> dict[str, Any]:
         "alarms": measured.alarms,
         "measured_percent": 100.0 * measured.share,
         "checks_percent": 100.0 * measured.checks_share,
+        "checks_of_host_kernels_percent": 100.0 * measured.checks_host_share,
         "paper_percent": 100.0 * paper.overhead,
     }
 
@@ -128,9 +135,8 @@ def _scheme(
     row: Mapping[str, Any],
     plans: Mapping[tuple[str, str], FlightPlan | str],
     flown: Mapping[tuple[str, str], Flights],
-    ratio: PairedRatio,
 ) -> dict[str, Any]:
-    key, reference = (vehicle, row["scheme"]), (vehicle, REFERENCE)
+    key = (vehicle, row["scheme"])
     plan = plans[key]
     told: dict[str, Any] = {
         "scheme": row["scheme"], "title": row["title"], "boards": row["boards"],
@@ -138,21 +144,42 @@ def _scheme(
     }  # fmt: skip
     if isinstance(plan, str):
         return {**told, "problem": plan}
-    flights, base = flown[key], plans[reference]
-    told |= {
+    return {
+        **told,
         "v_max_mps": plan.mission.v_max_mps,
         "a_max_mps2": plan.mission.a_max_mps2,
+        "braking_velocity_mps": plan.braking_velocity_mps,
         "cut": list(plan.cut),
-        "errors": list(flights.errors),
-        **_success(flights),
-        **_numbers(row, plan, flights),
+        "errors": list(flown[key].errors),
+        **_success(flown[key]),
+        **_numbers(row, plan, flown[key]),
     }
-    for name in RATIOS:
-        if isinstance(base, FlightPlan):
-            of = [_measure(name, each) for each in (base, plan)]
-            found = ratio(flown[reference], flights, *of)
-            told |= _beside(f"{name}_ratio", "", row[f"{name}_ratio"], found)
-            told["pairs"] = found.count
+
+
+def _over(
+    one: Mapping[str, Any],
+    row: Mapping[str, Any],
+    plans: Mapping[tuple[str, str], FlightPlan | str],
+    flown: Mapping[tuple[str, str], Flights],
+    ratio: PairedRatio,
+) -> dict[str, float]:
+    """Ratios over one board without protection, and the paper's: over detection and recovery."""
+    rows = {each["scheme"]: each for each in one["schemes"]}
+    told: dict[str, float] = {}
+    for over, suffix, names in (
+        (BASE, "", tuple(MODEL)),
+        (REFERENCE, f"_over_{REFERENCE}", ("flight_time",)),
+    ):
+        first, second = (one["vehicle"], over), (one["vehicle"], row["scheme"])
+        base, plan = plans[first], plans[second]
+        if isinstance(base, str) or isinstance(plan, str):
+            continue
+        for name in names:
+            model = row[MODEL[name]] / rows[over][MODEL[name]]
+            measures_of = _measure(name, base), _measure(name, plan)
+            found = ratio(flown[first], flown[second], *measures_of)
+            told |= _beside(f"{name}{suffix}", "_ratio", model, found)
+            told[f"pairs{suffix}"] = found.count
     return told
 
 
