@@ -135,7 +135,7 @@ def _ratio(row: Mapping[str, Any], name: str, suffix: str) -> list[str]:
         f"x {row[f'model_{key}_ratio']:.4f}",
         f"x {flight:.4f}",
         f"(x {low:.4f} to x {high:.4f}, {row[f'pairs{suffix}']} pairs)",
-        f"{row[f'{key}_difference_percent']:+.1f} %",
+        f"{row[f'{key}_ratio_difference_percent']:+.1f} %",
     ]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -229,10 +228,11 @@ def _numbers(row: Mapping[str, Any], plan: FlightPlan, flights: Flights) -> dict
 
 def _beside(name: str, unit: str, model: float, flight: Estimate) -> dict[str, float]:
     """The model's number, the flights' with its interval, and by how much they differ."""
+    of = "_ratio" if unit == "_ratio" else ""
     return {
         f"model_{name}{unit}": model,
         f"flight_{name}{unit}": flight.value,
         f"flight_{name}_low{unit}": flight.low,
         f"flight_{name}_high{unit}": flight.high,
-        f"{name}_difference_percent": 100.0 * (flight.value / model - 1.0) if model else math.nan,
+        f"{name}{of}_difference_percent": 100.0 * (flight.value / model - 1.0),
     }

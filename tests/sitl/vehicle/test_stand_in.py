@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from conftest import Flight
 
 from mavfi_cli.core.errors import ConfigError
 from sitl.vehicle.profile import GRAVITY_MPS2, MIN_THRUST_TO_WEIGHT, load_profile
@@ -57,9 +56,9 @@ def test_hover_power_follows_momentum_theory(load):
     assert load(HEAVY).battery.drive_efficiency == pytest.approx(rotor.hover_power_w(0.3) / 63.0)
 
 
-def test_the_record_s_hover_power_is_that_of_the_physics(tmp_path, setpoint):
+def test_the_record_s_hover_power_is_that_of_the_physics(airborne, setpoint):
     """JSBSim's propellers take it when the vehicle hovers."""
-    flight = Flight("spark+0.1").take_off()
+    flight = airborne("spark+0.1")
     flight.fly(setpoint(velocity=(0.0, 0.0, 0.0)), 3.0)
     told = flight.vehicle.profile.physics
     assert told["mass_kg"] == pytest.approx(0.4)
@@ -104,11 +103,11 @@ def test_what_is_wrong_with_a_stand_in(load, old, new, said):
 
 
 @pytest.mark.parametrize("base", ["spark", "solo"])
-def test_it_flies_at_the_least_thrust_to_weight(load, setpoint, base):
+def test_it_flies_at_the_least_thrust_to_weight(airborne, setpoint, base):
     """Climbs slowly, reaches 4 m/s and stops without losing height."""
     own = load_profile(base)
     payload_kg = own.max_thrust_n / (MIN_THRUST_TO_WEIGHT * GRAVITY_MPS2) - own.mass_kg
-    flight = Flight(f"{base}+{payload_kg - 1e-6}").take_off()
+    flight = airborne(f"{base}+{payload_kg - 1e-6}")
     assert -flight.truth.position_ned_m[2] > 3.0
     speeding = flight.fly(setpoint(velocity=(4.0, 0.0, 0.0)), 6.0)
     np.testing.assert_allclose(speeding.velocity[-1], (4.0, 0.0, 0.0), atol=0.2)
