@@ -26,15 +26,15 @@ def overheads(texts: tuple[str, ...]) -> dict[str, tuple[float, str]]:
     """
     found: dict[str, tuple[float, str]] = {}
     for text in texts:
-        name, equals, number = text.partition("=")
-        if Path(text).exists() or not equals:
+        name, _, number = text.partition("=")
+        if Path(text).exists():
             found |= measured(text)
             continue
         try:
             found[name.strip()] = float(number), "--overhead"
         except ValueError:
             raise click.UsageError(
-                f"--overhead {text}: give a detector and per cent, as aad=0.0062, or a path"
+                f"--overhead {text}: no such file or folder; for per cent write aad=0.0062"
             ) from None
     return found
 
@@ -46,8 +46,6 @@ def measured(text: str) -> dict[str, tuple[float, str]]:
         RecordError: there are none; says what is there.
     """
     path = Path(text)
-    if not path.exists():
-        raise RecordError(f"{path}: no such file or folder, nor DETECTOR=PERCENT")
     of_each = overheads_of(_results(path))
     known = {name: each for name, each in of_each.items() if name in DETECTORS}
     if not known:

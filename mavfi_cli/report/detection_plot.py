@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.core.files import write_atomically
+from mavfi_cli.report.drawing import NOTE, write_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,27 +18,18 @@ _COLOURS = {
     "none": "#9aa5b1", "range": "#f2b134", "l2": "#8e5aa3", "gad": "#1b4965", "aad": "#e4572e",
 }  # fmt: skip
 _OTHERS = ("#2a9d8f", "#7f5539", "#c9184a", "#606c38")  # plug-ins
-_GREY, _GRID = "#5b6573", "#edf0f4"
+_GRID = "#edf0f4"
 Evaluation = Mapping[str, Any]
 
 
 def write_roc_plot(evaluation: Evaluation, path: Path) -> None:
     """Draw the curves of an evaluation as SVG, atomically; equal ones give equal bytes."""
-    _write(draw_roc_plot(evaluation), path)
+    write_svg(draw_roc_plot(evaluation), path)
 
 
 def write_recovery_plot(evaluation: Evaluation, path: Path) -> None:
     """Draw what detectors recover as SVG, atomically; equal ones give equal bytes."""
-    _write(draw_recovery_plot(evaluation), path)
-
-
-def _write(figure: Figure, path: Path) -> None:
-    import matplotlib as mpl
-
-    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
-    write_atomically(path, lambda file: file.write(buffer.getvalue()))
+    write_svg(draw_recovery_plot(evaluation), path)
 
 
 def draw_roc_plot(evaluation: Evaluation) -> Figure:
@@ -63,7 +53,7 @@ def draw_roc_plot(evaluation: Evaluation) -> Figure:
             curve["recall"], curve["precision"], where="pre", color=colour, linewidth=1.5
         )
         precision.plot(*_at_threshold(curve), "o", color=colour, markersize=5)
-    roc.plot([0, 1], [0, 1], color=_GREY, linewidth=0.8, linestyle=":")
+    roc.plot([0, 1], [0, 1], color=NOTE, linewidth=0.8, linestyle=":")
     _square(roc, "share of error-free flights with an alarm", "share of harmful faults detected")
     _square(precision, "share of harmful faults detected", "share of alarms that are right")
     if drawn:
@@ -75,7 +65,7 @@ def draw_roc_plot(evaluation: Evaluation) -> Figure:
         figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     else:
         caption = "no harmful fault: no curve"
-    figure.supxlabel(caption, fontsize=7.5, color=_GREY)
+    figure.supxlabel(caption, fontsize=7.5, color=NOTE)
     return figure
 
 
@@ -126,7 +116,7 @@ def draw_recovery_plot(evaluation: Evaluation) -> Figure:
     )
     figure.supxlabel(
         "left: whiskers are 95 % Wilson intervals, n lost missions; right: successful flights "
-        "with n active faults", fontsize=7.5, color=_GREY,
+        "with n active faults", fontsize=7.5, color=NOTE,
     )  # fmt: skip
     return figure
 
@@ -150,7 +140,7 @@ def _bars(
         )
         value, low, high = measure(row)
         if not np.isfinite(value):
-            axes.text(place, 1.0, "-", ha="center", fontsize=8, color=_GREY)
+            axes.text(place, 1.0, "-", ha="center", fontsize=8, color=NOTE)
             continue
         axes.bar(place, 100.0 * value, width=0.9 * width, color=colours[row["detector"]])
         if low is not None:

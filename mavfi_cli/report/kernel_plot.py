@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.core.files import write_atomically
+from mavfi_cli.report.drawing import INK, write_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
 
 _COLOURS = {"sdc": "#8e5aa3", "crash": "#e4572e", "hang": "#f2b134", "benign": "#c3d4e6"}
 _DARKER = {"sdc": "#6d3f84", "crash": "#b23a17", "hang": "#a06c00", "benign": "#4f6a88"}
-_INK = "#1d232b"
 _WIDTH = 0.6
 _ROOM = 5.0  # per cent that a number inside a bar needs; smaller shares are written beside it
 _LINE = 3.2  # per cent that a line of such numbers is high
@@ -25,13 +23,7 @@ _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 def write_kernel_plot(summary: Mapping[str, Any], path: Path) -> None:
     """Draw the summary of a kernel campaign as SVG, atomically; equal ones give equal bytes."""
-    import matplotlib as mpl
-
-    figure = draw_kernel_plot(summary)
-    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
-    write_atomically(path, lambda file: file.write(buffer.getvalue()))
+    write_svg(draw_kernel_plot(summary), path)
 
 
 def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
@@ -63,7 +55,7 @@ def _bar(axes: Axes, place: int, outcomes: Mapping[str, Any]) -> None:
         axes.bar(place, share, bottom=base, width=_WIDTH, color=colour)
         if share >= _ROOM:
             axes.text(
-                place - 0.16, base + share / 2, f"{share:.0f}", color=_INK, fontsize=8.5,
+                place - 0.16, base + share / 2, f"{share:.0f}", color=INK, fontsize=8.5,
                 ha="center", va="center",
             )  # fmt: skip
         elif row["count"]:
@@ -76,7 +68,7 @@ def _bar(axes: Axes, place: int, outcomes: Mapping[str, Any]) -> None:
         if row["count"] and name != "benign" and high - low >= _VISIBLE:
             axes.errorbar(
                 place + 0.03 + 0.1 * number, base + share, [[share - low], [high - share]],
-                color=_INK, elinewidth=0.9, capsize=2.0,
+                color=INK, elinewidth=0.9, capsize=2.0,
             )  # fmt: skip
         base += share
 

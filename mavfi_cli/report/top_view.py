@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.core.files import write_atomically
 from mavfi_cli.mission.run_folder import Run
+from mavfi_cli.report.drawing import write_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,13 +38,7 @@ _LABELS = {
 
 def write_top_view(run: Run, path: Path) -> None:
     """Draw the run and write it as SVG, atomically; equal runs give equal bytes."""
-    import matplotlib as mpl
-
-    figure = draw_top_view(run)
-    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
-    write_atomically(path, lambda file: file.write(buffer.getvalue()))
+    write_svg(draw_top_view(run), path)
 
 
 def draw_top_view(run: Run) -> Figure:

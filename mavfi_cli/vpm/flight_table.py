@@ -7,6 +7,7 @@ from typing import Any
 
 from mavfi_cli.vpm.table import columns, csv_of
 
+MANY_ALARMS = 10.0  # of an error-free flight: more is not the detector's usual rate
 _NUMBERS = (
     # name, unit in the key, unit as printed, factor, digits, heading
     ("velocity", "_mps", "m/s", 1.0, 2, "Mean velocity against the model's safe velocity"),
@@ -142,11 +143,21 @@ def _ratio(row: Mapping[str, Any], name: str, suffix: str) -> list[str]:
 def _remarks(row: Mapping[str, Any]) -> Iterator[str]:
     if row["problem"] is not None:
         yield f"{row['scheme']}: not flown: {row['problem']}"
+        return
+    yield from _false_alarms(row)
     if row["cut"]:
         yield f"{row['scheme']}: flown with {', '.join(row['cut'])}"
     if row["errors"]:
         many = len(row["errors"])
         yield f"{row['scheme']}: {many} could not begin, the first: {row['errors'][0]}"
+
+
+def _false_alarms(row: Mapping[str, Any]) -> Iterator[str]:
+    if row["flight_alarms"] >= MANY_ALARMS:
+        yield (
+            f"{row['scheme']}: {row['flight_alarms']:.0f} alarms in a flight without a fault: its "
+            "model was fitted to other flights; --train fits one to these"
+        )
 
 
 def _overheads(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -3,7 +3,10 @@
 import json
 
 import pytest
+from click import UsageError
 
+from mavfi_cli.cli.overheads import measured, overheads
+from mavfi_cli.core.errors import RecordError
 from mavfi_cli.vpm.overhead import overheads_of
 
 
@@ -82,9 +85,6 @@ def test_a_real_record_has_what_it_takes(guarded):
 
 
 def test_the_command_takes_a_run_folder(guarded, tmp_path):
-    from mavfi_cli.cli.overheads import measured, overheads
-    from mavfi_cli.core.errors import RecordError
-
     (percent, told) = measured(str(guarded.path))["gad"]
     assert measured(str(guarded.path.parent))["gad"][0] > 0.0  # the folder of runs
     assert measured(str(guarded.result))["gad"] == (percent, told.replace(
@@ -93,5 +93,5 @@ def test_the_command_takes_a_run_folder(guarded, tmp_path):
     assert overheads((str(guarded.path), "aad=0.5"))["aad"] == (0.5, "--overhead")
     with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
         measured(str(tmp_path))
-    with pytest.raises(RecordError, match="no such file or folder, nor DETECTOR=PERCENT"):
-        measured(str(tmp_path / "nowhere"))
+    with pytest.raises(UsageError, match=r"no such file or folder; for per cent write aad=0\.0062"):
+        overheads((str(tmp_path / "nowhere"),))

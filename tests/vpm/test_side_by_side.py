@@ -21,7 +21,7 @@ HOVER_SHAFT_W = 20.0  # of the simulated vehicle, with one board
 STRAIGHT_M = 40.0 - 1.0
 
 
-def flight(row, plan, *, slower=1.0, longer=1.0, outcome="success"):
+def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
     """What a flight as the model has it records; or a slower one, or one of a longer path."""
     hover_w = HOVER_SHAFT_W * plan.rotors_w
     velocity = row["velocity_mps"] / slower
@@ -38,7 +38,7 @@ def flight(row, plan, *, slower=1.0, longer=1.0, outcome="success"):
         "referee": {"physics": {"hover_shaft_w": hover_w}},
         "response_time_s": {"median": 1.0 / row["throughput_hz"]},
         "pilot": {"replans": 2},
-        "detection": {"alarm_count": 3} if row["scheme"] in ("gad", "aad") else None,
+        "detection": {"alarm_count": alarms} if row["scheme"] in ("gad", "aad") else None,
     }  # fmt: skip
 
 
@@ -136,6 +136,12 @@ def test_the_table_tells_overheads_side_by_side(spark):
     assert "none: flown with acceleration 8 m/s² instead of 9.171 m/s²" in text
     assert "no detector" in text
     assert "3.0 a flight" in text
+    assert "alarms in a flight without a fault" not in text
+
+
+def test_a_detector_that_does_not_know_these_flights(spark):
+    text = "\n".join(flight_table(spark({"aad": {"alarms": 683}})["flights"]))
+    assert "aad: 683 alarms in a flight without a fault: its model was fitted to other" in text
 
 
 def test_the_picture(spark, tmp_path):
