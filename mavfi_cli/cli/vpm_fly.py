@@ -121,6 +121,8 @@ def make_plans(
     """
     _require_distinct([vehicle.name for vehicle in ask.vehicles], "vehicle")
     _require_distinct(ask.worlds, "world")
+    if ask.train:
+        _require_held_out(ask)
     for world in ask.worlds:
         check_names(MissionConfig(world=world, seed=ask.first_seed), ask_vehicle)
     platform = ask.choices.platform or load_platform(PLATFORM)
@@ -184,6 +186,17 @@ def _require_distinct(names: Sequence[str], what: str) -> None:
     for place, name in enumerate(names):
         if name in names[:place]:
             raise ConfigError(f"{name} is named twice", key=what)
+
+
+def _require_held_out(ask: Ask) -> None:
+    """Refuse missions with the seeds of training flights, whatever their worlds."""
+    first = TrainingPlan().first_seed
+    last = first + ask.train * len(TRAINING_WORLDS) - 1
+    if ask.first_seed <= last and first <= ask.first_seed + ask.missions - 1:
+        raise ConfigError(
+            f"seeds {first} to {last} are for training: choose another --first-seed",
+            key="first seed",
+        )
 
 
 def _refusal(plan: FlightPlan, ask: Ask, *, bare: bool) -> str | None:
