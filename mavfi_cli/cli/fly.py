@@ -62,8 +62,10 @@ class _Size(click.ParamType[Any]):
 @click.option("--seed", default=3, show_default=True, help="Root seed of everything random.")
 @click.option("--planner", default="rrtstar", show_default=True,
               help="rrtstar, rrt, rrtconnect, or a plug-in's name.")  # fmt: skip
-@click.option("--platform", default="x86", show_default=True, metavar="NAME|FILE",
-              help="The companion computer whose latencies the flight feels.")  # fmt: skip
+@click.option("--platform", default="x86", show_default=True,
+              metavar="NAME|FILE|measured:FACTOR",
+              help="The companion computer whose latencies the flight feels; measured: this "
+                   "host's own kernel times, times the factor, with --realtime.")  # fmt: skip
 @click.option("--vehicle", default="solo", show_default=True, metavar="NAME|FILE",
               help="solo, spark, or a TOML profile.")  # fmt: skip
 @click.option("--start", type=_Place(), help="Where to take off, ENU, m  [the world's own].")

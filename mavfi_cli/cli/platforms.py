@@ -26,6 +26,10 @@ def platforms(names: tuple[str, ...], as_json: bool) -> None:
     else:
         for profile in profiles:
             click.echo(_line(profile))
+        click.echo(
+            "measured:FACTOR  this host's own kernel times while it flies, times FACTOR; for "
+            "`mavfi fly --realtime` only"
+        )
         click.echo("\n`mavfi platforms NAME` shows every kernel; CONTRIBUTING.md how to add one.")
 
 
@@ -42,6 +46,8 @@ def _line(profile: Any) -> str:
 
 
 def _explained(profile: Any) -> str:
+    if profile.measured_factor is not None:
+        return _measured(profile)
     based = f"; latencies from {profile.base}" if profile.base else ""
     where = "carried" if profile.carried else "stays on the ground"
     lines = [
@@ -59,6 +65,20 @@ def _explained(profile: Any) -> str:
         )
     lines.append(f"{'all of them':<16} {1000 * _all_s(profile):>7.2f} ms")
     return "\n".join([*lines, *profile.sources])
+
+
+def _measured(profile: Any) -> str:
+    return "\n".join(
+        [
+            f"{profile.name}: {profile.description}",
+            f"{profile.cores} cores, stays on the ground",
+            f"Every invocation of {', '.join(profile.kernels)} is",
+            f"measured on this host, and its output takes effect {profile.measured_factor:g} times "
+            "as much later.",
+            "result.json has the medians. Such a flight does not repeat: `mavfi fly --realtime`",
+            "only, neither in campaigns nor with `mavfi replay`.",
+        ]
+    )
 
 
 def _plain(profile: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 
 class _Positive(click.FloatRange):
@@ -20,6 +21,7 @@ class _Positive(click.FloatRange):
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 
+_FLYING = ("worlds", "missions", "first_seed", "models", "train", "jobs", "quiet")
 _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
 
 
@@ -41,22 +43,48 @@ _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
 @click.option("--range", "range_", type=_ABOVE_ZERO, metavar="M", help="Sensing range, m.")
 @click.option("--distance", type=_ABOVE_ZERO, default=50.0, show_default=True, metavar="M",
               help="Length of a mission, m.")  # fmt: skip
-@click.option("--overhead", "overheads", multiple=True, metavar="DETECTOR=PERCENT",
-              help="Measured compute overhead of gad or aad, per cent  "
-                   "[the paper's Table V].")  # fmt: skip
+@click.option("--overhead", "overheads", multiple=True, metavar="DETECTOR=PERCENT|PATH",
+              help="Compute overhead of gad or aad: per cent, or measured in the flights of a run "
+                   "folder, a campaign or an evaluation  [--fly: in its own flights; else the "
+                   "paper's Table V].")  # fmt: skip
+@click.option("--fly", "fly", is_flag=True,
+              help="Fly every row in JSBSim with its mass at its safe velocity, and put model and "
+                   "flight side by side.")  # fmt: skip
+@click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
+              help="With --fly: where; may be repeated  [sparse, dense].")  # fmt: skip
+@click.option("--missions", type=click.IntRange(1, 100_000), default=10, show_default=True,
+              help="With --fly: of each scheme in each world.")  # fmt: skip
+@click.option("--first-seed", type=click.IntRange(0, 2**31 - 200_000), default=1,
+              show_default=True, help="With --fly: seeds count up from here.")  # fmt: skip
+@click.option("--models", type=click.Path(path_type=Path, file_okay=False, exists=True),
+              help="With --fly: folder of detectors' models NAME.json  [the shipped].")  # fmt: skip
+@click.option("--train", type=click.IntRange(min=0), default=0, metavar="FLIGHTS",
+              help="With --fly: fit the detectors for each vehicle to so many error-free flights "
+                   "of each training world at its safe velocity first  [0: none].")  # fmt: skip
+@click.option("--jobs", type=click.IntRange(min=1),
+              help="With --fly: missions at the same time  [one a core].")  # fmt: skip
+@click.option("--quiet", is_flag=True, help="With --fly: no progress on stderr.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False),
-              help="Folder for roofline.svg, redundancy.svg, vpm.json, vpm.csv.")  # fmt: skip
+              help="Folder for vpm.json, vpm.csv and pictures; with --fly also for the flights, "
+                   "which are not flown again  [none; --fly: vpm].")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print a row a scheme as CSV.")
 def vpm(
-    vehicles: tuple[str, ...], out: Path | None, as_json: bool, as_csv: bool, **options: Any
+    vehicles: tuple[str, ...],
+    out: Path | None,
+    fly: bool,
+    as_json: bool,
+    as_csv: bool,
+    **options: Any,
 ) -> None:
     """Safe velocity, flight time and energy with none, DMR, TMR, and detection and recovery.
 
     The F-1 visual performance model: a vehicle flies so fast that it stops within what it sees.
     A copy of the computer adds mass and power; detection and recovery adds compute time.
     """
+    from mavfi_cli.cli.overheads import overheads
     from mavfi_cli.core.files import plain
+    from mavfi_cli.vpm.flight_table import flight_rows_csv, flight_table
     from mavfi_cli.vpm.report import report
     from mavfi_cli.vpm.schemes import schemes_with
     from mavfi_cli.vpm.table import scheme_rows_csv, table
@@ -64,16 +92,58 @@ def vpm(
 
     if as_json and as_csv:
         raise click.UsageError("--json or --csv, not both")
+    if not fly:
+        _refuse_unused()
+    if options["models"] is not None and options["train"]:
+        raise click.UsageError("--models or --train, not both")
     chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
-    told = report(chosen, _choices(options), schemes_with(_overheads(options["overheads"])))
+    known = overheads(options["overheads"])
+    schemes = schemes_with(
+        {name: percent for name, (percent, _) in known.items()},
+        {name: source for name, (_, source) in known.items()},
+    )
+    told = report(chosen, _choices(options), schemes)
+    if fly:
+        out = out or Path("vpm")
+        told = _flown(chosen, known, out, options)
     if out is not None:
         _save(told, out)
     if as_json:
         click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(scheme_rows_csv(told), nl=False)
+        click.echo(flight_rows_csv(told["flights"]) if fly else scheme_rows_csv(told), nl=False)
     else:
-        click.echo("\n".join(table(told)))
+        click.echo("\n".join([*table(told), *(flight_table(told["flights"]) if fly else [])]))
+
+
+def _refuse_unused() -> None:
+    """An option that would do nothing is a mistake: exit code 2."""
+    context = click.get_current_context()
+    for option in context.command.params:
+        given = context.get_parameter_source(str(option.name))
+        if option.name in _FLYING and given is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"{option.opts[0]} needs --fly")
+
+
+def _flown(
+    vehicles: list[Any], known: dict[str, tuple[float, str]], out: Path, options: dict[str, Any]
+) -> dict[str, Any]:
+    from mavfi_cli.campaign.run import Options
+    from mavfi_cli.cli.missions_view import missions_view
+    from mavfi_cli.cli.vpm_fly import WORLDS, Ask, fly_and_report
+
+    ask = Ask(
+        vehicles=vehicles,
+        choices=_choices(options),
+        worlds=options["worlds"] or WORLDS,
+        missions=options["missions"],
+        first_seed=options["first_seed"],
+        folder=out,
+        models=options["models"],
+        train=options["train"],
+    )
+    with missions_view(quiet=options["quiet"]) as view:
+        return fly_and_report(ask, known, Options(jobs=options["jobs"] or 0), view)
 
 
 def _choices(options: dict[str, Any]) -> Any:
@@ -92,24 +162,13 @@ def _choices(options: dict[str, Any]) -> Any:
     )
 
 
-def _overheads(texts: tuple[str, ...]) -> dict[str, float]:
-    found = {}
-    for text in texts:
-        name, _, number = text.partition("=")
-        try:
-            found[name.strip()] = float(number)
-        except ValueError:
-            raise click.UsageError(
-                f"--overhead {text}: give a detector and per cent, as aad=0.0062"
-            ) from None
-    return found
-
-
 def _save(told: dict[str, Any], out: Path) -> None:
     from mavfi_cli.core.errors import RecordError
     from mavfi_cli.core.files import write_json, write_text
+    from mavfi_cli.report.flight_plot import write_flight_plot
     from mavfi_cli.report.redundancy_plot import write_redundancy_plot
     from mavfi_cli.report.roofline_plot import write_roofline_plot
+    from mavfi_cli.vpm.flight_table import flight_rows_csv
     from mavfi_cli.vpm.table import scheme_rows_csv
 
     try:
@@ -120,3 +179,6 @@ def _save(told: dict[str, Any], out: Path) -> None:
     write_text(out / "vpm.csv", scheme_rows_csv(told))
     write_roofline_plot(told, out / "roofline.svg")
     write_redundancy_plot(told, out / "redundancy.svg")
+    if "flights" in told:
+        write_text(out / "flights.csv", flight_rows_csv(told["flights"]))
+        write_flight_plot(told, out / "flights.svg")

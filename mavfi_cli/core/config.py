@@ -27,12 +27,21 @@ def load_toml(path: Path, cls: type[T]) -> T:
             line and key.
         UnknownKey: a key that `cls` does not have; names the nearest.
     """
+    data, text = read_toml(path)
+    return structure(data, cls, path=path, text=text)
+
+
+def read_toml(path: Path) -> tuple[dict[str, Any], str]:
+    """What a TOML file says, and its text, from which `structure` tells the line of an error.
+
+    Raises:
+        ConfigError: the file cannot be read or parsed; names file and line.
+    """
     text = _read(path)
     try:
-        data = tomllib.loads(text)
+        return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
         raise syntax_error(error, path) from None
-    return structure(data, cls, path=path, text=text)
 
 
 def shipped_names(folder: Path) -> list[str]:
@@ -55,6 +64,16 @@ def shipped_path(kind: str, name_or_path: str, folder: Path) -> Path:
     if not path.is_file():
         raise ConfigError("no such file", path=path)
     return path
+
+
+def load_shipped(kind: str, name_or_path: str, folder: Path, cls: type[T]) -> T:
+    """A shipped `kind` by name, or a user's own by the path of its TOML file, as `cls`.
+
+    Raises:
+        UnknownName: nothing shipped has this name, and it is not a path to a TOML file.
+        ConfigError: the file cannot be used.
+    """
+    return load_toml(shipped_path(kind, name_or_path, folder), cls)
 
 
 def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:

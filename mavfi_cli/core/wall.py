@@ -8,10 +8,11 @@ from time import perf_counter
 
 
 class WallClock:
-    """Host seconds by name."""
+    """Host seconds by name: all together, and of the newest time."""
 
     def __init__(self) -> None:
         self.totals: dict[str, float] = {}
+        self.newest: dict[str, float] = {}
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
@@ -25,3 +26,4 @@ class WallClock:
     def add(self, name: str, seconds: float) -> None:
         """Add host seconds that were measured elsewhere."""
         self.totals[name] = self.totals.get(name, 0.0) + seconds
+        self.newest[name] = seconds

@@ -37,7 +37,7 @@ from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.executor import Executor
 from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels, tracking_inputs
-from mavfi_cli.mission.platform import LatencyModel, PlatformProfile
+from mavfi_cli.mission.platform import PlatformProfile, latency_model
 from mavfi_cli.mission.protection import NoProtection
 from mavfi_cli.mission.recovery import Recovery, Retry, Setpoint
 from mavfi_cli.mission.response import Reaction
@@ -80,10 +80,11 @@ class Companion:
             briefing.goal_enu_m,
         )
         self._recovery = Recovery(protection, self.pilot, injection.follower, self._exchange)
-        self._latency = LatencyModel(platform, config.seed)
+        self._latency = latency_model(platform, config.seed, wall)
         self.executor = Executor(
             draw_latency_s=self._latency.draw_s,
             cores=platform.cores,
+            compute_first=platform.measured_factor is not None,
             wall=wall,
             restart_s=config.node_restart_s,
             watchdog_s=config.node_watchdog_s,
@@ -110,6 +111,11 @@ class Companion:
         self._fresh_frame_s: float | None = None
         self._takeover_s: float | None = None
         self._ticks = 0
+
+    @property
+    def measured(self) -> dict[str, Any] | None:
+        """Factor and medians of a platform that is measured; None of any other."""
+        return self._latency.summary()
 
     # Messages as they take effect
 
@@ -239,11 +245,11 @@ class Companion:
     ) -> Setpoint | None:
         """Have control compute a command, due when its latency has passed."""
         fresh, attempt = (None, 0) if retry is None else (retry.fresh, retry.attempt)
-        due_s = stamp_s + self._control_delay_s(stamp_s)
         job = ControlInput(
             inputs=tracking_inputs(stamp_s, state, directive), fresh=fresh, yaw_rad=state.yaw_rad
         )
         command: Command | None = self.executor.call("control", job, stamp_s)
+        due_s = stamp_s + self._control_delay_s(stamp_s)
         if command is None:
             return None
         flown = directive.trajectory

@@ -10,9 +10,22 @@ from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.platform import measured_factor
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 Vector3 = tuple[float, float, float]
+LIMITS = {  # smallest and largest of each number
+    "takeoff_height_m": (1.0, 50.0),
+    "v_max_mps": (0.1, 12.0),
+    "a_max_mps2": (0.5, 8.0),
+    "goal_tolerance_m": (0.1, 50.0),
+    "time_limit_s": (1.0, 86400.0),
+    "map_resolution_m": (0.05, 1.0),
+    "map_range_m": (2.0, 25.0),
+    "node_restart_s": (0.0, 3600.0),
+    "node_watchdog_s": (0.1, 3600.0),
+    "camera_rate_hz": (0.1, 50.0),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,19 +75,8 @@ class MissionConfig:
     isolate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        positive = {
-            "takeoff_height_m": (self.takeoff_height_m, 1.0, 50.0),
-            "v_max_mps": (self.v_max_mps, 0.1, 12.0),
-            "a_max_mps2": (self.a_max_mps2, 0.5, 8.0),
-            "goal_tolerance_m": (self.goal_tolerance_m, 0.1, 50.0),
-            "time_limit_s": (self.time_limit_s, 1.0, 86400.0),
-            "map_resolution_m": (self.map_resolution_m, 0.05, 1.0),
-            "map_range_m": (self.map_range_m, 2.0, 25.0),
-            "node_restart_s": (self.node_restart_s, 0.0, 3600.0),
-            "node_watchdog_s": (self.node_watchdog_s, 0.1, 3600.0),
-            "camera_rate_hz": (self.camera_rate_hz, 0.1, 50.0),
-        }
-        for name, (value, low, high) in positive.items():
+        for name, (low, high) in LIMITS.items():
+            value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):
                 raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
         for name, place in (("start", self.start), ("goal", self.goal)):
@@ -82,6 +84,7 @@ class MissionConfig:
                 raise ConfigError("must be three finite numbers", key=name)
         if self.fault is not None and self.instruction is not None:
             raise ConfigError("one mission takes one fault", key="instruction")
+        self._check_platform()
         for node in self.isolate:
             if node not in ISOLATABLE:
                 raise UnknownName("node", node, ISOLATABLE)
@@ -93,6 +96,22 @@ class MissionConfig:
         ):
             if not 4 <= size <= 1024:
                 raise ConfigError(f"must be within 4 and 1024 pixels, got {size}", key=name)
+
+    def _check_platform(self) -> None:
+        if measured_factor(self.platform) is None:
+            return
+        if not self.realtime:
+            raise ConfigError(
+                f"{self.platform} needs --realtime: measured times differ from flight to flight, "
+                "and without it every flight repeats",
+                key="platform",
+            )
+        if self.isolate or self.instruction is not None:
+            raise ConfigError(
+                f"{self.platform} measures the kernels in the companion's own process: without "
+                "--isolate and --level instruction",
+                key="platform",
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the record of the run; how it was computed is not part of it."""

@@ -114,6 +114,7 @@ class Executor:
     Attributes:
         draw_latency_s: latency of the next invocation of a node, by its name.
         cores: how many nodes can work at the same time; the rest wait in the order of asking.
+        compute_first: an invocation's latency is asked for after its real work is done.
         restart_s: from a node's end until its successor is ready, simulated.
         watchdog_s: an invocation that has not ended after so long is killed, simulated.
         losses: of all nodes, in order.
@@ -124,6 +125,7 @@ class Executor:
     draw_latency_s: Callable[[str], float]
     cores: int
     wall: WallClock = field(default_factory=WallClock)
+    compute_first: bool = False
     restart_s: float = 1.0
     watchdog_s: float = 5.0
     now_s: float = 0.0
@@ -234,13 +236,15 @@ class Executor:
             if node not in self._waiting:
                 self._waiting.append(node)
             return
-        latency_s = self.draw_latency_s(node.name)
         job = _Job(node=node, start_s=self.now_s, input=node.pending)
         node.pending = None
         node.busy = True
         node.invocations += 1
-        self.book(node.name, job.start_s, latency_s)
         self.on_start(node.name, job.input, job.start_s)
+        if self.compute_first:
+            job.begin(self.wall)
+        latency_s = self.draw_latency_s(node.name)
+        self.book(node.name, job.start_s, latency_s)
         self._working += 1
         self._uncomputed.append(job)
         self._jobs[node.name] = job

@@ -2,24 +2,33 @@
 
 A file either gives every kernel its latency, or names a shipped platform as its `base` and says
 by how much each kernel is slower: `scale` of the kernel, or that of the whole file.
+
+`measured:FACTOR` is no file: the host's own kernel times, measured invocation by invocation while
+it flies, times the factor. Such a flight cannot repeat.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.wall import WallClock
 
+MEASURED = "measured"
+FACTORS = (0.01, 1000.0)  # smallest and largest of a measured platform
 KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
 _LONGEST_S = 3600.0
-_LARGEST = 1.0e6  # W or kg; more is a slip of the unit
+LARGEST = 1.0e6  # in any unit of hardware; more is a slip of the unit
+HARDWARE = ("mass_kg", "power_w", "heatsink_kgpw")
 _FOLDER = Path(__file__).parent / "platforms"
 
 
@@ -53,12 +62,13 @@ class PlatformProfile:
     heatsink_kgpw: float = 0.0  # mass of the heat sink for each watt of power_w
     sources: list[str] = field(default_factory=list)
     base: str = ""  # the platform whose latencies are scaled, where there is one
+    measured_factor: float | None = None  # the host's own times, times this, are the latencies
 
     def __post_init__(self) -> None:
         if self.cores < 1:
             raise ValueError(f"cores must be at least 1, got {self.cores}")
         _check_kernels(self.kernels)
-        _check_hardware(self)
+        check_hardware(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,13 +136,18 @@ def _check_kernels(kernels: Collection[str]) -> None:
         raise ValueError(f"{', '.join(missing)}: missing, a kernel without a latency")
 
 
-def _check_hardware(profile: PlatformProfile) -> None:
-    for key in ("power_w", "mass_kg", "heatsink_kgpw"):
-        value = getattr(profile, key)
+def check_hardware(board: object) -> None:
+    """Refuse a board whose mass or power is negative, or a slip of the unit.
+
+    Raises:
+        ValueError: names the key and the value.
+    """
+    for key in HARDWARE:
+        value = getattr(board, key)
         if value < 0.0:
             raise ValueError(f"{key}: must not be negative, is {value:g}")
-        if value > _LARGEST:
-            raise ValueError(f"{key}: must be at most {_LARGEST:g}, is {value:g}")
+        if value > LARGEST:
+            raise ValueError(f"{key}: must be at most {LARGEST:g}, is {value:g}")
 
 
 def platform_names() -> list[str]:
@@ -141,14 +156,54 @@ def platform_names() -> list[str]:
 
 
 def load_platform(name_or_path: str) -> PlatformProfile:
-    """A shipped platform by name, or a user's own by the path of its TOML file.
+    """A shipped platform by name, a user's own by the path of its TOML file, or `measured:FACTOR`.
 
     Raises:
         UnknownName: no shipped platform has this name, and it is not a path to a TOML file.
-        ConfigError: the file cannot be used.
+        ConfigError: the file, or the factor, cannot be used.
     """
+    factor = measured_factor(name_or_path)
+    if factor is not None:
+        return _measured(factor)
+    if not name_or_path.endswith(".toml") and name_or_path not in platform_names():
+        raise UnknownName("platform", name_or_path, [*platform_names(), f"{MEASURED}:FACTOR"])
     path = shipped_path("platform", name_or_path, _FOLDER)
     return _resolved(load_toml(path, _PlatformFile), path)
+
+
+def measured_factor(name: str) -> float | None:
+    """The factor of a platform `measured:FACTOR`; None of any other.
+
+    Raises:
+        ConfigError: it is not a number, or out of its range.
+    """
+    kind, colon, text = name.partition(":")
+    if kind != MEASURED or not colon:
+        return None
+    low, high = FACTORS
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = math.nan
+    if not low <= factor <= high:
+        raise ConfigError(
+            f"the factor of {MEASURED}:FACTOR must be a number within {low:g} and {high:g}, "
+            f"got {text!r}",
+            key="platform",
+        )
+    return factor
+
+
+def _measured(factor: float) -> PlatformProfile:
+    told = f"this host's own times while it flies, x {factor:g}"
+    return PlatformProfile(
+        name=f"{MEASURED}:{factor:g}",
+        cores=len(os.sched_getaffinity(0)),
+        kernels=dict.fromkeys(KERNELS, KernelLatency(latency_s=0.0, source=told)),
+        description=f"{told}; needs --realtime, and does not repeat",
+        carried=False,
+        measured_factor=factor,
+    )
 
 
 def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
@@ -159,7 +214,8 @@ def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
             error = UnknownName("platform", file.base, set(platform_names()) - {path.stem})
             raise ConfigError(str(error), path=path, key="base")
         base = load_platform(file.base).kernels
-    shared = {key.name: getattr(file, key.name) for key in fields(PlatformProfile)}
+    named = {each.name for each in fields(_PlatformFile)}
+    shared = {e.name: getattr(file, e.name) for e in fields(PlatformProfile) if e.name in named}
     try:
         return PlatformProfile(**{**shared, "kernels": _kernels(file, base, path)})
     except ValueError as error:
@@ -219,3 +275,49 @@ class LatencyModel:
         return latency.latency_s * math.exp(
             latency.spread * float(self._streams[kernel].standard_normal())
         )
+
+    def summary(self) -> dict[str, Any] | None:
+        """Nothing was measured."""
+        return None
+
+
+class MeasuredLatency(LatencyModel):
+    """The host's own time of the newest invocation of a kernel, times the profile's factor."""
+
+    def __init__(self, profile: PlatformProfile, wall: WallClock) -> None:
+        assert profile.measured_factor is not None
+        self._name, self._factor, self._wall = profile.name, profile.measured_factor, wall
+        self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
+
+    def draw_s(self, kernel: str) -> float:
+        """Latency of the invocation of `kernel` that the host has just done, s."""
+        host_s = self._wall.newest.get(kernel, 0.0)
+        self._host_s[kernel].append(host_s)
+        return self._factor * host_s
+
+    def summary(self) -> dict[str, Any]:
+        """Platform, factor, and of each kernel the median on the host and in the flight, s."""
+        medians = {kernel: float(np.median(s)) for kernel, s in self._host_s.items() if s}
+        return {
+            "platform": self._name,
+            "factor": self._factor,
+            "kernels": {
+                kernel: {
+                    "host_median_s": median_s,
+                    "latency_median_s": self._factor * median_s,
+                    "invocations": len(self._host_s[kernel]),
+                }
+                for kernel, median_s in medians.items()
+            },
+        }
+
+
+def latency_model(profile: PlatformProfile, root_seed: int, wall: WallClock) -> LatencyModel:
+    """Where a platform's latencies come from.
+
+    Args:
+        wall: has measured the invocation that a latency is asked for, where it is measured.
+    """
+    if profile.measured_factor is not None:
+        return MeasuredLatency(profile, wall)
+    return LatencyModel(profile, root_seed)

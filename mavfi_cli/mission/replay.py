@@ -12,6 +12,7 @@ import numpy as np
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.platform import measured_factor
 from mavfi_cli.mission.run_folder import Run
 
 HOST_SECTION = "host"
@@ -34,11 +35,13 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
     against.
 
     Raises:
-        RecordError: it flew a foreign autopilot, which nothing here can repeat.
+        RecordError: it flew a foreign autopilot, or on measured times: nothing can repeat that.
     """
     values = dict(run.result["config"])
     if values.get("link") is not None:
         raise RecordError(f"{run.folder.path}: a flight of a foreign autopilot does not repeat")
+    if measured_factor(values.get("platform", "")) is not None:
+        raise RecordError(f"{run.folder.path}: a flight on measured kernel times does not repeat")
     if not with_fault:
         values["fault"] = values["instruction"] = values["detector"] = None
     return structure(values, MissionConfig, path=run.folder.result)

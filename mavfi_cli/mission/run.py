@@ -260,6 +260,7 @@ def _write(
         "simulated_s": flight.end_s,
         "quality_of_flight": qof.to_dict(),
         **mission_statistics(companion, flight.images),
+        "measured_platform": companion.measured if companion else None,
         "response_time_s": response_times(companion.reactions if companion else []),
         "events": flight.log.to_list(),
         "plans": plan_lines(companion),

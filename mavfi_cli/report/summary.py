@@ -61,6 +61,7 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
             f"Response    {response['median'] * 1e3:.0f} ms from depth frame to setpoint "
             f"(median), {response['p95'] * 1e3:.0f} ms (95th percentile)"
         )
+    lines += measured_lines(result)
     if host.get("flight_wall_s"):
         factor = result["simulated_s"] / host["flight_wall_s"]
         lines.append(
@@ -68,6 +69,17 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
             f"seconds: {factor:.0f} times real time, after {host['startup_s']:.1f} s of start-up"
         )
     return lines
+
+
+def measured_lines(result: dict[str, Any]) -> list[str]:
+    """The medians of a platform whose kernels were measured on the host."""
+    measured = result.get("measured_platform")
+    if not measured:
+        return []
+    told = ", ".join(
+        f"{name} {1e3 * each['host_median_s']:.2f} ms" for name, each in measured["kernels"].items()
+    )
+    return [f"Measured    {told} (medians on this host), x {measured['factor']:g} in the flight"]
 
 
 def node_lines(result: dict[str, Any]) -> list[str]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
-from mavfi_cli.mission.platform import PlatformProfile
+from mavfi_cli.core.config import load_shipped, shipped_names
+from mavfi_cli.mission.platform import HARDWARE, PlatformProfile, check_hardware
 
-LARGEST = 1.0e6  # of any number here; more is a slip of the unit
 _FOLDER = Path(__file__).parent / "boards"
 
 
@@ -24,12 +23,7 @@ class Board:
     sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
 
     def __post_init__(self) -> None:
-        for key in ("mass_kg", "power_w", "heatsink_kgpw"):
-            value = getattr(self, key)
-            if value < 0.0:
-                raise ValueError(f"{key}: must not be negative, is {value:g}")
-            if value > LARGEST:
-                raise ValueError(f"{key}: must be at most {LARGEST:g}, is {value:g}")
+        check_hardware(self)
 
     @property
     def total_kg(self) -> float:
@@ -42,12 +36,11 @@ class Board:
         told = f"platform {platform.name}"
         if not platform.carried:
             told = f"{told} stays on the ground"
-        keys = ("mass_kg", "power_w", "heatsink_kgpw")
         return cls(
             name=platform.name,
             description=platform.description,
-            sources=dict.fromkeys(keys, told),
-            **{key: getattr(platform, key) if platform.carried else 0.0 for key in keys},
+            sources=dict.fromkeys(HARDWARE, told),
+            **{key: getattr(platform, key) if platform.carried else 0.0 for key in HARDWARE},
         )
 
 
@@ -63,4 +56,4 @@ def load_board(name_or_path: str) -> Board:
         UnknownName: no shipped board has this name, and it is not a path to a TOML file.
         ConfigError: the file cannot be used.
     """
-    return load_toml(shipped_path("board", name_or_path, _FOLDER), Board)
+    return load_shipped("board", name_or_path, _FOLDER, Board)

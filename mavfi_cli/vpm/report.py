@@ -75,6 +75,16 @@ def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dic
     }
 
 
+def setting_of(vehicle: Vehicle, choices: Choices) -> Setting:
+    """What the model works with for a vehicle, its free number calibrated.
+
+    Raises:
+        ConfigError: the vehicle lacks what the choices do not give either.
+    """
+    found = calibrated(vehicle) if vehicle.calibration else None
+    return _setting(vehicle, choices, found)[0]
+
+
 def _setting(
     vehicle: Vehicle, choices: Choices, found: Calibrated | None
 ) -> tuple[Setting, list[dict[str, Any]]]:
@@ -93,6 +103,11 @@ def _setting(
         compute_s, given = choices.response_s, _COMMAND
     elif choices.platform is not None:
         kernels = choices.platform.kernels
+        if choices.platform.measured_factor is not None:
+            raise ConfigError(
+                f"{choices.platform.name} has latencies only while it flies: mavfi fly --realtime",
+                key="platform",
+            )
         combined, how = CHAINS[choices.chain]
         compute_s = combined([each.latency_s for each in kernels.values()])
         if compute_s == 0.0:

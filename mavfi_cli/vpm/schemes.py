@@ -31,25 +31,35 @@ SCHEMES = (
     Scheme(name="aad", title="detection (autoencoder)", overhead=0.000062, source=_TABLE_V),
 )
 
+DETECTORS = tuple(scheme.name for scheme in SCHEMES if scheme.overhead > 0.0)
 
-def schemes_with(overheads_percent: Mapping[str, float]) -> tuple[Scheme, ...]:
+
+def schemes_with(
+    overheads_percent: Mapping[str, float], sources: Mapping[str, str] | None = None
+) -> tuple[Scheme, ...]:
     """The schemes, with measured overheads in place of the paper's.
 
     Args:
         overheads_percent: of a detector's name to its overhead, per cent of the compute time.
+        sources: of a detector's name to where its overhead comes from, where that is not the
+            command line.
 
     Raises:
         UnknownName: a scheme that does not detect and recover.
         ConfigError: an overhead that is negative or not finite.
     """
-    known = [scheme.name for scheme in SCHEMES if scheme.overhead > 0.0]
     for name, percent in overheads_percent.items():
-        if name not in known:
-            raise UnknownName("detector", name, known)
+        if name not in DETECTORS:
+            raise UnknownName("detector", name, DETECTORS)
         if not 0.0 <= percent < math.inf:
             raise ConfigError(f"must be zero or more, is {percent:g} %", key=f"overhead of {name}")
+    told = sources or {}
     return tuple(
-        replace(scheme, overhead=overheads_percent[scheme.name] / 100.0, source="--overhead")
+        replace(
+            scheme,
+            overhead=overheads_percent[scheme.name] / 100.0,
+            source=told.get(scheme.name, "--overhead"),
+        )
         if scheme.name in overheads_percent
         else scheme
         for scheme in SCHEMES

@@ -25,9 +25,14 @@ def table(told: Mapping[str, Any]) -> list[str]:
 
 def scheme_rows_csv(told: Mapping[str, Any]) -> str:
     """CSV text: a row a vehicle and scheme; the header names the units."""
-    rows = schemes_of(dict(told))
+    return csv_of(schemes_of(dict(told)))
+
+
+def csv_of(rows: Sequence[Mapping[str, Any]]) -> str:
+    """CSV text of flat rows; the header has the keys of all of them, in order."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(text, keys, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
@@ -37,7 +42,7 @@ def _vehicle(one: Mapping[str, Any]) -> Iterator[str]:
     title = f": {one['description']}" if one["description"] else ""
     yield f"== {one['vehicle']}{title}; board {one['board']} =="
     flying = [row for row in one["schemes"] if row["problem"] is None]
-    yield from _columns(
+    yield from columns(
         ["scheme", "boards", "overhead", "compute", "mass", "thrust/weight", "acceleration",
          "roof", "knee", "throughput", "velocity", "bound by"],
         [[row["scheme"], f"{row['boards']}", f"{row['overhead_percent']:.4g} %",
@@ -48,7 +53,7 @@ def _vehicle(one: Mapping[str, Any]) -> Iterator[str]:
          for row in flying],
     )  # fmt: skip
     yield ""
-    yield from _columns(
+    yield from columns(
         ["scheme", "velocity ratio", "time ratio", "energy ratio", "missions ratio",
          "flight time", "power", "energy", "missions a charge"],
         [[row["scheme"], *(f"x {row[f'{name}_ratio']:.4f}"
@@ -85,7 +90,7 @@ def _sensitivity(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             f"  {row['parameter']} {row['value']:.4g} {row['unit']}; 1 % more: velocity {told[0]}, "
             f"TMR's time ratio {told[1]}"
         )
-        yield from _columns([], [_point(point, row["unit"]) for point in row["points"]])
+        yield from columns([], [_point(point, row["unit"]) for point in row["points"]])
 
 
 def _point(point: Mapping[str, Any], unit: str) -> list[str]:
@@ -112,7 +117,7 @@ def _calibrations(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 def _sources(one: Mapping[str, Any]) -> Iterator[str]:
     yield ""
-    yield from _columns(
+    yield from columns(
         ["number", "value", "source"],
         [
             [row["parameter"], f"{row['value']:.5g} {row['unit']}", row["source"]]
@@ -125,7 +130,7 @@ def _sources(one: Mapping[str, Any]) -> Iterator[str]:
     )
 
 
-def _columns(head: list[str], rows: list[list[str]]) -> Iterator[str]:
+def columns(head: list[str], rows: list[list[str]]) -> Iterator[str]:
     """Left-aligned columns, two blanks between them."""
     lines = [head, *rows] if head else rows
     widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]

@@ -6,10 +6,11 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
-from mavfi_cli.vpm.board import LARGEST
+from mavfi_cli.core.config import load_shipped, shipped_names
+from mavfi_cli.mission.platform import LARGEST
 
 CALIBRATED = ("rotor_pull_n", "response_s")  # what a calibration may set
+SMALL_KG = 0.67  # geometric mean of the simulated vehicles, 0.3 kg and 1.5 kg
 _FOLDER = Path(__file__).parent / "vehicles"
 
 
@@ -43,6 +44,7 @@ class Vehicle:
     battery_wh: float
     tilt_deg: float = 0.0
     board: str = ""  # a shipped board, where no platform is named
+    flies_as: str = ""  # the simulated vehicle that stands in for it; empty: one of its size
     description: str = ""
     sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
     calibration: Calibration | None = None
@@ -68,6 +70,13 @@ class Vehicle:
             raise ValueError("response_s: is missing, the calibration needs it")
 
     @property
+    def stand_in(self) -> str:
+        """The simulated vehicle on which flights of this one are based."""
+        if self.flies_as:
+            return self.flies_as
+        return "spark" if self.mass_kg < SMALL_KG else "solo"
+
+    @property
     def tilt_rad(self) -> float:
         """Angle between the thrust and the vertical, rad."""
         return math.radians(self.tilt_deg)
@@ -85,4 +94,4 @@ def load_vehicle(name_or_path: str) -> Vehicle:
         UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
         ConfigError: the file cannot be used.
     """
-    return load_toml(shipped_path("vehicle", name_or_path, _FOLDER), Vehicle)
+    return load_shipped("vehicle", name_or_path, _FOLDER, Vehicle)

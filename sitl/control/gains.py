@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sitl.control import layout
 from sitl.control.attitude import THRUST_RESERVE
 from sitl.vehicle.model import INFLOW_SLOPE
-from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
+from sitl.vehicle.profile import GRAVITY_MPS2, LEVEL_SHARE, VehicleProfile
 
 RATE_DAMPING = 0.75
 RATE_BANDWIDTH_PER_LAG = 1.6  # natural frequency of the tilt-rate loop x motor time constant
@@ -67,7 +67,7 @@ def _outer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
     gains[layout.G_VELOCITY_P : layout.G_VELOCITY_P + 3] = (2.2, 2.2, 4.0)
     gains[layout.G_VELOCITY_I : layout.G_VELOCITY_I + 3] = (0.8, 0.8, 2.0)
     gains[layout.G_INTEGRAL_LIMIT : layout.G_INTEGRAL_LIMIT + 3] = (4.0, 4.0, 5.0)
-    gains[layout.G_ACCELERATION_LIMIT] = 0.9 * GRAVITY_MPS2 * tangent
+    gains[layout.G_ACCELERATION_LIMIT] = LEVEL_SHARE * GRAVITY_MPS2 * tangent
     spare_mps2 = THRUST_RESERVE * profile.max_thrust_n / profile.total_mass_kg - GRAVITY_MPS2
     gains[layout.G_ACCELERATION_LIMIT + 1] = min(
         limits.vertical_acceleration_mps2, CLIMB_SHARE * spare_mps2

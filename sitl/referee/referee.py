@@ -50,6 +50,7 @@ class Referee:
         world: the world that is flown in.
         body_box_m: length, width and height of the vehicle's body box, centred on its position.
         vehicle: the vehicle's name, for the report.
+        physics: its mass and thrust, for the report.
         limits: what is still a landing.
     """
 
@@ -59,10 +60,12 @@ class Referee:
         body_box_m: Sequence[float],
         *,
         vehicle: str = "",
+        physics: Mapping[str, float] | None = None,
         limits: LandingLimits = _DEFAULT_LIMITS,
     ) -> None:
         self.world = world
         self.vehicle = vehicle
+        self.physics = dict(physics or {})
         self.collision: Collision | None = None
         self.distance_m = 0.0
         self.min_clearance_m = math.inf
@@ -206,6 +209,7 @@ class Referee:
             "distance_m": self.distance_m,
             "energies_j": dict(energies_j or {}),
             "vehicle": self.vehicle,
+            "physics": self.physics,
             "world": {
                 "name": world.name,
                 "seed": world.seed,

@@ -72,7 +72,9 @@ class Simulation:
             rate_hz=camera_rate_hz,
             system=system_id,
         )
-        self.referee = Referee(world, profile.body_box_m, vehicle=profile.name)
+        self.referee = Referee(
+            world, profile.body_box_m, vehicle=profile.name, physics=profile.physics
+        )
         self.wall = WallClock()
         self.stamp_us = 0
         self._wreck: Wreck | None = None

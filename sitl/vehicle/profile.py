@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.config import load_toml
+from mavfi_cli.core.config import load_toml, read_toml, structure
 from mavfi_cli.core.errors import ConfigError, UnknownName
 
 AIR_DENSITY_KGPM3 = 1.225  # ISA sea level, which is where the physics world lies
 GRAVITY_MPS2 = 9.80665
-MIN_THRUST_TO_WEIGHT = 1.2  # below it there is nothing left to steer and climb with
+MIN_THRUST_TO_WEIGHT = 1.15  # below it there is nothing left to steer and climb with
 
 LARGEST_TILT_DEG = 60.0
+LEVEL_SHARE = 0.9  # of the acceleration that the tilt limit allows, which the controller asks for
 
 Triple = tuple[float, float, float]
 
@@ -65,6 +66,13 @@ class Rotor:
     def torque_constant_nmpa(self) -> float:
         """Motor torque per ampere, N m/A: 60 / (2 pi Kv)."""
         return 60.0 / (2.0 * math.pi * self.motor_kv_rpmpv)
+
+    def hover_power_w(self, mass_kg: float) -> float:
+        """Shaft power of all four rotors when a mass hovers, W: static C_P at the speed of C_T."""
+        thrust_n = mass_kg * GRAVITY_MPS2 / 4.0
+        speed_hz = math.sqrt(thrust_n / self.max_thrust_n) * self.max_rpm / 60.0
+        power = self.power_coefficient * AIR_DENSITY_KGPM3 * speed_hz**3 * self.diameter_m**5
+        return 4.0 * power
 
     @property
     def full_throttle_voltage_v(self) -> float:
@@ -212,6 +220,15 @@ class VehicleProfile:
         return 4.0 * self.rotor.max_thrust_n
 
     @property
+    def physics(self) -> dict[str, float]:
+        """What a flight's record says of the vehicle: take-off mass, static thrust, hover power."""
+        return {
+            "mass_kg": self.total_mass_kg,
+            "rotor_pull_n": self.max_thrust_n,
+            "hover_shaft_w": self.rotor.hover_power_w(self.total_mass_kg),
+        }
+
+    @property
     def gear_stiffness_npm(self) -> float:
         """Spring rate of one leg, N/m."""
         return self.total_mass_kg / 4.0 * self.gear.natural_frequency_radps**2
@@ -252,6 +269,8 @@ def profile_names() -> list[str]:
 def load_profile(name_or_path: str) -> VehicleProfile:
     """A shipped profile by name, or any profile by the path of its TOML file.
 
+    A file with a `base` scales a shipped profile, see `sitl.vehicle.stand_in`.
+
     Raises:
         UnknownName: neither a shipped profile nor a TOML path.
         ConfigError: the file cannot be read, or describes no vehicle that can fly.
@@ -259,5 +278,21 @@ def load_profile(name_or_path: str) -> VehicleProfile:
     if name_or_path in profile_names():
         return load_toml(_PROFILES / f"{name_or_path}.toml", VehicleProfile)
     if name_or_path.endswith(".toml") or "/" in name_or_path:
-        return load_toml(Path(name_or_path), VehicleProfile)
+        return _load_file(Path(name_or_path))
     raise UnknownName("vehicle", name_or_path, profile_names())
+
+
+def _load_file(path: Path) -> VehicleProfile:
+    from sitl.vehicle.stand_in import StandIn
+
+    data, text = read_toml(path)
+    if "base" not in data:
+        return structure(data, VehicleProfile, path=path, text=text)
+    stand_in = structure(data, StandIn, path=path, text=text)
+    if stand_in.base not in profile_names():
+        error = UnknownName("vehicle", stand_in.base, profile_names())
+        raise ConfigError(str(error), path=path, key="base")
+    try:
+        return stand_in.profile(load_profile(stand_in.base))
+    except (ConfigError, ValueError) as problem:
+        raise ConfigError(str(problem), path=path) from None

@@ -109,6 +109,34 @@ def test_bad_input_is_one_line(command_line, tmp_path, arguments, said):
     assert line.startswith(f"error: {said}")
 
 
+KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[kernels.control]\nlatency_s = 0.1\n", "", "error: p.toml: kernels.control: missing, a"),
+        ("[kernels.planner]\nlatency_s = 0.1", "[kernels.planner]\nlatency_s = -0.1",
+         "error: p.toml:11: kernels.planner: latency_s must not be negative, got -0.1"),
+        ("power_w = 5.0", "power_w = -5.0", "error: p.toml: power_w: must not be negative, is -5"),
+        ("mass_kg = 0.1", "mass_kg = 9.0",
+         "error: vehicle 'spark' cannot lift its compute: 8.33 N of rotor pull lift less than "
+         "0.850 kg, 0.300 kg + 9.000 kg of compute are 9.300 kg"),
+    ],
+)  # fmt: skip
+def test_a_bad_profile_is_one_line(command_line, tmp_path, old, new, said):
+    kernels = "".join(f"[kernels.{kernel}]\nlatency_s = 0.1\n" for kernel in KERNELS)
+    text = f'name = "p"\ncores = 1\npower_w = 5.0\nmass_kg = 0.1\n{kernels}'
+    (tmp_path / "p.toml").write_text(text)
+    assert command_line("vpm", "--vehicle", "spark", "--platform", "p.toml")[0] == 0
+    assert old in text
+    (tmp_path / "p.toml").write_text(text.replace(old, new))
+    code, out, err = command_line("vpm", "--vehicle", "spark", "--platform", "p.toml")
+    assert (code, out) == (1, "")
+    (line,) = err.splitlines()
+    assert line.startswith(said)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [("--overhead", "aad"), ("--range", "0"), ("--response=-1",), ("--json", "--csv"),
@@ -133,4 +161,6 @@ def test_platforms(command_line, tmp_path):
     (tmp_path / "mine.toml").write_text('name = "mine"\nbase = "tx2"\ncores = 6\nscale = 0.5\n')
     code, out, _ = command_line("platforms", "mine.toml")
     assert re.search(r"octomap +673\.37 ms", out)
+    assert "measured:FACTOR" in command_line("platforms")[1]
+    assert "2.5 times" in command_line("platforms", "measured:2.5")[1]
     assert command_line("platforms", "tx1")[2].startswith("error: unknown platform 'tx1': did you")

@@ -1,0 +1,97 @@
+"""The overhead of detection and recovery, from records of flights."""
+
+import json
+
+import pytest
+from click import UsageError
+
+from mavfi_cli.cli.overheads import measured, overheads
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.vpm.overhead import overheads_of
+
+
+def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None):
+    listed = [{"stage": stage, "response": response} for stage, response in alarms]
+    counts = {"recompute": 0, "hold": 0, "accept": 0}
+    for _, response in alarms:
+        counts[response] += 1
+    return {
+        "detection": detector
+        and {"detector": detector, "alarms": listed, "responses": counts | (counted or {})},
+        "fault": fault,
+        "kernels": {
+            "point_cloud": {"invocations": 100, "busy_s": 1.0},
+            "octomap": {"invocations": 20, "busy_s": 6.0},
+            "collision_check": {"invocations": 10, "busy_s": 0.5},
+            "planner": {"invocations": 5, "busy_s": 1.0},
+            "control": {"invocations": 1000, "busy_s": 0.5},
+        },
+        "host": {"stage_wall_s": {"gate": gate_s, "octomap": 0.15, "planner": 0.05, "link": 9.0}},
+    }
+
+
+def test_checks_alone():
+    found = overheads_of([flight()])["gad"]
+    assert found.share == pytest.approx(0.02 / 9.0)
+    assert found.checks_share == pytest.approx(found.share)
+    assert found.checks_host_share == pytest.approx(0.02 / 0.2)
+    assert (found.flights, found.alarms) == (1, 0)
+
+
+def test_recomputation_costs_a_run_of_the_stage():
+    """0.01 + 0.3 + 0.05 s for perception, 0.2 s for planning, 0.5 ms for control."""
+    alarms = [("perception", "recompute"), ("planning", "hold"), ("control", "recompute"),
+              ("control", "accept")]  # fmt: skip
+    found = overheads_of([flight(alarms=alarms)])["gad"]
+    again_s = 0.36 + 0.2 + 0.0005
+    assert found.recompute_s == pytest.approx(again_s)
+    assert found.share == pytest.approx((0.02 + again_s) / (9.0 - again_s))
+    assert found.alarms == 3
+    assert "3 recomputations" in found.told("somewhere")
+
+
+def test_alarms_beyond_the_listed_ones_are_counted():
+    alarms = [("planning", "recompute")] * 3 + [("control", "recompute")]
+    found = overheads_of([flight(alarms=alarms, counted={"recompute": 8})])["gad"]
+    assert found.recompute_s == pytest.approx(6 * 0.2 + 2 * 0.0005)
+    assert found.alarms == 8
+
+
+def test_flights_are_taken_together_and_faulty_ones_left_out():
+    found = overheads_of(
+        [flight(), flight(gate_s=0.04), flight("aad"), flight(None), flight(fault={"state": "x"}),
+         {"outcome": "crash"}]
+    )  # fmt: skip
+    assert set(found) == {"gad", "aad"}
+    assert found["gad"].flights == 2
+    assert found["gad"].share == pytest.approx(0.06 / 18.0)
+    assert found["gad"].told("here").startswith("measured in 2 flights of here: checks 0.3333 %")
+    assert found["aad"].told("here").startswith("measured in 1 flight of here: ")
+
+
+@pytest.fixture(scope="module")
+def guarded(fly_short):
+    from mavfi_cli.mission.detector_config import DetectorConfig
+
+    return fly_short(detector=DetectorConfig(name="gad"))
+
+
+def test_a_real_record_has_what_it_takes(guarded):
+    result = json.loads(guarded.result.read_text())
+    found = overheads_of([result])["gad"]
+    assert found.detection_s == result["host"]["stage_wall_s"]["gate"] > 0.0
+    assert found.compute_s == pytest.approx(sum(k["busy_s"] for k in result["kernels"].values()))
+    assert 0.0 < found.share < 0.5
+
+
+def test_the_command_takes_a_run_folder(guarded, tmp_path):
+    (percent, told) = measured(str(guarded.path))["gad"]
+    assert measured(str(guarded.path.parent))["gad"][0] > 0.0  # the folder of runs
+    assert measured(str(guarded.result))["gad"] == (percent, told.replace(
+        str(guarded.path), str(guarded.result)))  # fmt: skip
+    assert told.startswith(f"measured in 1 flight of {guarded.path}: checks ")
+    assert overheads((str(guarded.path), "aad=0.5"))["aad"] == (0.5, "--overhead")
+    with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
+        measured(str(tmp_path))
+    with pytest.raises(UsageError, match=r"no such file or folder; for per cent write aad=0\.0062"):
+        overheads((str(tmp_path / "nowhere"),))
