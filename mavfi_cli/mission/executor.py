@@ -194,7 +194,7 @@ class Executor:
         return self._nodes
 
     def book(self, name: str, start_s: float, latency_s: float) -> None:
-        """Put work outside the queue, as of `call`, into the time table."""
+        """Put an invocation into the time table; also one outside the queue, as of `call`."""
         self._nodes[name].busy_s += latency_s
         end_s = start_s + latency_s
         self.timetable.append(Invocation(node=name, start_s=start_s, end_s=end_s))
