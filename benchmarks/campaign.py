@@ -3,7 +3,8 @@
     python benchmarks/campaign.py [--missions 100] [--jobs 2 ...] [--world sparse]
 
 Flies half of the missions golden and half with a source-level fault, then as many pairs with an
-instruction-level fault; each with every number of jobs.
+instruction-level fault; each with every number of jobs, and in each of the ways in which a
+simulated vehicle can start: as a program, as a fork of a warm one.
 """
 
 from __future__ import annotations
@@ -60,18 +61,21 @@ def instruction_missions(world: str, count: int) -> list[PlannedMission]:
     ]  # fmt: skip
 
 
-def row(name: str, missions: Sequence[PlannedMission], jobs: int) -> str:
+WAYS = {"programs": {"fork": False}, "forks": {"fork": True}}
+
+
+def row(name: str, missions: Sequence[PlannedMission], jobs: int, way: str) -> str:
     """Fly them, and tell one line of the table."""
     last = _Last()
     with tempfile.TemporaryDirectory() as folder:
-        options = Options(jobs=jobs, keep=Keep.NONE)
+        options = Options(jobs=jobs, keep=Keep.NONE, **WAYS[way])
         with run_campaign(missions, Path(folder) / "campaign", options, last) as ledger:
             errors = sum(result.outcome is None for result in ledger.results())
     seen = last.progress
     outside = 1.0 - seen.inside_s / (jobs * seen.elapsed_s)
     return (
-        f"| {name} | {jobs} | {len(missions)} | {seen.rate_per_h:.0f} | {REQUIRED[name]:.0f} | "
-        f"{100 * outside:.1f} % | {100 * OUTSIDE_LIMIT:.0f} % | {errors} |"
+        f"| {name} | {way} | {jobs} | {len(missions)} | {seen.rate_per_h:.0f} | "
+        f"{REQUIRED[name]:.0f} | {100 * outside:.1f} % | {100 * OUTSIDE_LIMIT:.0f} % | {errors} |"
     )
 
 
@@ -83,15 +87,17 @@ def main() -> None:
     parser.add_argument("--world", default="sparse")
     given = parser.parse_args()
     print(
-        "| missions | jobs | flown | an hour | required (2 cores) | outside missions | at most "
-        "| could not begin |\n|---|---|---|---|---|---|---|---|"
+        "| missions | vehicles | jobs | flown | an hour | required (2 cores) | outside missions "
+        "| at most | could not begin |\n|---|---|---|---|---|---|---|---|---|"
     )
-    for jobs in given.jobs:
-        source = source_missions(given.world, given.missions)
-        print(row("golden and source level", source, jobs), flush=True)
-    for jobs in given.jobs:
-        native = instruction_missions(given.world, given.missions)
-        print(row("instruction level", native, jobs), flush=True)
+    lists = {
+        "golden and source level": source_missions(given.world, given.missions),
+        "instruction level": instruction_missions(given.world, given.missions),
+    }
+    for name, missions in lists.items():
+        for jobs in given.jobs:
+            for way in WAYS:
+                print(row(name, missions, jobs, way), flush=True)
 
 
 if __name__ == "__main__":

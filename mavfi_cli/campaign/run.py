@@ -44,6 +44,7 @@ class Options:
         task: module that does the work.
         errors: fly those again that could not begin.
         cluster: address of a scheduler of dask.distributed, instead of slots on this machine.
+        fork: simulated vehicles are forks of a warm template; otherwise programs.
     """
 
     jobs: int = 0  # as many as there are cores
@@ -52,6 +53,7 @@ class Options:
     task: str = TASK
     errors: bool = False
     cluster: str | None = None
+    fork: bool = True
 
 
 def run_campaign(
@@ -221,7 +223,8 @@ class _Run:
     def _seats(self) -> Seats:
         options = self._options
         if options.cluster is None:
-            return Slots(options.jobs or len(os.sched_getaffinity(0)), options.task)
+            jobs = options.jobs or len(os.sched_getaffinity(0))
+            return Slots(jobs, options.task, fork=options.fork)
         from mavfi_cli.campaign.cluster import Cluster
 
         return Cluster(options.cluster, options.keep, options.task)

@@ -1,9 +1,11 @@
 """A slot: a process that keeps one mission at a time, in a fresh fork of itself.
 
 It is the reaper of everything that the mission starts, so whatever becomes of the mission, nothing
-of it is left when the slot reports. Orders and reports are JSON, one a packet.
+of it is left when the slot reports. What stays from mission to mission is the template that their
+simulated vehicles are forks of; one that does not answer is ended and made anew. Orders and
+reports are JSON, one a packet.
 
-    runner -> slot   {"number", "changes", "out", "limit_s"}
+    runner -> slot   {"number", "changes", "out", "limit_s", "fork"}
     slot -> runner   {"number", "pid"} when it begins
                      {"number", "exit" | "signal" | "timeout", "report", "wall_s"} when it is over
     the runner's end closes: the mission is killed, and the slot ends
@@ -27,7 +29,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.campaign.processes import (
+from mavfi_cli.core.errors import MavfiError, VehicleProcessError
+from mavfi_cli.core.processes import (
     MISSION,
     SLOT,
     become_reaper,
@@ -35,11 +38,12 @@ from mavfi_cli.campaign.processes import (
     die_with,
     end_children,
 )
-from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.mission.vehicle_template import VehicleTemplate
 
 PACKET = 1 << 17  # bytes, of an order or a report
 _REPORT = 1 << 15  # bytes of what a mission says itself
 ERRORS, SCRATCH = "stderr.txt", "tmp"
+SETTLE_S = 60.0  # the template answers at once, but may have to get warm first
 
 
 class Task(Protocol):
@@ -48,41 +52,75 @@ class Task(Protocol):
     def prepare(self) -> None:
         """Load everything, once."""
 
-    def perform(self, changes: Mapping[str, Any], out: Path) -> Path:
+    def equip(self) -> VehicleTemplate | None:
+        """What forks the vehicles of the missions of a slot; None where they have none."""
+
+    def perform(
+        self, changes: Mapping[str, Any], out: Path, vehicles: VehicleTemplate | None
+    ) -> Path:
         """Do it; the folder that it left."""
+
+
+class Equipment:
+    """A slot's template of vehicles, started when a mission first needs it."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._vehicles: VehicleTemplate | None = None
+
+    def vehicles(self) -> VehicleTemplate | None:
+        """The template; None where the task has none, or it cannot be started."""
+        if self._vehicles is None:
+            with contextlib.suppress(VehicleProcessError):  # the mission starts its own, or says so
+                self._vehicles = self._task.equip()
+        return self._vehicles
+
+    def settle(self) -> None:
+        """After a mission: end and reap everything but the template, which has to answer."""
+        if self._vehicles is not None:
+            end_children(spare=self._vehicles.pid)
+            if self._vehicles.settle(SETTLE_S):
+                return
+            self._vehicles.close()
+            self._vehicles = None
+        end_children()
 
 
 def serve(channel: socket.socket, task: Task) -> NoReturn:
     """The slot's whole life."""
     call_this_process(SLOT)
     become_reaper()
+    equipment = Equipment(task)
     while True:
         try:
             packet = channel.recv(PACKET)
             if not packet:
                 os._exit(0)
-            channel.send(_keep(json.loads(packet), channel, task))
+            channel.send(_keep(json.loads(packet), channel, task, equipment))
         except OSError:
             os._exit(0)  # the runner is gone
 
 
-def _keep(order: Mapping[str, Any], channel: socket.socket, task: Task) -> bytes:
+def _keep(
+    order: Mapping[str, Any], channel: socket.socket, task: Task, equipment: Equipment
+) -> bytes:
     """Have one mission flown; the packet that says how it ended."""
     begun = time.monotonic()
+    vehicles = equipment.vehicles() if order["fork"] else None
     reading, writing = os.pipe()
     slot = os.getpid()
     pid = os.fork()
     if pid == 0:
         channel.close()
         os.close(reading)
-        _perform(order, task, slot, writing)
+        _perform(order, task, slot, writing, vehicles)
     os.close(writing)
     channel.send(json.dumps({"number": order["number"], "pid": pid}).encode())
     timeout = _await(pid, channel, begun + order["limit_s"])
     if timeout:
         os.kill(pid, signal.SIGKILL)
     _, status = os.waitpid(pid, 0)
-    end_children()
+    equipment.settle()
     ended: dict[str, Any] = {"number": order["number"], "report": _read(reading)}
     if timeout:
         ended["timeout"] = True
@@ -125,7 +163,9 @@ def _read(reading: int) -> Any:
         return None
 
 
-def _perform(order: Mapping[str, Any], task: Task, slot: int, writing: int) -> NoReturn:
+def _perform(
+    order: Mapping[str, Any], task: Task, slot: int, writing: int, vehicles: VehicleTemplate | None
+) -> NoReturn:
     """The mission's whole life, in a process group of its own."""
     code = 1
     try:
@@ -134,7 +174,7 @@ def _perform(order: Mapping[str, Any], task: Task, slot: int, writing: int) -> N
         die_with(slot)
         out = Path(order["out"])
         _own_surroundings(out)
-        folder = task.perform(order["changes"], out)
+        folder = task.perform(order["changes"], out, vehicles)
         _tell(writing, {"folder": folder.name})
         code = 0
     except MavfiError as error:

@@ -16,9 +16,9 @@ from mavfi_cli.campaign.seats import Ended, Seats
 from mavfi_cli.campaign.slot import PACKET
 from mavfi_cli.campaign.template import READY
 from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.processes import ONE_THREAD
 
 TASK = "mavfi_cli.campaign.task"
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 _STOP_S = 10.0  # from the closing of the slots until what is left of them is killed
 
 
@@ -29,13 +29,19 @@ class SlotsFailed(MavfiError):
 class Slots(Seats):
     """Keeps up to `jobs` missions flying.
 
+    Args:
+        jobs: missions at the same time.
+        module: that does the work.
+        fork: simulated vehicles are forks of a warm template; otherwise programs.
+
     Attributes:
         running: process id by mission number; 0 until the slot has told it.
     """
 
-    def __init__(self, jobs: int, module: str = TASK) -> None:
+    def __init__(self, jobs: int, module: str = TASK, *, fork: bool = True) -> None:
         self._jobs = jobs
         self._module = module
+        self._fork = fork
         self._selector = selectors.DefaultSelector()
         self._idle: list[socket.socket] = []
         self._at: dict[socket.socket, int] = {}  # the mission that a slot keeps
@@ -54,7 +60,13 @@ class Slots(Seats):
         Raises:
             SlotsFailed: the processes cannot be started.
         """
-        order = {"number": number, "changes": changes, "out": out, "limit_s": limit_s}
+        order = {
+            "number": number,
+            "changes": changes,
+            "out": out,
+            "limit_s": limit_s,
+            "fork": self._fork,
+        }
         packet = json.dumps(order).encode()
         while True:
             channel = self._idle.pop() if self._idle else self._new_slot()
@@ -121,7 +133,7 @@ class Slots(Seats):
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-                env={**_ONE_THREAD, **os.environ},
+                env={**os.environ, **ONE_THREAD},
                 start_new_session=True,  # Ctrl-C is for the runner, which lets missions finish
             )
         try:

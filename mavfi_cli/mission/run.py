@@ -40,6 +40,7 @@ from mavfi_cli.mission.spawned_node import SpawnedNode
 from mavfi_cli.mission.statistics import mission_statistics, plan_lines
 from mavfi_cli.mission.trace import write_trace
 from mavfi_cli.mission.vehicle_process import VehicleProcess
+from mavfi_cli.mission.vehicle_template import VehicleTemplate
 
 _VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")
 
@@ -52,6 +53,7 @@ def fly_mission(
     recorder: Recorder | None = None,
     repeat: Mapping[str, Any] | None = None,
     for_debugger: Callable[[int], None] | None = None,
+    vehicles: VehicleTemplate | None = None,
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
@@ -64,6 +66,7 @@ def fly_mission(
         recorder: keeps what the flight asks of its nodes.
         repeat: the record of an instruction-level fault to repeat, instead of drawing one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
+        vehicles: forks the simulated vehicle; None: it is started as a program.
 
     Raises:
         MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
@@ -74,9 +77,9 @@ def fly_mission(
     platform = load_platform(config.platform)
     planner = planners.find(config.planner)
     with (
-        _injection(config, out, repeat, for_debugger) as injection,
+        _injection(config, out, repeat, for_debugger, vehicles) as injection,
         interruptible() as interrupt,
-        _vehicle(config) as (transport, truth_folder, process),
+        _vehicle(config, vehicles) as (transport, truth_folder, process),
     ):
         flight = Flight(config, transport, platform, planner, watcher, interrupt)
         if injection is not None:
@@ -111,9 +114,9 @@ def fly_mission(
             "machine": host_platform.machine(),
             "cores": os.cpu_count(),
             "isolated": list(config.isolate),
-            "memory_mb": _memory_mb(),
-            "stage_wall_s": {k: round(v, 4) for k, v in flight.wall.totals.items()},
-            "vehicle_stage_wall_s": _vehicle_stages(truth_folder),
+            "memory_mb": _memory_mb(truth_folder),
+            "stage_wall_s": _rounded(flight.wall.totals),
+            "vehicle_stage_wall_s": _rounded(_vehicle_host(truth_folder).get("stage_wall_s", {})),
         }
         truth, referee = _read_truth(truth_folder)
         _write(flight, folder, config, host, truth, referee, crash)
@@ -126,13 +129,17 @@ def _injection(
     out: Path,
     repeat: Mapping[str, Any] | None,
     for_debugger: Callable[[int], None] | None,
+    vehicles: VehicleTemplate | None,
 ) -> Iterator[InstructionInjection | None]:
     """The instruction-level fault of a mission, its node's process already starting."""
     if config.instruction is None:
         yield None
         return
     require_possible(config.link)
-    planned = planned_of(repeat) if repeat is not None else _plan(config, config.instruction, out)
+    if repeat is not None:
+        planned = planned_of(repeat)
+    else:
+        planned = _plan(config, config.instruction, out, vehicles)
     injection = InstructionInjection(planned, SpawnedNode(), for_debugger)
     try:
         yield injection
@@ -140,9 +147,11 @@ def _injection(
         injection.close()
 
 
-def _plan(config: MissionConfig, asked: InstructionConfig, out: Path) -> PlannedFault:
+def _plan(
+    config: MissionConfig, asked: InstructionConfig, out: Path, vehicles: VehicleTemplate | None
+) -> PlannedFault:
     def fly_golden(golden: MissionConfig, folder: Path, recorder: Recorder) -> None:
-        flown = fly_mission(golden, folder, Watcher(), recorder=recorder)
+        flown = fly_mission(golden, folder, Watcher(), recorder=recorder, vehicles=vehicles)
         if json.loads(flown.result.read_text())["referee"] is None:  # nothing to draw from
             raise VehicleProcessError("the vehicle process of the golden flight died")
 
@@ -163,7 +172,7 @@ def _fly(flight: Flight, folder: RunFolder) -> str | None:
 
 @contextlib.contextmanager
 def _vehicle(
-    config: MissionConfig,
+    config: MissionConfig, vehicles: VehicleTemplate | None
 ) -> Iterator[tuple[Transport, Path | None, VehicleProcess | None]]:
     """The other end: a simulated vehicle of our own, or a foreign autopilot."""
     if config.link is not None:
@@ -175,7 +184,7 @@ def _vehicle(
             transport.close()
         return
     with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
-        process = VehicleProcess(config, Path(folder))
+        process = VehicleProcess(config, Path(folder), vehicles)
         transport = open_transport(f"fd:{process.detach()}")
         try:
             warm_up()  # while the vehicle starts
@@ -218,18 +227,22 @@ def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, An
     return truth, json.loads((folder / "truth.json").read_text())
 
 
-def _memory_mb() -> dict[str, float]:
-    """Peak resident memory, MB, of this process and of the largest of its children so far."""
+def _memory_mb(folder: Path | None) -> dict[str, float]:
+    """Peak resident memory of this process and of the vehicle's, MB."""
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    return {"companion": round(own / 1024, 1), "vehicle": round(children / 1024, 1)}
+    vehicle = _vehicle_host(folder).get("memory_mb", 0.0)
+    return {"companion": round(own / 1024, 1), "vehicle": round(vehicle, 1)}
 
 
-def _vehicle_stages(folder: Path | None) -> dict[str, float]:
-    """Where the host time of the vehicle's process went, s."""
+def _vehicle_host(folder: Path | None) -> dict[str, Any]:
+    """What the vehicle's process tells of itself: stages, s, and memory, MB."""
     if folder is None or not (folder / "host.json").is_file():
         return {}
-    stages = json.loads((folder / "host.json").read_text())["stage_wall_s"]
+    told: dict[str, Any] = json.loads((folder / "host.json").read_text())
+    return told
+
+
+def _rounded(stages: Mapping[str, float]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in stages.items()}
 
 

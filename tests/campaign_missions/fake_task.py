@@ -15,7 +15,12 @@ def prepare():
     pass
 
 
-def perform(changes, out):
+def equip():
+    return None
+
+
+def perform(changes, out, vehicles):
+    assert vehicles is None
     world, _, value = changes.get("world", "fly").partition(":")
     seed = changes.get("seed", 3)
     run = out / f"{world}-{seed}-001"

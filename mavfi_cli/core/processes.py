@@ -9,7 +9,12 @@ import signal
 from pathlib import Path
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
-TEMPLATE, SLOT, MISSION = "mavfi-template", "mavfi-slot", "mavfi-mission"  # what ps calls them
+# What ps calls them.
+TEMPLATE, SLOT, MISSION = "mavfi-template", "mavfi-slot", "mavfi-mission"
+VEHICLES, VEHICLE = "mavfi-vehicles", "mavfi-vehicle"  # the template of vehicles, and one
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+"""Environment of a process that forks itself: the libraries that it loads start no threads."""
+
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 
 
@@ -36,19 +41,21 @@ def _request(option: int, value: int | ctypes.c_char_p) -> None:
         raise OSError(code, os.strerror(code))
 
 
-def end_children() -> None:
+def end_children(spare: int | None = None) -> None:
     """Kill and reap every descendant of this process, which is their reaper.
 
     A killed child leaves its own children to us, so the loop ends when there are none.
+
+    Args:
+        spare: a child that is left alone, with all that it started.
     """
-    while True:
-        for pid in _children():
+    while children := [pid for pid in _children() if pid != spare]:
+        for pid in children:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        try:
-            os.waitpid(-1, 0)
-        except ChildProcessError:
-            return
+        for pid in children:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, 0)
 
 
 def _children() -> list[int]:
