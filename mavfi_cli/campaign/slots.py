@@ -9,10 +9,10 @@ import selectors
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict
 
-from mavfi_cli.campaign.seats import Ended, Seats
+from mavfi_cli.campaign.seats import Assignment, Ended, Seats
 from mavfi_cli.campaign.slot import PACKET
 from mavfi_cli.campaign.template import READY
 from mavfi_cli.core.errors import MavfiError
@@ -44,7 +44,7 @@ class Slots(Seats):
         self._fork = fork
         self._selector = selectors.DefaultSelector()
         self._idle: list[socket.socket] = []
-        self._at: dict[socket.socket, int] = {}  # the mission that a slot keeps
+        self._at: dict[socket.socket, set[int]] = {}  # the missions that a slot keeps
         self._template: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self.running: dict[int, int] = {}
@@ -54,16 +54,14 @@ class Slots(Seats):
         """How many missions may be started now."""
         return self._jobs - len(self._at)
 
-    def start(self, number: int, changes: Mapping[str, Any], out: str, limit_s: float) -> None:
-        """Start a mission in a free slot.
+    def start(self, missions: Sequence[Assignment], limit_s: float) -> None:
+        """Start missions in a free slot.
 
         Raises:
             SlotsFailed: the processes cannot be started.
         """
         order = {
-            "number": number,
-            "changes": changes,
-            "out": out,
+            "missions": [asdict(mission) for mission in missions],
             "limit_s": limit_s,
             "fork": self._fork,
         }
@@ -76,8 +74,8 @@ class Slots(Seats):
                 channel.close()
                 continue
             self._selector.register(channel, selectors.EVENT_READ)
-            self._at[channel] = number
-            self.running[number] = 0
+            self._at[channel] = {mission.number for mission in missions}
+            self.running |= dict.fromkeys(self._at[channel], 0)
             return
 
     def wait(self, timeout_s: float) -> list[Ended]:
@@ -90,24 +88,28 @@ class Slots(Seats):
                 packet = channel.recv(PACKET)
             except OSError:
                 packet = b""
-            number = self._at[channel]
+            kept = self._at[channel]
             if not packet:
+                ended += [Ended(number=number) for number in sorted(kept)]
                 self._release(channel)
                 channel.close()
-                ended.append(Ended(number=number))
                 continue
             said = json.loads(packet)
             if "pid" in said:
-                self.running[number] = said["pid"]
+                self.running[said["number"]] = said["pid"]
                 continue
-            self._release(channel)
-            self._idle.append(channel)
             ended.append(Ended(**said))
+            kept.remove(said["number"])
+            del self.running[said["number"]]
+            if not kept:
+                self._release(channel)
+                self._idle.append(channel)
         return ended
 
     def _release(self, channel: socket.socket) -> None:
         self._selector.unregister(channel)
-        del self.running[self._at.pop(channel)]
+        for number in self._at.pop(channel):
+            del self.running[number]
 
     def _new_slot(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mavfi_cli.campaign.desk import Desk
     from mavfi_cli.mission.vehicle_template import VehicleTemplate
 
 
@@ -48,3 +49,15 @@ def perform(changes: Mapping[str, Any], out: Path, vehicles: VehicleTemplate | N
     from mavfi_cli.mission.run import fly_mission
 
     return fly_mission(config_from(changes), out, Watcher(), vehicles=vehicles).path
+
+
+def perform_together(desk: Desk, vehicles: VehicleTemplate) -> Path:
+    """Fly missions that begin alike; the run folder of the one that this process has become.
+
+    Raises:
+        MavfiError: as `perform`.
+    """
+    from mavfi_cli.campaign.cast import Cast
+    from mavfi_cli.mission.run import fly_together
+
+    return fly_together(Cast(desk), desk.place, vehicles).path

@@ -12,7 +12,11 @@ _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 # What ps calls them.
 TEMPLATE, SLOT, MISSION = "mavfi-template", "mavfi-slot", "mavfi-mission"
 VEHICLES, VEHICLE = "mavfi-vehicles", "mavfi-vehicle"  # the template of vehicles, and one
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+ONE_THREAD = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "JE_ARROW_MALLOC_CONF": "background_thread:false",
+}
 """Environment of a process that forks itself: the libraries that it loads start no threads."""
 
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
@@ -28,6 +32,39 @@ def die_with(parent: int) -> None:
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
+
+
+def fork_beside(reaper: int) -> int:
+    """Fork, with a reaper as the parent instead of this process; 0 in the child.
+
+    Args:
+        reaper: process id of the nearest reaper among the ancestors of this process. The child dies
+            with it.
+    """
+    reading, writing = os.pipe()
+    between = os.fork()
+    if between:
+        os.close(writing)
+        with open(reading, "rb", buffering=0) as pipe:
+            told = pipe.read()
+        os.waitpid(between, 0)
+        return int(told)
+    middle = os.getpid()
+    child = os.fork()
+    if child:
+        os.write(writing, str(child).encode())
+        os._exit(0)
+    os.close(reading)
+    os.close(writing)
+    while os.getppid() == middle:  # it is about to end
+        os.sched_yield()
+    die_with(reaper)
+    return 0
+
+
+def threads() -> int:
+    """How many threads this process has. A fork has only one of them, and the others' locks."""
+    return len(os.listdir("/proc/self/task"))
 
 
 def call_this_process(name: str) -> None:

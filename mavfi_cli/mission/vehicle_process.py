@@ -7,11 +7,14 @@ import socket
 import subprocess
 import sys
 import tempfile
+from copy import copy
 from pathlib import Path
 
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.vehicle_template import ForkedVehicle, VehicleTemplate
+
+_FOR_EVER_S = "1e9"
 
 
 class VehicleProcess:
@@ -21,14 +24,22 @@ class VehicleProcess:
         config: the mission.
         truth_folder: where the vehicle leaves briefing and truth.
         template: forks the vehicle; None: it is started as a program.
+        patient: the companion may take as long as it likes to answer.
     """
 
     def __init__(
-        self, config: MissionConfig, truth_folder: Path, template: VehicleTemplate | None = None
+        self,
+        config: MissionConfig,
+        truth_folder: Path,
+        template: VehicleTemplate | None = None,
+        *,
+        patient: bool = False,
     ) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         arguments = _arguments(config, truth_folder)
+        if patient:
+            arguments += ["--answer-limit", _FOR_EVER_S]
         self._process: subprocess.Popen[bytes] | ForkedVehicle
         with theirs:
             try:
@@ -53,6 +64,25 @@ class VehicleProcess:
             pass_fds=[link.fileno()],
             start_new_session=True,  # Ctrl-C is for the companion, which then closes
         )
+
+    def branch(self, truth_folder: Path) -> VehicleProcess:
+        """The vehicle once more, as it is while it waits for an answer; a fork of a template only.
+
+        Raises:
+            VehicleProcessError: it does not branch.
+        """
+        assert isinstance(self._process, ForkedVehicle)
+        twin = copy(self)
+        twin._errors = tempfile.TemporaryFile()  # noqa: SIM115 - as above
+        twin._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        with theirs:
+            try:
+                twin._process = self._process.branch(truth_folder, theirs, twin._errors.fileno())
+            except VehicleProcessError:
+                twin._socket.close()
+                twin._errors.close()
+                raise
+        return twin
 
     def detach(self) -> int:
         """Our end of the socket pair; the caller closes it."""

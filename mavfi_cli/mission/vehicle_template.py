@@ -17,11 +17,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.processes import ONE_THREAD
 
 _FLY, _SETTLE, _SETTLED = b"fly", b"settle", b"settled"
+_BRANCH_S = 60.0  # a waiting vehicle takes a few milliseconds
 _WORD = 64  # bytes of the longest thing that the template says
 
 
@@ -144,6 +146,36 @@ class ForkedVehicle:
         # Without a word the template is gone, and has taken the vehicle with it.
         self._code = int(said) if said else -signal.SIGKILL
         return True
+
+    def branch(self, truth_folder: Path, link: socket.socket, errors: int) -> ForkedVehicle:
+        """The vehicle once more, as it is now, while it waits for an answer.
+
+        Args:
+            truth_folder: where the new one leaves its truth.
+            link: its end of the link; the caller closes its own copy.
+            errors: descriptor of the file for what it says on its standard error.
+
+        Raises:
+            VehicleProcessError: it is gone, or does not hear.
+        """
+        self.poll()
+        gone = VehicleProcessError("the vehicle did not branch")
+        if self._process is None or self._code is not None:
+            raise gone
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        twin = ForkedVehicle(ours)
+        order = json.dumps({"truth": str(truth_folder)}).encode()
+        try:
+            with theirs:
+                descriptors = [link.fileno(), errors, theirs.fileno()]
+                socket.send_fds(self._status, [order], descriptors)
+            signal.pidfd_send_signal(self._process, signal.SIGUSR1)
+            if not twin._hear(_BRANCH_S):
+                return twin
+        except (OSError, subprocess.TimeoutExpired):
+            pass
+        twin.close()
+        raise gone
 
     def kill(self) -> None:
         """End it at once."""

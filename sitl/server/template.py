@@ -10,7 +10,11 @@ slot write to it too. A packet is an order:
     "settle": end every vehicle; answered by SETTLED when none is left
 
 On the status channel comes HERE with a descriptor of the vehicle's process, and when that has
-ended, its code as `subprocess` gives it, as text. A vehicle is as fresh as `python -m sitl`: this
+ended, its code as `subprocess` gives it, as text. A flying vehicle that finds JSON {"truth"} there
+when SIGUSR1 comes, with three descriptors as above, forks itself: the one flight goes on as if
+nothing had happened, the other with the new descriptors, and with its truth in the folder named.
+
+A vehicle is as fresh as `python -m sitl`: this
 process has flown nothing but the ticks that load the compiled code, in a simulation of their own.
 """
 
@@ -26,7 +30,7 @@ import socket
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -38,8 +42,10 @@ from mavfi_cli.core.processes import (
     call_this_process,
     die_with,
     end_children,
+    fork_beside,
+    threads,
 )
-from sitl.server.main import main
+from sitl.server.main import Place, main
 from sitl.server.simulation import Simulation
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
@@ -58,20 +64,63 @@ class _Flying:
     status: socket.socket
 
 
+class _Branching:
+    """A vehicle's answer to SIGUSR1: it flies on twice from where it is.
+
+    The companion asks between a tick's messages and its answer, when the vehicle only waits and
+    nothing is on the link.
+
+    Args:
+        link: descriptor of the companion's socket.
+        place: where the truth goes.
+        status: channel on which the request waits.
+        register: channel to the template, which hears of the fork on it.
+        template: process id of the template.
+    """
+
+    def __init__(
+        self, link: int, place: Place, status: socket.socket, register: socket.socket, template: int
+    ) -> None:
+        self._link, self._place = link, place
+        self._status, self._register, self._template = status, register, template
+
+    def on_signal(self, _number: int, _frame: object) -> None:
+        """Fork, and let the fork have what the request brought."""
+        packet, descriptors, _, _ = socket.recv_fds(self._status, PACKET, 3)
+        if len(descriptors) == 3:
+            if fork_beside(self._template) == 0:
+                signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # it branches once
+                self._place.truth = Path(json.loads(packet)["truth"])
+                self._become(*descriptors)
+                return
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def _become(self, link: int, errors: int, status: int) -> None:
+        os.set_blocking(link, False)
+        os.dup2(link, self._link)
+        os.dup2(errors, 2)
+        socket.send_fds(self._register, [str(os.getpid()).encode()], [status])
+        for descriptor in (link, errors, status):
+            os.close(descriptor)
+        self._status.close()
+        self._register.close()
+
+
 class Template:
     """Forks vehicles, and reaps them.
 
     Args:
         control: where orders come from.
-        fly: the whole work of a vehicle, `python -m sitl` with arguments; the exit code.
     """
 
-    def __init__(self, control: socket.socket, fly: Callable[[list[str]], int]) -> None:
+    def __init__(self, control: socket.socket) -> None:
         self._control = control
-        self._fly = fly
         self._flying: dict[int, _Flying] = {}  # by descriptor of the process
+        self._branched, self._register = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._poller = select.poll()
         self._poller.register(control, select.POLLIN)
+        self._poller.register(self._branched, select.POLLIN)
 
     def serve(self) -> None:
         """Until the other end closes."""
@@ -79,6 +128,8 @@ class Template:
             for descriptor, _ in self._poller.poll():
                 if descriptor in self._flying:
                     self._reap(descriptor)
+                elif descriptor == self._branched.fileno():
+                    self._take_branch()
                 elif not self._obey():
                     return
 
@@ -101,6 +152,18 @@ class Template:
             self._become_vehicle(order, template, link, errors, status)
         os.close(link)
         os.close(errors)
+        self._keep(pid, status)
+
+    def _take_branch(self) -> None:
+        """A vehicle has forked itself."""
+        said, descriptors, _, _ = socket.recv_fds(self._branched, PACKET, 1)
+        status = socket.socket(fileno=descriptors[0])
+        try:
+            self._keep(int(said), status)
+        except ProcessLookupError:  # it was ended with all others
+            status.close()
+
+    def _keep(self, pid: int, status: socket.socket) -> None:
         process = os.pidfd_open(pid)
         self._flying[process] = _Flying(pid, status)
         self._poller.register(process, select.POLLIN)
@@ -117,14 +180,17 @@ class Template:
             os.setsid()
             die_with(template)
             self._control.close()
-            status.close()
+            self._branched.close()
             for process, other in self._flying.items():
                 os.close(process)
                 other.status.close()
             os.dup2(errors, 2)
             os.close(errors)
             os.environ["TMPDIR"] = tempfile.tempdir = order["tmp"]
-            code = self._fly([*order["arguments"], "--fd", str(link)])
+            place = Place()
+            branching = _Branching(link, place, status, self._register, template)
+            signal.signal(signal.SIGUSR1, branching.on_signal)
+            code = main([*order["arguments"], "--fd", str(link)], place)
         except SystemExit as error:  # arguments that make no sense
             code = error.code if isinstance(error.code, int) else 1
         except BaseException:  # the process boundary: last words are what others see of it
@@ -158,10 +224,6 @@ def warm_up() -> None:
         simulation.advance()
 
 
-def _threads() -> int:
-    return len(list(Path("/proc/self/task").iterdir()))
-
-
 def run(descriptor: int, parent: int) -> int:
     """Get warm, then serve; the exit code."""
     call_this_process(VEHICLES)
@@ -170,12 +232,12 @@ def run(descriptor: int, parent: int) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the parent says when it is over
     warm_up()
-    if (threads := _threads()) > 1:  # a fork has only one of them, and the others' locks
-        print(f"error: {threads} threads where one is needed", file=sys.stderr)  # noqa: T201
+    if (count := threads()) > 1:
+        print(f"error: {count} threads where one is needed", file=sys.stderr)  # noqa: T201
         return 1
     gc.collect()
     gc.freeze()  # the collector would touch, and so copy, every page that forks share
-    Template(socket.socket(fileno=descriptor), main).serve()
+    Template(socket.socket(fileno=descriptor)).serve()
     end_children()
     return 0
 
