@@ -56,7 +56,7 @@ class Task(Protocol):
     ) -> Path:
         """Do it; the folder that it left."""
 
-    def perform_together(self, desk: Desk, vehicles: VehicleTemplate) -> Path:
+    def perform_together(self, desk: Desk, vehicles: VehicleTemplate | None) -> Path:
         """Do several that begin alike; the folder of the one that this process has become."""
 
 
@@ -129,7 +129,6 @@ def _perform(desk: Desk, task: Task, slot: int, vehicles: VehicleTemplate | None
             desk.become(0)
             folder = task.perform(desk.missions[0]["changes"], desk.out(0), vehicles)
         else:
-            assert vehicles is not None
             folder = task.perform_together(desk, vehicles)
         desk.tell({"folder": folder.name})
         code = 0

@@ -51,7 +51,7 @@ def perform(changes: Mapping[str, Any], out: Path, vehicles: VehicleTemplate | N
     return fly_mission(config_from(changes), out, Watcher(), vehicles=vehicles).path
 
 
-def perform_together(desk: Desk, vehicles: VehicleTemplate) -> Path:
+def perform_together(desk: Desk, vehicles: VehicleTemplate | None) -> Path:
     """Fly missions that begin alike; the run folder of the one that this process has become.
 
     Raises:
@@ -60,4 +60,5 @@ def perform_together(desk: Desk, vehicles: VehicleTemplate) -> Path:
     from mavfi_cli.campaign.cast import Cast
     from mavfi_cli.mission.run import fly_together
 
+    assert vehicles is not None
     return fly_together(Cast(desk), desk.place, vehicles).path
