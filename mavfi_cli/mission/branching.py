@@ -134,7 +134,13 @@ class Trunk(NoInjection):
         if not self._waiting:
             return pass_on(self._own, message)
         for number, fault in list(self._waiting.items()):
-            sent = pass_on(fault, message)
+            try:
+                sent = pass_on(fault, message)
+            except Exception:  # the boundary between missions: this one's crash is not the others'
+                if self._branch(number):
+                    raise
+                del self._waiting[number]
+                continue
             if fault.struck and self._branch(number):
                 return sent
             if fault.struck:
