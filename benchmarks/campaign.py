@@ -2,8 +2,10 @@
 
     python benchmarks/campaign.py [--missions 100] [--jobs 2 ...] [--world sparse]
 
-Flies half of the missions golden and half with a source-level fault, then as many pairs with an
-instruction-level fault; each with every number of jobs.
+Flies golden missions and missions with a source-level fault, pairs by default, then as many with an
+instruction-level fault; each with every number of jobs, and in each of three ways: simulated
+vehicles as programs, as forks of a warm one, and with missions that branch off each other where
+their fault strikes.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import argparse
 import os
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.campaign.keep import Keep
@@ -37,14 +40,15 @@ class _Last(Spectator):
         self.progress = progress
 
 
-def source_missions(world: str, count: int) -> list[PlannedMission]:
-    """Golden and faulty flights in turns."""
+def source_missions(world: str, count: int, faults: int) -> list[PlannedMission]:
+    """Golden flights, each with so many faulty ones."""
     found = []
-    for seed in range(1, count // 2 + 1):
+    for seed in range(1, count // (1 + faults) + 1):
         golden = MissionConfig(world=world, seed=seed)
-        fault = FaultConfig(target=STAGES[seed % 3], seed=seed)
-        faulty = MissionConfig(world=world, seed=seed, fault=fault)
-        found += [PlannedMission(config=golden), PlannedMission(config=faulty)]
+        found.append(PlannedMission(config=golden))
+        for number in range(faults):
+            fault = FaultConfig(target=STAGES[(seed + number) % 3], seed=seed)
+            found.append(PlannedMission(config=replace(golden, fault=fault)))
     return found
 
 
@@ -61,18 +65,25 @@ def instruction_missions(world: str, count: int) -> list[PlannedMission]:
     ]  # fmt: skip
 
 
-def row(name: str, missions: Sequence[PlannedMission], jobs: int) -> str:
+WAYS = {
+    "programs": {"fork": False, "branch": False},
+    "forks": {"fork": True, "branch": False},
+    "branches": {"fork": True, "branch": True},
+}
+
+
+def row(name: str, missions: Sequence[PlannedMission], jobs: int, way: str) -> str:
     """Fly them, and tell one line of the table."""
     last = _Last()
     with tempfile.TemporaryDirectory() as folder:
-        options = Options(jobs=jobs, keep=Keep.NONE)
+        options = Options(jobs=jobs, keep=Keep.NONE, **WAYS[way])
         with run_campaign(missions, Path(folder) / "campaign", options, last) as ledger:
             errors = sum(result.outcome is None for result in ledger.results())
     seen = last.progress
     outside = 1.0 - seen.inside_s / (jobs * seen.elapsed_s)
     return (
-        f"| {name} | {jobs} | {len(missions)} | {seen.rate_per_h:.0f} | {REQUIRED[name]:.0f} | "
-        f"{100 * outside:.1f} % | {100 * OUTSIDE_LIMIT:.0f} % | {errors} |"
+        f"| {name} | {way} | {jobs} | {len(missions)} | {seen.rate_per_h:.0f} | "
+        f"{REQUIRED[name]:.0f} | {100 * outside:.1f} % | {100 * OUTSIDE_LIMIT:.0f} % | {errors} |"
     )
 
 
@@ -82,17 +93,21 @@ def main() -> None:
     parser.add_argument("--missions", type=int, default=100)
     parser.add_argument("--jobs", type=int, nargs="+", default=[1, os.cpu_count() or 1])
     parser.add_argument("--world", default="sparse")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    parser.add_argument("--faults", type=int, default=1, help="faulty missions a golden one")
     given = parser.parse_args()
     print(
-        "| missions | jobs | flown | an hour | required (2 cores) | outside missions | at most "
-        "| could not begin |\n|---|---|---|---|---|---|---|---|"
+        "| missions | vehicles | jobs | flown | an hour | required (2 cores) | outside missions "
+        "| at most | could not begin |\n|---|---|---|---|---|---|---|---|---|"
     )
-    for jobs in given.jobs:
-        source = source_missions(given.world, given.missions)
-        print(row("golden and source level", source, jobs), flush=True)
-    for jobs in given.jobs:
-        native = instruction_missions(given.world, given.missions)
-        print(row("instruction level", native, jobs), flush=True)
+    lists = {
+        "golden and source level": source_missions(given.world, given.missions, given.faults),
+        "instruction level": instruction_missions(given.world, given.missions),
+    }
+    for name, missions in lists.items():
+        for jobs in given.jobs:
+            for way in given.ways:
+                print(row(name, missions, jobs, way), flush=True)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,13 @@ import contextlib
 import queue
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.remote import Answer, Order, fly, unpack, worker_versions
-from mavfi_cli.campaign.seats import Ended, Seats
+from mavfi_cli.campaign.seats import Assignment, Ended, Seats
 from mavfi_cli.campaign.slots import TASK
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.mission.replay import version_differences
@@ -65,11 +65,13 @@ class Cluster(Seats):
             self._looked_s = time.monotonic()
         return _BACKLOG * self._threads - len(self._futures)
 
-    def start(self, number: int, changes: Mapping[str, Any], out: str, limit_s: float) -> None:
+    def start(self, missions: Sequence[Assignment], limit_s: float) -> None:
         """Hand a mission out."""
+        (mission,) = missions
+        number = mission.number
         order = Order(
             number=number,
-            changes=changes,
+            changes=mission.changes,
             limit_s=limit_s,
             keep=self._keep.value,
             task=self._task,
@@ -79,7 +81,7 @@ class Cluster(Seats):
         future = self._client.submit(
             fly, order, key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0
         )
-        self._futures[number] = (future, Path(out))
+        self._futures[number] = (future, Path(mission.out))
         future.add_done_callback(lambda _future: self._done.put(number))
 
     def wait(self, timeout_s: float) -> list[Ended]:

@@ -17,9 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.campaign.desk import SCRATCH
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.seats import Ended
-from mavfi_cli.campaign.slot import SCRATCH
+from mavfi_cli.campaign.seats import Assignment, Ended
 from mavfi_cli.campaign.slots import Slots
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
@@ -73,7 +73,8 @@ def fly(order: Order) -> Answer:
     (place / ".profiles").symlink_to(_scratch() / "profiles")
     try:
         slots = _slots(order.task)
-        slots.start(order.number, order.changes, str(place), order.limit_s)
+        mission = Assignment(number=order.number, changes=order.changes, out=str(place))
+        slots.start([mission], order.limit_s)
         ended: list[Ended] = []
         while not ended:
             ended = slots.wait(60.0)

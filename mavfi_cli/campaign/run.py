@@ -18,10 +18,11 @@ from mavfi_cli.campaign.ledger import RUNS, Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
 from mavfi_cli.campaign.outcome import State, injected_of
 from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.seats import Ended, Seats
+from mavfi_cli.campaign.seats import Assignment, Ended, Seats
 from mavfi_cli.campaign.slots import TASK, Slots
 from mavfi_cli.campaign.spec import Stop
 from mavfi_cli.campaign.stopping import Entry, Gate, Queue
+from mavfi_cli.campaign.together import Together
 from mavfi_cli.campaign.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
 from mavfi_cli.mission.replay import version_differences
@@ -44,6 +45,8 @@ class Options:
         task: module that does the work.
         errors: fly those again that could not begin.
         cluster: address of a scheduler of dask.distributed, instead of slots on this machine.
+        fork: simulated vehicles are forks of a warm template; otherwise programs.
+        branch: missions that differ in their fault only fly together until it strikes; with `fork`.
     """
 
     jobs: int = 0  # as many as there are cores
@@ -52,6 +55,8 @@ class Options:
     task: str = TASK
     errors: bool = False
     cluster: str | None = None
+    fork: bool = True
+    branch: bool = True
 
 
 def run_campaign(
@@ -185,7 +190,12 @@ class _Run:
         self._spectator = spectator
         self._folder = ledger.folder.absolute()
         self._gate = None if stop is None else Gate(stop, ledger.cell_of_each(), ledger.fates())
-        self._queue = Queue(ledger.missing(errors=options.errors), self._gate)
+        self._jobs = options.jobs or len(os.sched_getaffinity(0))
+        queue = Queue(ledger.missing(errors=options.errors), self._gate)
+        branches = options.branch and options.fork and options.task == TASK
+        self._queue: Queue | Together = queue
+        if branches and options.cluster is None:
+            self._queue = Together(queue, self._jobs)
         self._again: list[Entry] = []
         self._flying: dict[int, Entry] = {}
         self._attempts: Counter[int] = Counter()
@@ -221,30 +231,39 @@ class _Run:
     def _seats(self) -> Seats:
         options = self._options
         if options.cluster is None:
-            return Slots(options.jobs or len(os.sched_getaffinity(0)), options.task)
+            return Slots(self._jobs, options.task, fork=options.fork)
         from mavfi_cli.campaign.cluster import Cluster
 
         return Cluster(options.cluster, options.keep, options.task)
 
     def _fill(self, slots: Seats, asked: Sequence[int]) -> None:
         """Start as many missions as there are free slots."""
-        while slots.free and not asked and (entry := self._next()) is not None:
-            self._start(slots, entry)
+        while slots.free and not asked and (entries := self._next()):
+            self._start(slots, entries)
 
-    def _next(self) -> Entry | None:
-        return self._again.pop() if self._again else self._queue.next()
+    def _next(self) -> list[Entry]:
+        """What flies next: one mission, or several as one; those that are begun again, alone."""
+        if self._again:
+            return [self._again.pop()]
+        if isinstance(self._queue, Together):
+            return self._queue.next()
+        entry = self._queue.next()
+        return [] if entry is None else [entry]
 
-    def _start(self, slots: Seats, entry: Entry) -> None:
-        number, _, changes = entry
-        self._attempts[number] += 1
-        out = self._out(number)
-        try:
-            out.mkdir()
-            (out / ".profiles").symlink_to(self._folder / PROFILES)
-        except OSError as error:
-            raise RecordError(f"{out}: {error.strerror or error}") from None
-        slots.start(number, changes, str(out), self._options.limit_s)
-        self._flying[number] = entry
+    def _start(self, slots: Seats, entries: Sequence[Entry]) -> None:
+        missions = []
+        for entry in entries:
+            number, _, changes = entry
+            self._attempts[number] += 1
+            out = self._out(number)
+            try:
+                out.mkdir()
+                (out / ".profiles").symlink_to(self._folder / PROFILES)
+            except OSError as error:
+                raise RecordError(f"{out}: {error.strerror or error}") from None
+            missions.append(Assignment(number=number, changes=changes, out=str(out)))
+            self._flying[number] = entry
+        slots.start(missions, self._options.limit_s)
 
     def _out(self, number: int) -> Path:
         return self._folder / WORK / f"{number}-{self._attempts[number]}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -30,6 +30,21 @@ class Ended:
     wall_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Assignment:
+    """One mission to be flown.
+
+    Attributes:
+        number: of the mission.
+        changes: what it has other than by default.
+        out: the folder that is to hold what it leaves.
+    """
+
+    number: int
+    changes: Mapping[str, Any]
+    out: str
+
+
 class Seats(ABC):
     """Keeps missions flying. A context manager that ends them."""
 
@@ -45,14 +60,12 @@ class Seats(ABC):
         """How many missions may be started now."""
 
     @abstractmethod
-    def start(self, number: int, changes: Mapping[str, Any], out: str, limit_s: float) -> None:
-        """Start a mission.
+    def start(self, missions: Sequence[Assignment], limit_s: float) -> None:
+        """Start missions that begin alike as one flight; or a single one.
 
         Args:
-            number: of the mission.
-            changes: what it has other than by default.
-            out: the folder that is to hold what it leaves.
-            limit_s: of wall time.
+            missions: what to fly.
+            limit_s: of wall time, of each.
         """
 
     @abstractmethod

@@ -9,16 +9,16 @@ import selectors
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict
 
-from mavfi_cli.campaign.seats import Ended, Seats
+from mavfi_cli.campaign.seats import Assignment, Ended, Seats
 from mavfi_cli.campaign.slot import PACKET
 from mavfi_cli.campaign.template import READY
 from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.processes import ONE_THREAD
 
 TASK = "mavfi_cli.campaign.task"
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 _STOP_S = 10.0  # from the closing of the slots until what is left of them is killed
 
 
@@ -29,16 +29,22 @@ class SlotsFailed(MavfiError):
 class Slots(Seats):
     """Keeps up to `jobs` missions flying.
 
+    Args:
+        jobs: missions at the same time.
+        module: that does the work.
+        fork: simulated vehicles are forks of a warm template; otherwise programs.
+
     Attributes:
         running: process id by mission number; 0 until the slot has told it.
     """
 
-    def __init__(self, jobs: int, module: str = TASK) -> None:
+    def __init__(self, jobs: int, module: str = TASK, *, fork: bool = True) -> None:
         self._jobs = jobs
         self._module = module
+        self._fork = fork
         self._selector = selectors.DefaultSelector()
         self._idle: list[socket.socket] = []
-        self._at: dict[socket.socket, int] = {}  # the mission that a slot keeps
+        self._at: dict[socket.socket, set[int]] = {}  # the missions that a slot keeps
         self._template: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self.running: dict[int, int] = {}
@@ -48,13 +54,17 @@ class Slots(Seats):
         """How many missions may be started now."""
         return self._jobs - len(self._at)
 
-    def start(self, number: int, changes: Mapping[str, Any], out: str, limit_s: float) -> None:
-        """Start a mission in a free slot.
+    def start(self, missions: Sequence[Assignment], limit_s: float) -> None:
+        """Start missions in a free slot.
 
         Raises:
             SlotsFailed: the processes cannot be started.
         """
-        order = {"number": number, "changes": changes, "out": out, "limit_s": limit_s}
+        order = {
+            "missions": [asdict(mission) for mission in missions],
+            "limit_s": limit_s,
+            "fork": self._fork,
+        }
         packet = json.dumps(order).encode()
         while True:
             channel = self._idle.pop() if self._idle else self._new_slot()
@@ -64,8 +74,8 @@ class Slots(Seats):
                 channel.close()
                 continue
             self._selector.register(channel, selectors.EVENT_READ)
-            self._at[channel] = number
-            self.running[number] = 0
+            self._at[channel] = {mission.number for mission in missions}
+            self.running |= dict.fromkeys(self._at[channel], 0)
             return
 
     def wait(self, timeout_s: float) -> list[Ended]:
@@ -78,24 +88,28 @@ class Slots(Seats):
                 packet = channel.recv(PACKET)
             except OSError:
                 packet = b""
-            number = self._at[channel]
+            kept = self._at[channel]
             if not packet:
+                ended += [Ended(number=number) for number in sorted(kept)]
                 self._release(channel)
                 channel.close()
-                ended.append(Ended(number=number))
                 continue
             said = json.loads(packet)
             if "pid" in said:
-                self.running[number] = said["pid"]
+                self.running[said["number"]] = said["pid"]
                 continue
-            self._release(channel)
-            self._idle.append(channel)
             ended.append(Ended(**said))
+            kept.remove(said["number"])
+            del self.running[said["number"]]
+            if not kept:
+                self._release(channel)
+                self._idle.append(channel)
         return ended
 
     def _release(self, channel: socket.socket) -> None:
         self._selector.unregister(channel)
-        del self.running[self._at.pop(channel)]
+        for number in self._at.pop(channel):
+            del self.running[number]
 
     def _new_slot(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -121,7 +135,7 @@ class Slots(Seats):
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-                env={**_ONE_THREAD, **os.environ},
+                env={**os.environ, **ONE_THREAD},
                 start_new_session=True,  # Ctrl-C is for the runner, which lets missions finish
             )
         try:

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mavfi_cli.campaign.desk import Desk
+    from mavfi_cli.mission.vehicle_template import VehicleTemplate
 
 
 def prepare() -> None:
@@ -18,12 +22,24 @@ def prepare() -> None:
     warm_up()
 
 
-def perform(changes: Mapping[str, Any], out: Path) -> Path:
+def equip() -> VehicleTemplate:
+    """What forks the simulated vehicles of a slot.
+
+    Raises:
+        VehicleProcessError: it cannot be started.
+    """
+    from mavfi_cli.mission.vehicle_template import VehicleTemplate
+
+    return VehicleTemplate()
+
+
+def perform(changes: Mapping[str, Any], out: Path, vehicles: VehicleTemplate | None) -> Path:
     """Fly one mission; its run folder.
 
     Args:
         changes: of the mission, by `missions.changes_of`.
         out: where the run folder goes.
+        vehicles: forks the simulated vehicle; None: it is started as a program.
 
     Raises:
         MavfiError: the mission could not begin, or its record could not be written.
@@ -32,4 +48,17 @@ def perform(changes: Mapping[str, Any], out: Path) -> Path:
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
 
-    return fly_mission(config_from(changes), out, Watcher()).path
+    return fly_mission(config_from(changes), out, Watcher(), vehicles=vehicles).path
+
+
+def perform_together(desk: Desk, vehicles: VehicleTemplate | None) -> Path:
+    """Fly missions that begin alike; the run folder of the one that this process has become.
+
+    Raises:
+        MavfiError: as `perform`.
+    """
+    from mavfi_cli.campaign.cast import Cast
+    from mavfi_cli.mission.run import fly_together
+
+    assert vehicles is not None
+    return fly_together(Cast(desk), desk.place, vehicles).path

@@ -17,8 +17,8 @@ import socket
 import sys
 from typing import NoReturn, cast
 
-from mavfi_cli.campaign.processes import TEMPLATE, call_this_process
 from mavfi_cli.campaign.slot import Task, serve
+from mavfi_cli.core.processes import TEMPLATE, call_this_process, threads
 
 READY = b"ready"
 
@@ -30,6 +30,8 @@ def main() -> NoReturn:
     task = cast(Task, importlib.import_module(sys.argv[2]))
     task.prepare()
     gc.collect()
+    if (count := threads()) > 1:
+        sys.exit(f"error: {count} threads where one is needed: a fork would lack the others")
     gc.freeze()  # the collector would touch, and so copy, every page that forks share
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # slots reap themselves
     control.send(READY)

@@ -25,6 +25,7 @@ from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.tlog import TlogWriter
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission import quality
+from mavfi_cli.mission.branching import Trunk
 from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
@@ -120,6 +121,8 @@ class Flight:
             self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
         elif fault is not None:
             self.injection = Injection(fault, shortest_s)
+        elif isinstance(self.injection, Trunk):
+            self.injection.prepare(shortest_s)
         self.companion = Companion(
             self._config,
             self._platform,
@@ -189,6 +192,15 @@ class Flight:
                 self.end(Outcome.LINK_LOST, str(error))
             finally:
                 self.end_s = self.stamp_s if self.outcome is None else self.end_s
+
+    def go_on_in(self, tlog: Path) -> None:
+        """Go on in a copy of the tlog: this process is a fork, and flies another mission now.
+
+        Raises:
+            RecordError: it could not be copied.
+        """
+        assert self._tlog is not None
+        self._tlog.go_on_in(tlog)
 
     def _finished(self) -> bool:
         if self._session.failure is not None and self._session.failure is not self._landing_failed:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import importlib.metadata
 import json
 import os
@@ -11,21 +10,21 @@ import platform as host_platform
 import resource
 import signal
 import sys
-import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mavfi_cli import __version__
-from mavfi_cli.autonomy import planners, warm_up
+from mavfi_cli.autonomy import planners
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.mission import briefing, quality
+from mavfi_cli.mission.branching import Branching
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction_config import InstructionConfig
@@ -35,12 +34,13 @@ from mavfi_cli.mission.plan_file import write_plans
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.response import response_times
-from mavfi_cli.mission.run_folder import CRASH, RunFolder, new_run_folder, stem_of
+from mavfi_cli.mission.run_folder import CRASH, RunFolder
+from mavfi_cli.mission.sortie import Sortie, other_end
 from mavfi_cli.mission.spawned_node import SpawnedNode
 from mavfi_cli.mission.statistics import mission_statistics, plan_lines
 from mavfi_cli.mission.timetable import timetable_of, write_timetable
 from mavfi_cli.mission.trace import write_trace
-from mavfi_cli.mission.vehicle_process import VehicleProcess
+from mavfi_cli.mission.vehicle_template import VehicleTemplate
 
 _VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")
 
@@ -53,6 +53,8 @@ def fly_mission(
     recorder: Recorder | None = None,
     repeat: Mapping[str, Any] | None = None,
     for_debugger: Callable[[int], None] | None = None,
+    vehicles: VehicleTemplate | None = None,
+    branching: Branching | None = None,
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
@@ -65,60 +67,92 @@ def fly_mission(
         recorder: keeps what the flight asks of its nodes.
         repeat: the record of an instruction-level fault to repeat, instead of drawing one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
+        vehicles: forks the simulated vehicle; None: it is started as a program.
+        branching: other missions that begin as this one; see `fly_together`.
 
     Raises:
         MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
             or its record could not be written.
     """
-    started = datetime.datetime.now(datetime.UTC)
-    begun = time.perf_counter()
     platform = load_platform(config.platform)
     planner = planners.find(config.planner)
+    begun_s = time.perf_counter()
     with (
-        _injection(config, out, repeat, for_debugger) as injection,
+        _injection(config, out, repeat, for_debugger, vehicles) as injection,
         interruptible() as interrupt,
-        _vehicle(config) as (transport, truth_folder, process),
+        other_end(config, vehicles, patient=branching is not None) as end,
     ):
-        flight = Flight(config, transport, platform, planner, watcher, interrupt)
+        flight = Flight(config, end.transport, platform, planner, watcher, interrupt)
+        sortie = Sortie(config, out, end, flight, branching, begun_s=begun_s)
+        sortie.prepare_to_branch()
         if injection is not None:
             flight.injection = injection
         try:
-            if truth_folder is None:  # before connecting: from then on the vehicle's clock runs
+            if end.truth_folder is None:  # before connecting: then the vehicle's clock runs
                 flight.brief(briefing.of_config(config))
             flight.connect()
-            if truth_folder is not None:
-                flight.brief(briefing.of_simulation(truth_folder))
+            if end.truth_folder is not None:
+                flight.brief(briefing.of_simulation(end.truth_folder))
             if recorder is not None:
                 flight.record(recorder)
         except MavfiError:
-            transport.close()
-            if process is not None and (failure := _failure(process)):
+            end.transport.close()
+            if failure := end.failure():
                 raise failure from None
             raise
-        name = stem_of(config.world) if config.link is None else "link"
-        folder = new_run_folder(out, f"{name}-{config.seed}")
-        flight.injection.begin(folder.fault)
-        flight_begun = time.perf_counter()
+        sortie.begin()
+        sortie.flight_begun_s = time.perf_counter()
         with flight.isolated_nodes():
-            crash = _fly(flight, folder)
-        flight_wall_s = time.perf_counter() - flight_begun
-        transport.close()  # the vehicle sees the end and saves its truth
-        if process is not None and (failure := _failure(process)):
+            crash = _fly(sortie)
+        sortie.note_end()
+        end.transport.close()  # the vehicle sees the end and saves its truth
+        if failure := end.failure():
             flight.explain(str(failure))
-        host = {
-            "started": started.isoformat(timespec="seconds"),
-            "startup_s": round(flight_begun - begun, 3),
-            "flight_wall_s": round(flight_wall_s, 3),
-            "machine": host_platform.machine(),
-            "cores": os.cpu_count(),
-            "isolated": list(config.isolate),
-            "memory_mb": _memory_mb(),
-            "stage_wall_s": {k: round(v, 4) for k, v in flight.wall.totals.items()},
-            "vehicle_stage_wall_s": _vehicle_stages(truth_folder),
-        }
-        truth, referee = _read_truth(truth_folder)
-        _write(flight, folder, config, host, truth, referee, crash)
-    return folder
+        truth, referee = _read_truth(end.truth_folder)
+        vehicle = _vehicle_host(end.truth_folder)
+        sortie.branch_rest()
+        _write(sortie, _host(sortie, vehicle), truth, referee, crash)
+    return sortie.folder
+
+
+def fly_together(branching: Branching, place: Path, vehicles: VehicleTemplate) -> RunFolder:
+    """Fly missions that differ in their fault only, as one flight until each fault strikes.
+
+    Args:
+        branching: the missions; every one that branches off returns from here as well, in a process
+            of its own.
+        place: of what the flight leaves while it is none of the missions.
+        vehicles: forks the simulated vehicles.
+
+    Returns:
+        The run folder of the mission that the process has become.
+
+    Raises:
+        MavfiError: as `fly_mission`.
+    """
+    config = replace(branching.members[0].config, fault=None)
+    out = place if branching.me is None else branching.members[branching.me].out
+    return fly_mission(config, out, Watcher(), vehicles=vehicles, branching=branching)
+
+
+def _host(sortie: Sortie, vehicle: Mapping[str, Any]) -> dict[str, Any]:
+    """What this machine had to do for it: no part of what repeats."""
+    own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {
+        "started": sortie.started.isoformat(timespec="seconds"),
+        "startup_s": round(sortie.flight_begun_s - sortie.begun_s, 3),
+        "flight_wall_s": round(sortie.flight_wall_s, 3),
+        "branched_s": sortie.branched_s,
+        "machine": host_platform.machine(),
+        "cores": os.cpu_count(),
+        "isolated": list(sortie.config.isolate),
+        "memory_mb": {
+            "companion": round(own_mb, 1),
+            "vehicle": round(vehicle.get("memory_mb", 0.0), 1),
+        },
+        "stage_wall_s": _rounded(sortie.flight.wall.totals),
+        "vehicle_stage_wall_s": _rounded(vehicle.get("stage_wall_s", {})),
+    }
 
 
 @contextlib.contextmanager
@@ -127,13 +161,17 @@ def _injection(
     out: Path,
     repeat: Mapping[str, Any] | None,
     for_debugger: Callable[[int], None] | None,
+    vehicles: VehicleTemplate | None,
 ) -> Iterator[InstructionInjection | None]:
     """The instruction-level fault of a mission, its node's process already starting."""
     if config.instruction is None:
         yield None
         return
     require_possible(config.link)
-    planned = planned_of(repeat) if repeat is not None else _plan(config, config.instruction, out)
+    if repeat is not None:
+        planned = planned_of(repeat)
+    else:
+        planned = _plan(config, config.instruction, out, vehicles)
     injection = InstructionInjection(planned, SpawnedNode(), for_debugger)
     try:
         yield injection
@@ -141,55 +179,28 @@ def _injection(
         injection.close()
 
 
-def _plan(config: MissionConfig, asked: InstructionConfig, out: Path) -> PlannedFault:
+def _plan(
+    config: MissionConfig, asked: InstructionConfig, out: Path, vehicles: VehicleTemplate | None
+) -> PlannedFault:
     def fly_golden(golden: MissionConfig, folder: Path, recorder: Recorder) -> None:
-        flown = fly_mission(golden, folder, Watcher(), recorder=recorder)
+        flown = fly_mission(golden, folder, Watcher(), recorder=recorder, vehicles=vehicles)
         if json.loads(flown.result.read_text())["referee"] is None:  # nothing to draw from
             raise VehicleProcessError("the vehicle process of the golden flight died")
 
     return plan_fault(config, asked, out, installed_versions(), fly_golden)
 
 
-def _fly(flight: Flight, folder: RunFolder) -> str | None:
+def _fly(sortie: Sortie) -> str | None:
     """Fly to the end. A crash of the companion's software is an outcome: returns its traceback."""
+    flight = sortie.flight
     try:
-        flight.fly(folder.tlog)
+        flight.fly(sortie.folder.tlog)
     except MavfiError:
         raise
     except Exception as error:  # the mission-process boundary: a crash is a result
         flight.end(Outcome.CRASH, f"{type(error).__name__}: {error}")
         return traceback.format_exc()
     return None
-
-
-@contextlib.contextmanager
-def _vehicle(
-    config: MissionConfig,
-) -> Iterator[tuple[Transport, Path | None, VehicleProcess | None]]:
-    """The other end: a simulated vehicle of our own, or a foreign autopilot."""
-    if config.link is not None:
-        warm_up()  # first: what comes meanwhile would be stale, and the link full of it
-        transport = open_transport(config.link)
-        try:
-            yield transport, None, None
-        finally:
-            transport.close()
-        return
-    with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
-        process = VehicleProcess(config, Path(folder))
-        transport = open_transport(f"fd:{process.detach()}")
-        try:
-            warm_up()  # while the vehicle starts
-            yield transport, Path(folder), process
-        finally:
-            transport.close()
-            process.stop()
-            process.close()
-
-
-def _failure(process: VehicleProcess) -> MavfiError | None:
-    process.stop()
-    return process.failure()
 
 
 @contextlib.contextmanager
@@ -219,30 +230,26 @@ def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, An
     return truth, json.loads((folder / "truth.json").read_text())
 
 
-def _memory_mb() -> dict[str, float]:
-    """Peak resident memory, MB, of this process and of the largest of its children so far."""
-    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    return {"companion": round(own / 1024, 1), "vehicle": round(children / 1024, 1)}
-
-
-def _vehicle_stages(folder: Path | None) -> dict[str, float]:
-    """Where the host time of the vehicle's process went, s."""
+def _vehicle_host(folder: Path | None) -> dict[str, Any]:
+    """What the vehicle's process tells of itself: stages, s, and memory, MB."""
     if folder is None or not (folder / "host.json").is_file():
         return {}
-    stages = json.loads((folder / "host.json").read_text())["stage_wall_s"]
+    told: dict[str, Any] = json.loads((folder / "host.json").read_text())
+    return told
+
+
+def _rounded(stages: Mapping[str, float]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in stages.items()}
 
 
 def _write(
-    flight: Flight,
-    folder: RunFolder,
-    config: MissionConfig,
+    sortie: Sortie,
     host: dict[str, Any],
     truth: quality.Truth | None,
     referee: dict[str, Any] | None,
     crash: str | None,
 ) -> None:
+    flight, folder, config = sortie.flight, sortie.folder, sortie.config
     companion = flight.companion
     goal = flight.goal_enu_m
     if truth is not None and goal is not None:

@@ -7,33 +7,82 @@ import socket
 import subprocess
 import sys
 import tempfile
+from copy import copy
 from pathlib import Path
 
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.vehicle_template import ForkedVehicle, VehicleTemplate
+
+_FOR_EVER_S = "1e9"
 
 
 class VehicleProcess:
-    """`python -m sitl` in lockstep. Closing the socket ends it and saves the referee's truth."""
+    """`python -m sitl` in lockstep. Closing the socket ends it and saves the referee's truth.
 
-    def __init__(self, config: MissionConfig, truth_folder: Path) -> None:
+    Args:
+        config: the mission.
+        truth_folder: where the vehicle leaves briefing and truth.
+        template: forks the vehicle; None: it is started as a program.
+        patient: the companion may take as long as it likes to answer.
+    """
+
+    def __init__(
+        self,
+        config: MissionConfig,
+        truth_folder: Path,
+        template: VehicleTemplate | None = None,
+        *,
+        patient: bool = False,
+    ) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        arguments = _arguments(config, truth_folder)
+        if patient:
+            arguments += ["--answer-limit", _FOR_EVER_S]
+        self._process: subprocess.Popen[bytes] | ForkedVehicle
         with theirs:
             try:
-                self._process = subprocess.Popen(
-                    _command_line(config, theirs.fileno(), truth_folder),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=self._errors,
-                    pass_fds=[theirs.fileno()],
-                    start_new_session=True,  # Ctrl-C is for the companion, which then closes
-                )
-            except OSError as error:
+                if template is None:
+                    self._process = self._started(arguments, theirs)
+                else:
+                    self._process = template.start(arguments, theirs, self._errors.fileno())
+            except (OSError, VehicleProcessError) as error:
                 ours.close()
-                self.close()
+                self._errors.close()
+                if isinstance(error, VehicleProcessError):
+                    raise
                 raise VehicleProcessError(f"cannot start the vehicle: {error}") from None
         self._socket = ours
+
+    def _started(self, arguments: list[str], link: socket.socket) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "sitl", *arguments, "--fd", str(link.fileno())],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+            pass_fds=[link.fileno()],
+            start_new_session=True,  # Ctrl-C is for the companion, which then closes
+        )
+
+    def branch(self, truth_folder: Path) -> VehicleProcess:
+        """The vehicle once more, as it is while it waits for an answer; a fork of a template only.
+
+        Raises:
+            VehicleProcessError: it does not branch.
+        """
+        assert isinstance(self._process, ForkedVehicle)
+        twin = copy(self)
+        twin._errors = tempfile.TemporaryFile()  # noqa: SIM115 - as above
+        twin._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        with theirs:
+            try:
+                twin._process = self._process.branch(truth_folder, theirs, twin._errors.fileno())
+            except VehicleProcessError:
+                twin._socket.close()
+                twin._errors.close()
+                raise
+        return twin
 
     def detach(self) -> int:
         """Our end of the socket pair; the caller closes it."""
@@ -50,6 +99,8 @@ class VehicleProcess:
     def close(self) -> None:
         """Forget what it said; after `stop`."""
         self._errors.close()
+        if isinstance(self._process, ForkedVehicle):
+            self._process.close()
 
     def failure(self) -> VehicleProcessError | None:
         """What it said when it ended with an error; None where it ended well."""
@@ -67,10 +118,9 @@ class VehicleProcess:
         return VehicleProcessError(f"the vehicle process {how}{last}")
 
 
-def _command_line(config: MissionConfig, fd: int, truth_folder: Path) -> list[str]:
+def _arguments(config: MissionConfig, truth_folder: Path) -> list[str]:
     line = [
-        sys.executable, "-m", "sitl",
-        "--fd", str(fd), "--lockstep",
+        "--lockstep",
         "--world", config.world, "--seed", str(config.seed), "--vehicle", config.vehicle,
         "--camera-size", f"{config.camera_columns}x{config.camera_rows}",
         "--camera-rate", f"{config.camera_rate_hz:g}",

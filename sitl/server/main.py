@@ -6,6 +6,8 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.link.signing import Signing, key_from_passphrase
@@ -21,18 +23,32 @@ from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m sitl`; the exit code. A known error is one line on stderr and 1."""
+@dataclass(slots=True)
+class Place:
+    """Where the truth is saved at the end; None for nowhere. May change while it flies."""
+
+    truth: Path | None = None
+
+
+def main(arguments: Sequence[str] | None = None, place: Place | None = None) -> int:
+    """Run `python -m sitl`; the exit code. A known error is one line on stderr and 1.
+
+    Args:
+        arguments: of the command line.
+        place: told where the truth goes; asked again when it is saved.
+    """
     options = parse(sys.argv[1:] if arguments is None else arguments)
+    place = place or Place()
+    place.truth = options.truth
     try:
-        serve(options)
+        serve(options, place)
     except MavfiError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the one boundary
         return 1
     return 0
 
 
-def serve(options: Options) -> None:
+def serve(options: Options, place: Place) -> None:
     """Run until the peer closes, or SIGINT or SIGTERM; save the truth whatever ends it."""
     stopped = _stop_on_signals()
     simulation = _simulation(options)
@@ -42,8 +58,8 @@ def serve(options: Options) -> None:
     try:
         run(options, simulation, stopped)
     finally:
-        if options.truth is not None:
-            simulation.save_truth(options.truth)
+        if place.truth is not None:
+            simulation.save_truth(place.truth)
 
 
 def _simulation(options: Options) -> Simulation:

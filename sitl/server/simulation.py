@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,9 @@ class Simulation:
             "propeller": truth.energy_propeller_j,
         }
         self.referee.save(folder, energies)
-        write_json(folder / HOST_FILE, {"stage_wall_s": self.wall.totals})
+        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        host = {"stage_wall_s": self.wall.totals, "memory_mb": memory_mb}
+        write_json(folder / HOST_FILE, host)
 
     def _look(self) -> None:
         autopilot = self.autopilot

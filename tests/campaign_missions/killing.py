@@ -14,10 +14,11 @@ from collections import Counter
 from pathlib import Path
 
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.processes import MISSION, SLOT, TEMPLATE
+from mavfi_cli.core.processes import MISSION, SLOT, TEMPLATE, VEHICLE, VEHICLES
 
-RUNNER, VEHICLE = "runner", "vehicle"
-VICTIMS = (RUNNER, TEMPLATE, SLOT, MISSION, VEHICLE)
+RUNNER = "runner"
+WITHOUT_VEHICLES = (RUNNER, TEMPLATE, SLOT, MISSION)
+VICTIMS = (*WITHOUT_VEHICLES, VEHICLE, VEHICLES)
 _MARK = "MAVFI_TEST_CAMPAIGN"
 
 

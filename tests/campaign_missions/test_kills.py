@@ -8,7 +8,7 @@ from functools import partial
 from conftest import planned
 from killing import (
     RUNNER,
-    VICTIMS,
+    WITHOUT_VEHICLES,
     complete_with_kills,
     kill_one,
     processes,
@@ -16,7 +16,7 @@ from killing import (
     start_fake,
 )
 
-from mavfi_cli.campaign.processes import MISSION, SLOT
+from mavfi_cli.core.processes import MISSION, SLOT
 
 MISSIONS, KILLS = 40, 8
 
@@ -26,7 +26,7 @@ def test_random_kills_lose_and_double_nothing(tmp_path):
     assert start_fake(undisturbed, MISSIONS).wait() == 0
     start = partial(start_fake, disturbed, MISSIONS)
     hits = complete_with_kills(
-        start, str(disturbed), KILLS, seed=1, pause_s=0.2, victims=VICTIMS[:-1]
+        start, str(disturbed), KILLS, seed=1, pause_s=0.2, victims=WITHOUT_VEHICLES
     )
     assert hits.total() == KILLS
     assert results_of(disturbed) == results_of(undisturbed)

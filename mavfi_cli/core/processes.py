@@ -1,0 +1,103 @@
+"""Processes of one mission: how they are bound to their keeper, found, and ended."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+from pathlib import Path
+
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
+# What ps calls them.
+TEMPLATE, SLOT, MISSION = "mavfi-template", "mavfi-slot", "mavfi-mission"
+VEHICLES, VEHICLE = "mavfi-vehicles", "mavfi-vehicle"  # the template of vehicles, and one
+ONE_THREAD = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "JE_ARROW_MALLOC_CONF": "background_thread:false",
+}
+"""Environment of a process that forks itself: the libraries that it loads start no threads."""
+
+_prctl = ctypes.CDLL(None, use_errno=True).prctl
+
+
+def become_reaper() -> None:
+    """From now on orphans among the descendants of this process become its children."""
+    _request(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def die_with(parent: int) -> None:
+    """Have this process killed when its parent ends; end now where that has happened already."""
+    _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def fork_beside(reaper: int) -> int:
+    """Fork, with a reaper as the parent instead of this process; 0 in the child.
+
+    Args:
+        reaper: process id of the nearest reaper among the ancestors of this process. The child dies
+            with it.
+    """
+    reading, writing = os.pipe()
+    between = os.fork()
+    if between:
+        os.close(writing)
+        with open(reading, "rb", buffering=0) as pipe:
+            told = pipe.read()
+        os.waitpid(between, 0)
+        return int(told)
+    middle = os.getpid()
+    child = os.fork()
+    if child:
+        os.write(writing, str(child).encode())
+        os._exit(0)
+    os.close(reading)
+    os.close(writing)
+    while os.getppid() == middle:  # it is about to end
+        os.sched_yield()
+    die_with(reaper)
+    return 0
+
+
+def threads() -> int:
+    """How many threads this process has. A fork has only one of them, and the others' locks."""
+    return len(os.listdir("/proc/self/task"))
+
+
+def call_this_process(name: str) -> None:
+    """Have ps and top call this process so; at most 15 bytes."""
+    _request(_PR_SET_NAME, ctypes.c_char_p(name.encode()))
+
+
+def _request(option: int, value: int | ctypes.c_char_p) -> None:
+    if _prctl(option, value, 0, 0, 0) != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+
+
+def end_children(spare: int | None = None) -> None:
+    """Kill and reap every descendant of this process, which is their reaper.
+
+    A killed child leaves its own children to us, so the loop ends when there are none.
+
+    Args:
+        spare: a child that is left alone, with all that it started.
+    """
+    while children := [pid for pid in _children() if pid != spare]:
+        for pid in children:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        for pid in children:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, 0)
+
+
+def _children() -> list[int]:
+    found: list[int] = []
+    for task in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):
+            found += map(int, (task / "children").read_text().split())
+    return found

@@ -1,0 +1,85 @@
+"""Real flights with forked vehicles: whatever is killed, nothing is lost, and none is left."""
+
+import os
+import signal
+import time
+from dataclasses import replace
+
+import pytest
+from killing import processes, results_of
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.core.processes import MISSION, VEHICLE, VEHICLES
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def missions(short_config):
+    return [PlannedMission(config=replace(short_config, seed=seed)) for seed in range(1, 5)]
+
+
+@pytest.fixture(scope="module")
+def started(missions, tmp_path_factory):
+    """Results of the same missions with vehicles that are programs."""
+    folder = tmp_path_factory.mktemp("started") / "campaign"
+    run_campaign(missions, folder, Options(jobs=1, keep=Keep.NONE, fork=False)).close()
+    return results_of(folder)
+
+
+class _Killer(Spectator):
+    """Kills one process of a kind as soon as a vehicle flies."""
+
+    def __init__(self, mark, victim):
+        self._mark, self._victim = mark, victim
+        self.struck = False
+        self.notes = []
+
+    def on_progress(self, progress):
+        found = processes(self._mark)
+        if not self.struck and VEHICLE in found and self._victim in found:
+            os.kill(found[self._victim][0], signal.SIGKILL)
+            self.struck = True
+
+    def on_note(self, text):
+        self.notes.append(text)
+
+
+@pytest.mark.parametrize("victim", [MISSION, VEHICLE, VEHICLES])
+def test_a_kill_costs_an_attempt_and_no_mission(victim, missions, started, tmp_path, monkeypatch):
+    mark = str(tmp_path)
+    monkeypatch.setenv("MAVFI_TEST_CAMPAIGN", mark)
+    monkeypatch.setattr("mavfi_cli.campaign.run._LOOK_S", 0.02)
+    killer = _Killer(mark, victim)
+    with run_campaign(missions, tmp_path / "campaign", Options(jobs=1), killer) as ledger:
+        attempts = sorted(result.attempts for result in ledger.results())
+    assert killer.struck
+    assert len(killer.notes) == 1
+    assert killer.notes[0].endswith("begun again")
+    assert attempts == [1, 1, 1, 2]
+    assert results_of(tmp_path / "campaign") == started
+    deadline = time.monotonic() + 30.0
+    while {VEHICLE, VEHICLES} & set(processes(mark)):
+        assert time.monotonic() < deadline, "a vehicle is left"
+        time.sleep(0.05)
+
+
+def test_a_mission_whose_time_runs_out_leaves_no_vehicle(short_config, tmp_path, monkeypatch):
+    mark = str(tmp_path)
+    monkeypatch.setenv("MAVFI_TEST_CAMPAIGN", mark)
+    slow = PlannedMission(config=replace(short_config, realtime=True))
+    usual = PlannedMission(config=short_config)
+    seen = []
+
+    class Watch(Spectator):
+        def on_progress(self, _progress):
+            seen.append(set(processes(mark)))
+
+    options = Options(jobs=1, limit_s=8.0, keep=Keep.NONE)
+    with run_campaign([slow, usual], tmp_path / "campaign", options, Watch()) as ledger:
+        assert [result.outcome for result in ledger.results()] == ["hang", "success"]
+    assert any(VEHICLE in kinds for kinds in seen)
+    assert not {VEHICLE, VEHICLES} & set(processes(mark))
