@@ -127,7 +127,7 @@ def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkey
     monkeypatch.chdir(home)
     plan = ComparePlan(world="posts.toml", inject=("waypoint_position",),
                        detectors=("none", "gad"), missions=1, first_seed=2)  # fmt: skip
-    folder, options = home / "resumed", Options(jobs=1)
+    folder, options = home / "resumed", Options(jobs=2)
     with pytest.raises(Interrupted):
         compare(plan, folder, options, Stopper())
     with Ledger(folder) as ledger:
