@@ -9,6 +9,8 @@ from pathlib import Path
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.vehicle_process import VehicleProcess
 
+START_S = 300.0  # the first start after an installation compiles, on a busy machine for minutes
+
 
 def ask_vehicle(config: MissionConfig) -> None:
     """Start the vehicle of a mission, and end it at once.
@@ -20,7 +22,7 @@ def ask_vehicle(config: MissionConfig) -> None:
         process = VehicleProcess(config, Path(folder))
         try:
             os.close(process.detach())
-            process.stop()
+            process.stop(START_S)
             failure = process.failure()
         finally:
             process.close()
