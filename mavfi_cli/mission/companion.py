@@ -252,6 +252,7 @@ class Companion:
         due_s = stamp_s + self._control_delay_s(stamp_s)
         if command is None:
             return None
+        frame_s, self._fresh_frame_s = self._fresh_frame_s, None
         flown = directive.trajectory
         return Setpoint(
             due_s=due_s,
@@ -259,6 +260,7 @@ class Companion:
             directive=directive,
             waypoint=0 if flown is None else waypoint_index(flown, directive.time_s),
             attempt=attempt,
+            frame_s=frame_s,
         )
 
     def _control_delay_s(self, stamp_s: float) -> float:
@@ -273,6 +275,8 @@ class Companion:
         """
         command = self._injection.pass_on(setpoint.command, self._moment(stamp_s))
         passes, retry = self._recovery.admit_command(command, setpoint, self.command, stamp_s)
+        if not passes and self._fresh_frame_s is None:
+            self._fresh_frame_s = setpoint.frame_s  # still unanswered
         if retry is not None:
             self._compute_again(stamp_s, retry)
         if not passes:
@@ -280,11 +284,10 @@ class Companion:
         self.command = command
         if self._injection.follower is not None:
             self._injection.follower.read(command, "setpoint", stamp_s, COMMAND_STATES)
-        if self._fresh_frame_s is not None:
+        if setpoint.frame_s is not None:
             self.reactions.append(
-                Reaction(frame_stamp_s=self._fresh_frame_s, setpoint_stamp_s=stamp_s)
+                Reaction(frame_stamp_s=setpoint.frame_s, setpoint_stamp_s=stamp_s)
             )
-            self._fresh_frame_s = None
 
     def _compute_again(self, stamp_s: float, retry: Retry) -> None:
         assert self._state is not None

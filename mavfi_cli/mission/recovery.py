@@ -37,6 +37,7 @@ class Setpoint:
     directive: Directive
     waypoint: int  # of the directive's trajectory
     attempt: int = 0  # how often it was computed again
+    frame_s: float | None = None  # of a depth frame whose verdict no earlier command knew
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,6 +8,7 @@ import pytest
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
 from mavfi_cli.mission.platform import KERNELS, LatencyModel, load_platform, platform_names
+from mavfi_cli.mission.timetable import read_timetable
 
 SOUND = 'name = "mine"\ncores = 2\n' + "".join(
     f"[kernels.{kernel}]\nlatency_s = {0.01 * (k + 1):.2f}\nspread = 0.5\n"
@@ -213,3 +214,16 @@ def test_a_flight_responds_as_late_as_its_platform_s_kernels(fly_short, short_fl
     octomap_s = load_platform("tx2").kernels["octomap"].latency_s
     assert octomap_s < tx2 < 2.0 * octomap_s
     assert octomap_s / 2 < mine < octomap_s
+
+
+def test_a_frame_is_answered_by_a_command_that_knew_of_it(fly_short):
+    """Control that takes most of a tick: what goes out next was computed before the verdict."""
+    folder = fly_short(platform="tx2-2c-0.81")
+    table = read_timetable(folder.kernels)
+    control = [each for each in table.invocations if each.node == "control"]
+    checks = [each.end_s for each in table.invocations if each.node == "collision_check"]
+    assert table.reactions
+    for reaction in table.reactions:
+        out_s = reaction.setpoint_stamp_s
+        verdict_s = max(end_s for end_s in checks if end_s <= out_s)
+        assert any(c.start_s >= verdict_s - 1e-9 and c.end_s <= out_s + 1e-9 for c in control)
