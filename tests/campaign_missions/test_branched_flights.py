@@ -22,7 +22,7 @@ from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
-FILES = ("trace.parquet", "plans.parquet", "flight.tlog", "fault.json")
+FILES = ("trace.parquet", "plans.parquet", "kernels.parquet", "flight.tlog", "fault.json")
 DETECTOR = DetectorConfig(name="gad")
 FAULTS = [
     *(FaultConfig(target=stage, seed=seed) for seed, stage in enumerate(
