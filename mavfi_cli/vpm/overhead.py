@@ -91,13 +91,8 @@ def _of_flight(result: Mapping[str, Any]) -> Overhead | None:
     walls, kernels = host.get("stage_wall_s") or {}, result.get("kernels") or {}
     if not detection or result.get("fault") or "gate" not in walls:
         return None
-    again = _recomputations(detection)
     compute_s = math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels)
-    recompute_s = math.fsum(
-        count * _mean_s(kernels.get(name))
-        for stage, count in again.items()
-        for name in RECOMPUTED[stage]
-    )
+    recompute_s = recomputed_s(result)
     host_compute_s = math.fsum(walls.get(name, 0.0) for name in KERNELS)
     if compute_s <= recompute_s or host_compute_s <= 0.0:
         return None
@@ -108,7 +103,17 @@ def _of_flight(result: Mapping[str, Any]) -> Overhead | None:
         recompute_s=recompute_s,
         compute_s=compute_s,
         host_compute_s=host_compute_s,
-        alarms=round(math.fsum(again.values())),
+        alarms=round(math.fsum(_recomputations(detection).values())),
+    )
+
+
+def recomputed_s(result: Mapping[str, Any]) -> float:
+    """Simulated seconds that what a detector had computed again took in a flight with one."""
+    kernels = result.get("kernels") or {}
+    return math.fsum(
+        count * _mean_s(kernels.get(name))
+        for stage, count in _recomputations(result["detection"]).items()
+        for name in RECOMPUTED[stage]
     )
 
 
