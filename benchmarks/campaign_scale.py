@@ -33,11 +33,15 @@ DISPATCH_LIMIT_S, LEDGER_LIMIT_S = 0.005, 10.0
 
 
 def prepare() -> None:
-    """Nothing: the task's first half."""
+    """Nothing to load: a part of the task, as the two below."""
 
 
-def perform(_changes: Mapping[str, Any], out: Path) -> Path:
-    """A mission that does nothing but leave its record: the task's second half."""
+def equip() -> None:
+    """No vehicles."""
+
+
+def perform(_changes: Mapping[str, Any], out: Path, _vehicles: None) -> Path:
+    """A mission that does nothing but leave its record."""
     run = out / "nothing-1"
     run.mkdir()
     (run / "result.json").write_text('{"outcome": "success", "reason": "", "nodes": {}}')

@@ -36,13 +36,13 @@ def compiled(function: F) -> F:
 def _numba() -> Any:
     """numba, without BLAS: it would import all of scipy.linalg to look for it.
 
-    That takes 0.14 s of processor time in every process, which no kernel here makes use of: one that
-    multiplies matrices (`@`, `np.dot`, `np.linalg`) would not compile, and says so.
+    That takes 0.14 s of processor time in every process, for nothing: no kernel here multiplies
+    matrices. One that did (`@`, `np.dot`, `np.linalg`) would not compile, and says so.
     """
     import numba
 
     if "numba.np.arraymath" not in sys.modules and _BLAS not in sys.modules:
-        sys.modules[_BLAS] = None  # type: ignore[assignment] - importing it fails
+        sys.modules[_BLAS] = None  # type: ignore[assignment]  # an import of it fails
         try:
             import numba.np.arraymath
         finally:
