@@ -1,4 +1,4 @@
-"""What detectors are worth, drawn: ROC and precision-recall, and what is recovered."""
+"""What detectors are worth, drawn: ROC and precision-recall, and what is undone."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _square(axes: Axes, x: str, y: str) -> None:
 
 
 def draw_recovery_plot(evaluation: Evaluation) -> Figure:
-    """A matplotlib figure: lost missions that are recovered by stage, worst flights by world."""
+    """A matplotlib figure: harmful faults whose harm is undone by stage, worst flights by world."""
     from matplotlib.figure import Figure
 
     rows = evaluation["faults"]
@@ -99,11 +99,11 @@ def draw_recovery_plot(evaluation: Evaluation) -> Figure:
     stages = [row for row in rows if row["by"] in ("all", "stage") and row["detector"] != "none"]
     _bars(
         shares, stages, [name for name in names if name != "none"], colours,
-        lambda row: (row["recovered"]["share"], row["recovered"]["low"], row["recovered"]["high"]),
-        lambda row: f"{row['value']}\nn = {row['recovered']['total']}",
+        lambda row: (row["undone"]["share"], row["undone"]["low"], row["undone"]["high"]),
+        lambda row: f"{row['value']}\nn = {row['undone']['total']}",
     )  # fmt: skip
     shares.set_ylim(0.0, 105.0)
-    shares.set_ylabel("lost missions that are recovered, %", fontsize=8.5)
+    shares.set_ylabel("harmful faults whose harm is undone, %", fontsize=8.5)
     _bars(
         times, [row for row in rows if row["by"] == "world"], names, colours,
         lambda row: (row["worst"]["protected"], None, None),
@@ -115,7 +115,7 @@ def draw_recovery_plot(evaluation: Evaluation) -> Figure:
         handles=handles, loc="outside upper center", ncols=len(names), frameon=False, fontsize=8.5
     )
     figure.supxlabel(
-        "left: whiskers are 95 % Wilson intervals, n lost missions; right: successful flights "
+        "left: whiskers are 95 % Wilson intervals, n harmful faults; right: successful flights "
         "with n active faults", fontsize=7.5, color=NOTE,
     )  # fmt: skip
     return figure
