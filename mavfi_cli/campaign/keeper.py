@@ -39,12 +39,14 @@ class _Process:
         self.descriptor = os.pidfd_open(self.pid)
 
     def reap(self) -> None:
+        """Take its exit status, once it has ended."""
         os.close(self.descriptor)
         _, self.status = os.waitpid(self.pid, 0)
         self.ended_s = time.monotonic()
 
     @property
     def wall_s(self) -> float:
+        """From its begin to its end, without the time in which it waited for its branches, s."""
         return self.ended_s - self.begun_s - self.away_s
 
 

@@ -110,6 +110,7 @@ def _keep(
     place = first.with_name(f"trunk-{first.name}")
 
     def perform(writing: list[int]) -> NoReturn:
+        """What the order's process does."""
         _perform(Desk(order["missions"], writing, slot, place), task, slot, vehicles)
 
     Keeper(order, channel, perform, equipment.settle).keep()

@@ -183,6 +183,7 @@ def _plan(
     config: MissionConfig, asked: InstructionConfig, out: Path, vehicles: VehicleTemplate | None
 ) -> PlannedFault:
     def fly_golden(golden: MissionConfig, folder: Path, recorder: Recorder) -> None:
+        """The flight whose invocations a fault is drawn from."""
         flown = fly_mission(golden, folder, Watcher(), recorder=recorder, vehicles=vehicles)
         if json.loads(flown.result.read_text())["referee"] is None:  # nothing to draw from
             raise VehicleProcessError("the vehicle process of the golden flight died")

@@ -208,6 +208,7 @@ def _numbers(row: Mapping[str, Any], plan: FlightPlan, flights: Flights) -> dict
     power_w: float = row["power_w"]
 
     def model_time_s(result: Mapping[str, Any]) -> float:
+        """The straight way of a mission at the model's velocity, s."""
         return measures.straight_m(result) / velocity
 
     time_s = flights.mean(model_time_s).value
