@@ -9,9 +9,11 @@ and runs the campaign again until it is complete.
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "campaign
 
 from killing import complete_with_kills, marked, results_of
 from missions import MAVFI
+
+Result = tuple[int, str, str]  # number, outcome, record as JSON
 
 SPEC = """
 name = "kills"
@@ -46,6 +50,27 @@ def start(spec: Path, folder: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen([*line, "--quiet"], stdout=subprocess.DEVNULL, env=marked(str(folder)))
 
 
+def differences(expected: list[Result], found: list[Result]) -> Iterator[str]:
+    """Missions that came out otherwise, a line each: what of their records differs."""
+    one, other = ({number: rest for number, *rest in each} for each in (expected, found))
+    for number in sorted({*one, *other}):
+        if number not in one or number not in other:
+            yield f"mission {number}: only {'undisturbed' if number in one else 'disturbed'}"
+            continue
+        (outcome, text), (outcome_other, text_other) = one[number], other[number]
+        if (outcome, text) != (outcome_other, text_other):
+            records = json.loads(text), json.loads(text_other)
+            keys = [
+                key
+                for key in sorted({*records[0], *records[1]})
+                if records[0].get(key) != records[1].get(key)
+            ]
+            yield (
+                f"mission {number}: {outcome}, disturbed {outcome_other}"
+                f" ({records[1].get('reason')}); differs in {', '.join(keys)}"
+            )
+
+
 def main() -> None:
     """Fly it twice, once with kills, and compare."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -63,11 +88,12 @@ def main() -> None:
         hits = complete_with_kills(
             partial(start, spec, disturbed), str(disturbed), given.kills, given.seed, pause_s=4.0
         )
-        same = results_of(disturbed) == results_of(home / "undisturbed")
-        count = len(results_of(disturbed))
+        expected, found = results_of(home / "undisturbed"), results_of(disturbed)
+    differing = list(differences(expected, found))
     print(f"{hits.total()} kills: {', '.join(f'{k} {v}' for k, v in sorted(hits.items()))}")
-    print(f"{count} missions, results {'the same' if same else 'DIFFERENT'}")
-    if not same or hits.total() < given.kills:
+    print(f"{len(found)} missions, results {'DIFFERENT' if differing else 'the same'}")
+    print("\n".join(differing))
+    if differing or hits.total() < given.kills:
         raise SystemExit(1)
 
 
