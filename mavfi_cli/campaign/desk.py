@@ -66,11 +66,14 @@ class Desk:
     def fork(self, mission: int) -> bool:
         """Fork: True in the new process, which is the mission; False here.
 
-        With several threads there is no fork: the mission is left out.
+        With several threads there is no fork, nor where it is killed at once: the mission is left
+        out.
         """
         if threads() > 1:
             return False
         pid = fork_beside(self._slot)
+        if pid is None:
+            return False
         if pid == 0:
             os.setsid()
             self.become(mission)

@@ -100,10 +100,13 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
     crashes = [
         crash["how"] for node in result.get("nodes", {}).values() for crash in node["crashes"]
     ]
-    vehicle = outcome == Outcome.LINK_LOST.value and config.get("link") is None
-    doubts = [how for how in [*crashes, reason if vehicle else ""] if how.endswith(_OUTSIDE_WORDS)]
-    if config.get("link") is None and result.get("referee", {}) is None:
-        doubts.append("the vehicle died before it had saved the truth")
+    if config.get("link") is None:  # no fault of the companion's can kill the simulated vehicle
+        if outcome == Outcome.LINK_LOST.value and reason.endswith(_OUTSIDE_WORDS):
+            return Verdict(state=None, result={}, reason=reason)
+        if result.get("referee", {}) is None:
+            reason = "the vehicle died before it had saved the truth"
+            return Verdict(state=None, result={}, reason=reason)
+    doubts = [how for how in crashes if how.endswith(_OUTSIDE_WORDS)]
     return Verdict(state=State.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts))
 
 
@@ -111,6 +114,8 @@ def _refused(kind: str, text: str) -> Verdict:
     """A mission that could not begin, or not write its record."""
     if kind in _OF_THE_MACHINE:
         raise CampaignStopped(text)
+    if kind in _BY_CHANCE and text.endswith(_OUTSIDE_WORDS):
+        return Verdict(state=None, result={}, reason=text)
     return Verdict(state=State.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
 
 

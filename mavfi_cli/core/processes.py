@@ -34,12 +34,15 @@ def die_with(parent: int) -> None:
         os._exit(1)
 
 
-def fork_beside(reaper: int) -> int:
-    """Fork, with a reaper as the parent instead of this process; 0 in the child.
+def fork_beside(reaper: int) -> int | None:
+    """Fork, with a reaper as the parent instead of this process.
 
     Args:
         reaper: process id of the nearest reaper among the ancestors of this process. The child dies
             with it.
+
+    Returns:
+        0 in the child, its process id here; None where something killed it before it could say so.
     """
     reading, writing = os.pipe()
     between = os.fork()
@@ -48,13 +51,12 @@ def fork_beside(reaper: int) -> int:
         with open(reading, "rb", buffering=0) as pipe:
             told = pipe.read()
         os.waitpid(between, 0)
-        return int(told)
+        return int(told) if told else None
     middle = os.getpid()
-    child = os.fork()
-    if child:
-        os.write(writing, str(child).encode())
+    if os.fork():
         os._exit(0)
     os.close(reading)
+    os.write(writing, str(os.getpid()).encode())
     os.close(writing)
     while os.getppid() == middle:  # it is about to end
         os.sched_yield()

@@ -60,6 +60,8 @@ def perform(changes, out, vehicles):
         raise RecordError("result.json: No space left on device")
     elif world == "vehicle":
         raise VehicleProcessError("the vehicle process was killed by SIGKILL")
+    elif world == "no-vehicle":
+        raise VehicleProcessError("the vehicle process ended with code 1")
     elif world == "defect":
         raise ZeroDivisionError("a defect")
     (run / "result.json").write_text(json.dumps(record(changes, seed, world, value)))

@@ -93,9 +93,16 @@ def test_a_mission_killed_each_time_stays_missing(campaign):
         assert [number for number, *_ in ledger.missing()] == [1]
 
 
-@pytest.mark.parametrize("world", ["end:link_lost", "node:killed by SIGKILL", "untrue"])
-def test_a_record_that_something_outside_had_a_hand_in_is_doubted_first(campaign, world):
-    result = only(campaign.run(planned(world)))
+@pytest.mark.parametrize("world", ["end:link_lost", "untrue", "vehicle"])
+def test_a_mission_whose_vehicle_is_killed_each_time_is_still_to_be_flown(campaign, world):
+    with pytest.raises(CampaignStopped, match="1 missions were ended from outside 3 times"):
+        campaign.run(planned("fly", world))
+    with Ledger(campaign.folder) as ledger:
+        assert [number for number, *_ in ledger.missing()] == [1]
+
+
+def test_a_node_that_is_killed_each_time_is_believed_at_last(campaign):
+    result = only(campaign.run(planned("node:killed by SIGKILL")))
     assert (result.state, result.attempts) == (State.FLOWN, ATTEMPTS)
 
 
@@ -103,7 +110,7 @@ def test_a_record_that_something_outside_had_a_hand_in_is_doubted_first(campaign
     ("world", "reason", "attempts"),
     [
         ("blocked", "the start is blocked", 1),
-        ("vehicle", "the vehicle process was killed by SIGKILL", ATTEMPTS),
+        ("no-vehicle", "the vehicle process ended with code 1", ATTEMPTS),
     ],
 )
 def test_a_mission_that_cannot_begin_has_no_outcome(campaign, world, reason, attempts):
