@@ -212,10 +212,6 @@ class Executor:
         node = self._nodes[name]
         return not node.busy and node.pending is None
 
-    def cancel_pending(self, name: str) -> None:
-        """Forget the input that a node has not looked at yet."""
-        self._nodes[name].pending = None
-
     def advance(self, stamp_s: float) -> None:
         """Publish every output that takes effect up to `stamp_s`, in the order of time."""
         while self._events and self._events[0][0] <= stamp_s:

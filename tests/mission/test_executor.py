@@ -66,16 +66,6 @@ def test_a_chain_runs_at_its_own_stamps_not_at_the_ticks():
     assert seen == [0.012]
 
 
-def test_a_cancelled_input_is_never_looked_at():
-    executor, published = make({"a": 0.1})
-    executor.submit("a", 1)
-    executor.submit("a", 2)
-    executor.cancel_pending("a")
-    executor.advance(1.0)
-    assert [p[1][0] for p in published] == [1]
-    assert executor.idle("a")
-
-
 inputs = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 30)), max_size=25)
 
 
