@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.campaign.groups import Group
+from mavfi_cli.campaign.groups import METRICS, BoolArray, Group, IntArray, matched
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.paired import McNemar, holm, mcnemar
 from mavfi_cli.campaign.statistics.worst_case import WorstCase, worst_case
-from mavfi_cli.campaign.stopping import COUNTED
+from mavfi_cli.core.types import FloatArray
 
-METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 RESAMPLES = 1999
 TREATMENT = ("setting", "detector", "protect")  # labels in which protected flights differ
-Places = list[tuple[int, int]]  # rows of the first and of the second, a pair of missions each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,17 +39,25 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class _Match:
+    """Two settings, the golden one of both, and the places of their pairs, (m,) in each."""
+
     first: Group
     second: Group
-    places: Places
     golden: Group
+    at_first: IntArray
+    at_second: IntArray
 
-    def columns(self, name: str | None = None) -> tuple[Any, Any]:
-        """A column of both, a row a pair; their successes where none is named."""
-        at = np.array(self.places).T
-        if name is None:
-            return self.first.succeeded[at[0]], self.second.succeeded[at[1]]
-        return self.first.numbers(name)[at[0]], self.second.numbers(name)[at[1]]
+    @property
+    def success(self) -> tuple[BoolArray, BoolArray]:
+        """Whether each of a pair succeeded, (m,) twice."""
+        return self.first.succeeded[self.at_first], self.second.succeeded[self.at_second]
+
+    def differences(self, metric: str) -> FloatArray:
+        """Second minus first, of the pairs in which both succeeded and have the metric."""
+        first, second = self.success
+        change = self.second.metrics[metric][self.at_second]
+        change = (change - self.first.metrics[metric][self.at_first])[first & second]
+        return change[~np.isnan(change)]
 
 
 def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Comparison]:
@@ -59,8 +65,8 @@ def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Co
     found = []
     for group in groups:
         golden = _golden_for(group, groups)
-        if golden is not None and (pairs := _paired(golden, group)):
-            found.append(_Match(golden, group, pairs, golden))
+        if golden is not None:
+            found.append(_Match(golden, group, golden, *matched(golden, group)))
     return _compared(found, confidence, protected=False)
 
 
@@ -70,10 +76,8 @@ def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[Compar
     found = []
     for group in filter(_protected, groups):
         faulty, golden = bare.get(_untreated(group)), _golden_for(group, groups)
-        if faulty is None or golden is None:
-            continue
-        if pairs := _paired(faulty, group):
-            found.append(_Match(faulty, group, pairs, golden))
+        if faulty is not None and golden is not None:
+            found.append(_Match(faulty, group, golden, *matched(faulty, group)))
     return _compared(found, confidence, protected=True)
 
 
@@ -90,7 +94,7 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     if group.golden:
         return None
     shared = [
-        (len(group.pairs.keys() & each.pairs.keys()), -index)
+        (int((group.flown_pairs & each.flown_pairs).sum()), -index)
         for index, each in enumerate(groups)
         if each.golden and not _protected(each)
     ]
@@ -98,27 +102,16 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     return groups[-most[1]] if most[0] else None
 
 
-def _paired(first: Group, second: Group) -> Places:
-    """Missions of equal pairs, in the order of the list; one golden flight serves several."""
-    found: Places = []
-    for pair, places in second.pairs.items():
-        others = first.pairs.get(pair, [])
-        if first.golden:
-            others = others[:1] * len(places)
-        found += zip(others, places, strict=False)  # as many as both have
-    return sorted(found, key=lambda pair: pair[1])
-
-
 def _compared(matches: Sequence[_Match], confidence: float, *, protected: bool) -> list[Comparison]:
+    matches = [each for each in matches if len(each.at_second)]
     tests = [
-        mcnemar(zip(*(column.tolist() for column in each.columns()), strict=True))
-        for each in matches
+        mcnemar(zip(*(column.tolist() for column in each.success), strict=True)) for each in matches
     ]
     corrected = holm([test.p_value for test in tests])
     found = []
     for each, test, p in zip(matches, tests, corrected, strict=True):
         golden, first, second = (
-            group.successes("flight_time_s", COUNTED).tolist()
+            group.successes("flight_time_s").tolist()
             for group in (each.golden, each.first, each.second)
         )
         found.append(
@@ -127,18 +120,15 @@ def _compared(matches: Sequence[_Match], confidence: float, *, protected: bool) 
                 second=each.second.labels,
                 success=test,
                 corrected_p=p,
-                differences={name: _difference(each, name, confidence) for name in METRICS},
+                differences={
+                    name: interval(
+                        each.differences(name), confidence=confidence, resamples=RESAMPLES
+                    )
+                    for name in METRICS
+                },
                 worst=worst_case(golden, first, second)
                 if protected
                 else worst_case(golden, second),
             )
         )
     return found
-
-
-def _difference(match: _Match, name: str, confidence: float) -> Interval:
-    a, b = match.columns(name)
-    won_a, won_b = match.columns()
-    differences = (b - a)[won_a & won_b]
-    known = differences[~np.isnan(differences)]
-    return interval(known, confidence=confidence, resamples=RESAMPLES)

@@ -1,97 +1,136 @@
-"""The flown missions of a campaign, gathered by setting or by some of its factors."""
+"""The flown missions of a campaign, gathered by setting or by some of its factors.
+
+Columns, not rows: a campaign may have a million missions.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.campaign.ledger import COLUMNS, Ledger
+from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import canonical
-from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray
 
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
+METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 INACTIVE = frozenset(each.value for each in Injected) - COUNTED
-_PAIR = 2  # place of the pair in a row of the ledger's table; its COLUMNS follow
 
 
-@dataclass(frozen=True)  # no slots: what is asked of all rows is computed once
+@dataclass(frozen=True, slots=True)
+class Words:
+    """A column of words, each written once.
+
+    Attributes:
+        known: the words, of all groups of a campaign.
+        codes: (n,) which of them each row has.
+    """
+
+    known: Sequence[str]
+    codes: IntArray
+
+    def at(self, rows: IntArray) -> Words:
+        """The words of some rows."""
+        return Words(self.known, self.codes[rows])
+
+    def among(self, words: Iterable[str]) -> BoolArray:
+        """Whether each row has one of these, (n,)."""
+        wanted = frozenset(words)
+        return np.array([word in wanted for word in self.known], dtype=bool)[self.codes]
+
+    def counts(self) -> dict[str, int]:
+        """How often each word comes that comes at all."""
+        often = np.bincount(self.codes, minlength=len(self.known)).tolist()
+        return dict(sorted((w, n) for w, n in zip(self.known, often, strict=True) if n))
+
+
+@dataclass(frozen=True)  # no slots: what is asked of all missions is computed once
 class Group:
-    """Missions that are counted together.
+    """Missions that are counted together; columns of the flown ones, in the order of the list.
 
     Attributes:
         labels: what they have in common.
         planned, errors: on the list; of them such that could not begin.
-        rows: of the ledger's table, the flown ones, in the order of the list.
+        outcome, injected: (n,) how each ended, and the fate of its fault.
+        pair: (n,) what golden, faulty and protected flights share.
+        metrics: (n,) for each of METRICS; not a number where a mission has none.
     """
 
     labels: Mapping[str, Any]
     planned: int
     errors: int
-    rows: list[tuple[Any, ...]] = field(default_factory=list)
-
-    def column(self, name: str) -> list[Any]:
-        """One of the ledger's COLUMNS, (n,)."""
-        place = _PAIR + 1 + COLUMNS.index(name)
-        return [row[place] for row in self.rows]
-
-    def numbers(self, name: str) -> FloatArray:
-        """A column of numbers, (n,); not a number where a mission has none."""
-        if name not in self._numbers:
-            self._numbers[name] = np.array(self.column(name), dtype=np.float64)
-        return self._numbers[name]
-
-    @cached_property
-    def _numbers(self) -> dict[str, FloatArray]:
-        return {}
+    outcome: Words
+    injected: Words
+    pair: Words
+    metrics: Mapping[str, FloatArray]
 
     @cached_property
     def succeeded(self) -> BoolArray:
         """Whether each mission reached its goal, (n,)."""
-        return np.array([outcome == "success" for outcome in self.column("outcome")], dtype=bool)
-
-    def of(self, fates: frozenset[str]) -> BoolArray:
-        """Whether the fault of each mission had one of these fates, (n,)."""
-        if fates not in self._masks:
-            self._masks[fates] = np.array(
-                [fate in fates for fate in self.column("injected")], dtype=bool
-            )
-        return self._masks[fates]
+        return self.outcome.among(("success",))
 
     @cached_property
-    def _masks(self) -> dict[frozenset[str], BoolArray]:
-        return {}
+    def counted(self) -> BoolArray:
+        """Whether each mission is golden or its fault struck, (n,)."""
+        return self.injected.among(COUNTED)
 
-    def successes(self, name: str, fates: frozenset[str]) -> FloatArray:
-        """A column of the successful ones among them that have the number."""
-        found = self.numbers(name)[self.succeeded & self.of(fates)]
+    def successes(self, metric: str) -> FloatArray:
+        """A metric of the successful ones among those that count, where they have it."""
+        found = self.metrics[metric][self.succeeded & self.counted]
         return found[~np.isnan(found)]
-
-    def counts(self, column: str) -> dict[str, int]:
-        """How often each value of a column comes."""
-        return dict(sorted(Counter(map(str, self.column(column))).items()))
 
     @cached_property
     def golden(self) -> bool:
         """Whether no fault was asked for."""
-        return bool(self.of(frozenset((Injected.GOLDEN.value,))).all())
+        return bool(self.injected.among((Injected.GOLDEN.value,)).all())
 
     @cached_property
-    def pairs(self) -> dict[str, list[int]]:
-        """The rows that are counted, by what golden, faulty and protected flights share."""
-        found: dict[str, list[int]] = {}
-        for place in np.flatnonzero(self.of(COUNTED)).tolist():
-            found.setdefault(self.rows[place][_PAIR], []).append(place)
+    def flown_pairs(self) -> BoolArray:
+        """For each pair of the campaign, whether a mission of it counts here."""
+        found = np.zeros(len(self.pair.known), dtype=bool)
+        found[self.pair.codes[self.counted]] = True
         return found
+
+
+def matched(first: Group, second: Group) -> tuple[IntArray, IntArray]:
+    """Missions of equal pairs that count: places in the first, places in the second, (m,) each.
+
+    In the order of the second. Of a pair that either flew more than once, the first time of one
+    goes with the first of the other, and so on; one golden flight serves all.
+    """
+    places, others = np.flatnonzero(second.counted), np.flatnonzero(first.counted)
+    pairs, known = second.pair.codes[places], first.pair.codes[others]
+    times, others_times = _times(pairs), _times(known)
+    if first.golden:
+        times = np.zeros_like(times)
+    most = 1 + max(times.max(initial=0), others_times.max(initial=0))
+    keys, sought = known * most + others_times, pairs * most + times
+    order = np.argsort(keys)
+    keys, others = keys[order], others[order]
+    at = np.searchsorted(keys, sought)
+    found = np.isin(sought, keys)
+    return others[at[found]], places[found]
+
+
+def _times(codes: IntArray) -> IntArray:
+    """How often each code came before, (n,)."""
+    order = np.argsort(codes, kind="stable")
+    ordered = codes[order]
+    begins = np.flatnonzero(np.diff(ordered, prepend=-1))
+    lengths = np.diff(begins, append=len(codes))
+    times = np.empty_like(codes)
+    times[order] = np.arange(len(codes)) - np.repeat(begins, lengths)
+    return times
 
 
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
@@ -105,20 +144,49 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
     for name in by:
         if name not in known:
             raise UnknownName("label", name, known)
-    errors = Counter[int]()
-    for cell, state, _, _, count in ledger.counts():
-        errors[cell] += count if state == State.ERROR.value else 0
     kept = [{name: each[name] for name in by or each if name in each} for each in labels]
     members: dict[str, list[int]] = {}
     for cell, each in enumerate(kept):
         members.setdefault(canonical(each), []).append(cell)
-    planned = ledger.planned_by_cell()
-    found = [
-        Group(kept[cells[0]], sum(planned[c] for c in cells), sum(errors[c] for c in cells))
-        for cells in members.values()
+    planned, errors = ledger.planned_by_cell(), ledger.errors_by_cell()
+    cells, words, numbers = _columns(ledger)
+    group_of = np.zeros(len(labels), dtype=np.int64)
+    for index, those in enumerate(members.values()):
+        group_of[those] = index
+    mine = group_of[cells]
+    order = np.argsort(mine, kind="stable")
+    ends = np.searchsorted(mine[order], np.arange(len(members)), side="right")
+    return [
+        Group(
+            labels=kept[those[0]],
+            planned=sum(planned[cell] for cell in those),
+            errors=sum(errors.get(cell, 0) for cell in those),
+            outcome=words["outcome"].at(rows),
+            injected=words["injected"].at(rows),
+            pair=words["pair"].at(rows),
+            metrics={name: column[rows] for name, column in numbers.items()},
+        )
+        for those, rows in zip(members.values(), np.split(order, ends[:-1]), strict=True)
     ]
-    place = {cell: group for group, cells in zip(found, members.values(), strict=True)
-             for cell in cells}  # fmt: skip
-    for row in ledger.table():
-        place[row[1]].rows.append(row)
-    return found
+
+
+def _columns(ledger: Ledger) -> tuple[IntArray, dict[str, Words], dict[str, FloatArray]]:
+    """Of every flown mission its cell; outcome, fate and pair; METRICS."""
+    codes: dict[str, dict[str, int]] = {"outcome": {}, "injected": {}, "pair": {}}
+    parts: dict[str, list[NDArray[Any]]] = {"cell": [], **{name: [] for name in codes}}
+    parts |= {name: [] for name in METRICS}
+    for portion in ledger.columns(list(parts)):
+        for name, column in zip(parts, portion, strict=True):
+            if name in METRICS:
+                parts[name].append(np.array(column, dtype=np.float64))
+            elif (seen := codes.get(name)) is None:
+                parts[name].append(np.array(column, dtype=np.int64))
+            else:
+                coded = [seen.setdefault(str(word), len(seen)) for word in column]
+                parts[name].append(np.array(coded, dtype=np.int64))
+    whole = {
+        name: np.concatenate([np.zeros(0, float if name in METRICS else np.int64), *found])
+        for name, found in parts.items()
+    }
+    words = {name: Words(list(seen), whole[name]) for name, seen in codes.items()}
+    return whole["cell"], words, {name: whole[name] for name in METRICS}

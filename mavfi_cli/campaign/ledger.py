@@ -59,7 +59,7 @@ CREATE TABLE records (number INTEGER PRIMARY KEY REFERENCES results, result BLOB
 _QUALITY = (
     "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
 )  # fmt: skip
-COLUMNS = ("outcome", "injected", *_QUALITY, "replans", "simulated_s", "wall_s")
+_PORTION = 5000  # rows that are read at once
 
 
 class Ledger:
@@ -316,20 +316,27 @@ class Ledger:
                 path=None if path is None else self.folder.absolute() / path,
             )
 
-    def table(self) -> Iterator[tuple[Any, ...]]:
-        """Number, cell, pair and `COLUMNS` of every flown mission, in the order of the list."""
-        names = ", ".join(COLUMNS)
-        yield from self._db.execute(
-            f"SELECT number, cell, pair, {names} FROM results JOIN missions USING (number) "
+    def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
+        """Columns of every flown mission, in the order of the list and in portions.
+
+        Args:
+            names: of the tables `missions` and `results`.
+        """
+        rows = self._db.execute(
+            f"SELECT {', '.join(names)} FROM results JOIN missions USING (number) "
             "WHERE state = 'flown' ORDER BY number"
         )
+        while portion := rows.fetchmany(_PORTION):
+            yield list(zip(*portion, strict=True))
 
-    def counts(self) -> list[tuple[int, str, str | None, str | None, int]]:
-        """How many missions there are by cell, state, outcome and fate of the fault."""
-        return self._db.execute(
-            "SELECT cell, state, outcome, injected, count(*) FROM results "
-            "JOIN missions USING (number) GROUP BY 1, 2, 3, 4 ORDER BY 1, 2, 3, 4"
-        ).fetchall()
+    def errors_by_cell(self) -> dict[int, int]:
+        """How many missions of a cell could not begin, where there are any."""
+        return dict(
+            self._db.execute(
+                "SELECT cell, count(*) FROM results JOIN missions USING (number) "
+                "WHERE state = 'error' GROUP BY cell"
+            )
+        )
 
     def planned_by_cell(self) -> list[int]:
         """How many missions each cell has."""

@@ -7,14 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mavfi_cli.campaign.comparison import (
-    METRICS,
-    RESAMPLES,
-    Comparison,
-    against_golden,
-    protection,
-)
-from mavfi_cli.campaign.groups import INACTIVE, Group, groups
+from mavfi_cli.campaign.comparison import RESAMPLES, Comparison, against_golden, protection
+from mavfi_cli.campaign.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate
@@ -90,20 +84,19 @@ def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) 
 def _cell(group: Group, confidence: float) -> Cell:
     def success(fates: frozenset[str]) -> Share:
         """Success rate over the missions of some fates."""
-        chosen = group.succeeded[group.of(fates)]
+        chosen = group.succeeded[group.injected.among(fates)]
         return rate(int(chosen.sum()), len(chosen), confidence)
 
     def metric(name: str) -> Interval:
         """Mean of a metric over successful missions, with its interval."""
-        values = group.successes(name, COUNTED)
-        return interval(values, confidence=confidence, resamples=RESAMPLES)
+        return interval(group.successes(name), confidence=confidence, resamples=RESAMPLES)
 
     return Cell(
         labels=group.labels,
         planned=group.planned,
         errors=group.errors,
-        outcomes=group.counts("outcome"),
-        injected=group.counts("injected"),
+        outcomes=group.outcome.counts(),
+        injected=group.injected.counts(),
         success=success(COUNTED),
         inactive=success(INACTIVE),
         every=success(COUNTED | INACTIVE),

@@ -72,11 +72,8 @@ def test_what_has_no_row_is_missing(tmp_path):
         assert missing == [n for n in range(2500) if n not in (0, 3, 5, 2400)]
         assert [n for n, *_ in ledger.missing(errors=True)][2:5] == [4, 5, 6]
         assert ledger.over() == 4
-        assert len(list(ledger.table())) == 3
-        assert ledger.counts() == [
-            (0, "error", None, None, 1),
-            (0, "flown", "success", "golden", 3),
-        ]
+        assert list(ledger.columns(("number", "outcome"))) == [[(0, 3, 2400), ("success",) * 3]]
+        assert ledger.errors_by_cell() == {0: 1}
 
 
 def test_rows_added_while_the_missing_are_read_change_nothing(tmp_path):

@@ -1,0 +1,68 @@
+"""Which missions of two settings are one pair: the rule, written out with dicts, is the oracle."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavfi_cli.campaign.groups import METRICS, Group, Words, matched
+from mavfi_cli.campaign.outcome import Injected
+
+FATES = (Injected.ACTIVE.value, Injected.NOT_INJECTED.value)
+PAIRS = "abcd"
+MISSIONS = st.lists(st.tuples(st.sampled_from(PAIRS), st.booleans()), max_size=12)
+
+
+def group(missions, fates=FATES):
+    """A setting of missions of a pair each, which count or do not."""
+    counted, other = fates
+    count = len(missions)
+    return Group(
+        labels={}, planned=count, errors=0,
+        outcome=Words(["success"], np.zeros(count, dtype=np.int64)),
+        injected=Words(
+            [counted, other], np.array([not counts for _, counts in missions], dtype=np.int64)
+        ),
+        pair=Words(PAIRS, np.array([PAIRS.index(pair) for pair, _ in missions], dtype=np.int64)),
+        metrics={name: np.zeros(count) for name in METRICS},
+    )  # fmt: skip
+
+
+def expected(first, second, *, golden):
+    """The k-th mission of a pair with the k-th; one golden one with all."""
+    found, met = [], dict.fromkeys(PAIRS, 0)
+    for place, (pair, counts) in enumerate(second):
+        if not counts:
+            continue
+        others = [at for at, each in enumerate(first) if each == (pair, True)]
+        wanted = 0 if golden else met[pair]
+        met[pair] += 1
+        if wanted < len(others):
+            found.append((others[wanted], place))
+    return found
+
+
+@given(first=MISSIONS, second=MISSIONS)
+def test_missions_of_a_pair_meet_one_by_one(first, second):
+    found = matched(group([*first, ("a", True)]), group(second))
+    assert list(zip(*map(np.ndarray.tolist, found), strict=True)) == expected(
+        [*first, ("a", True)], second, golden=False
+    )
+
+
+@given(pairs=st.lists(st.sampled_from(PAIRS), max_size=12), second=MISSIONS)
+def test_one_golden_flight_serves_all_of_its_pair(pairs, second):
+    first = [(pair, True) for pair in pairs]
+    found = matched(group(first, (Injected.GOLDEN.value,) * 2), group(second))
+    assert list(zip(*map(np.ndarray.tolist, found), strict=True)) == expected(
+        first, second, golden=True
+    )
+
+
+@given(missions=MISSIONS)
+def test_words_are_counted_as_they_stand(missions):
+    whole = group(missions)
+    pairs = [pair for pair, _ in missions]
+    assert whole.pair.counts() == {pair: pairs.count(pair) for pair in sorted(set(pairs))}
+    assert whole.pair.among("ab").tolist() == [pair in "ab" for pair in pairs]
+    known = {pair for pair, counts in missions if counts}
+    assert whole.flown_pairs.tolist() == [pair in known for pair in PAIRS]
