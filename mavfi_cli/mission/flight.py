@@ -19,10 +19,10 @@ from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.link.codec import Codec, Message, dialect
+from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
+from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
-from mavfi_cli.link.tlog import TlogWriter
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission import quality
 from mavfi_cli.mission.branching import Trunk
@@ -62,16 +62,13 @@ class Flight:
         interrupts: Sequence[int],
     ) -> None:
         self._config = config
-        self._transport = transport
         self._platform = platform
         self._planner = planner
         self._interrupts = interrupts
-        self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
+        self.link = RecordedLink(transport, SYSTEM_ID, COMPONENT_ID)
         self._session = self._new_session()
         self._images = ImageReceiver()
         self._frames: list[ImageFrame] = []
-        self._tlog: TlogWriter | None = None
-        self._early: list[tuple[float, bytes]] = []  # packets from before the run folder
         self._camera_asked = False
         self._unheard_s = self._unspoken_s = 0.0
         self._on_clock = config.link is None
@@ -180,10 +177,7 @@ class Flight:
             CommandRefused: the autopilot refused to arm, take off or change its mode.
             RecordError: the tlog could not be written.
         """
-        with TlogWriter(tlog) as self._tlog:
-            for stamp_s, data in self._early:
-                self._tlog.write(stamp_s, data)
-            self._early.clear()
+        with self.link.recording(tlog):
             try:
                 while not self._finished():
                     self._turn()
@@ -192,15 +186,6 @@ class Flight:
                 self.end(Outcome.LINK_LOST, str(error))
             finally:
                 self.end_s = self.stamp_s if self.outcome is None else self.end_s
-
-    def go_on_in(self, tlog: Path) -> None:
-        """Go on in a copy of the tlog: this process is a fork, and flies another mission now.
-
-        Raises:
-            RecordError: it could not be copied.
-        """
-        assert self._tlog is not None
-        self._tlog.go_on_in(tlog)
 
     def _finished(self) -> bool:
         if self._session.failure is not None and self._session.failure is not self._landing_failed:
@@ -238,7 +223,7 @@ class Flight:
         foreign = self._config.link is not None
         begun = time.monotonic()
         with self.wall.measure("wait"):
-            data = self._transport.receive(IDLE_S if foreign else SILENCE_S)
+            data = self.link.receive(IDLE_S if foreign else SILENCE_S)
         waited_s = time.monotonic() - begun
         stamp_s = self._take(data) if data else None
         if stamp_s is not None and self._tick(stamp_s):
@@ -252,10 +237,9 @@ class Flight:
         """Take the messages in the data; the stamp of the newest state among them, s."""
         stamp_ms = None
         with self.wall.measure("link"):
-            for message in self._codec.decode(data, datagram=self._transport.datagram):
+            for message in self.link.messages(data, self.stamp_s):
                 self._session.handle(message)
                 self._frames += self._images.feed(message)
-                self._record(message.get_msgbuf())
                 if type(message) is _POSITION and self._is_autopilot(message):
                     stamp_ms = message.time_boot_ms
         return None if stamp_ms is None else stamp_ms / 1e3
@@ -277,7 +261,7 @@ class Flight:
             return
         self._unspoken_s = 0.0
         self.stamp_s += IDLE_S
-        self._send(self._session.tick(self.stamp_s))
+        self.link.send(self._session.tick(self.stamp_s), self.stamp_s)
         if isinstance(self._session.failure, NoAutopilot):
             raise self._session.failure
 
@@ -299,7 +283,7 @@ class Flight:
             with self.wall.measure("pilot"):
                 self._control(stamp_s, state, companion)
         with self.wall.measure("link"):
-            self._send(self._session.tick(stamp_s))
+            self.link.send(self._session.tick(stamp_s), stamp_s)
         if companion is not None:
             companion.executor.compute()
         if not self._camera_asked and self._nearly_up(state):
@@ -358,22 +342,6 @@ class Flight:
                     )
                 )
         self._frames.clear()
-
-    def _send(self, messages: Sequence[Message]) -> None:
-        frames = [self._codec.encode(message) for message in messages]
-        for frame in frames:
-            self._record(frame)
-        if self._transport.datagram:
-            for frame in frames:
-                self._transport.send(frame)
-        elif frames:
-            self._transport.send(b"".join(frames))
-
-    def _record(self, frame: bytes) -> None:
-        if self._tlog is None:
-            self._early.append((self.stamp_s, frame))
-        else:
-            self._tlog.write(self.stamp_s, frame)
 
     # What became of it ----------------------------------------------------------------------------
 

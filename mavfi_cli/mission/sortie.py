@@ -148,7 +148,7 @@ class Sortie:
         if self._is_last(number):
             branching.become(number)
             self._be(number)
-            self.flight.go_on_in(self.folder.tlog)
+            self.flight.link.go_on_in(self.folder.tlog)
             return True
         truth_folder = branching.scratch(number)
         try:
@@ -160,7 +160,7 @@ class Sortie:
             self._start_anew()
             self.end.change_to(twin, truth_folder)
             self._be(number)
-            self.flight.go_on_in(self.folder.tlog)
+            self.flight.link.go_on_in(self.folder.tlog)
             return True
         os.close(twin.detach())  # else its vehicle would not hear the end of the link
         twin.close()

@@ -80,13 +80,13 @@ def test_nobody_there(fly_short, free_port, soon_given_up):
 
 def test_ctrl_c_while_it_waits_for_somebody(fly_short, free_port, monkeypatch):
     """The first thing that the flight sends, nobody hears: that is the moment."""
-    real = flight.Flight._send
+    real = flight.RecordedLink.send
 
-    def send(self, messages):
+    def send(self, messages, stamp_s):
         signal.raise_signal(signal.SIGINT)
-        real(self, messages)
+        real(self, messages, stamp_s)
 
-    monkeypatch.setattr(flight.Flight, "_send", send)
+    monkeypatch.setattr(flight.RecordedLink, "send", send)
     with pytest.raises(Interrupted):
         fly_short(link=f"udpin:127.0.0.1:{free_port}")
 
