@@ -23,6 +23,7 @@ from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
 from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
+from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission import quality
 from mavfi_cli.mission.branching import Trunk
@@ -84,12 +85,13 @@ class Flight:
         self.outcome: Outcome | None = None
         self.reason = ""
 
-    def _new_session(self) -> OffboardSession:
+    def _new_session(self, telemetry: Telemetry | None = None) -> OffboardSession:
         settings = SessionSettings(
             takeoff_height_m=self._config.takeoff_height_m,
             request_streams=self._config.link is not None,
         )
-        return OffboardSession(settings, url=self._config.link or "the simulated vehicle")
+        url = self._config.link or "the simulated vehicle"
+        return OffboardSession(settings, url=url, telemetry=telemetry)
 
     # Before and after -----------------------------------------------------------------------------
 
@@ -297,8 +299,7 @@ class Flight:
         self._on_clock = True
         telemetry = self._session.telemetry
         telemetry.heartbeat_s = telemetry.now_s = stamp_s
-        self._session = self._new_session()
-        self._session.telemetry = telemetry
+        self._session = self._new_session(telemetry)
 
     def _nearly_up(self, state: VehicleState | None) -> bool:
         """High enough that a map begun now is there when the companion takes over."""
