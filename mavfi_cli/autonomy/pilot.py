@@ -12,24 +12,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
 from mavfi_cli.autonomy.flown import FlownPlan
+from mavfi_cli.autonomy.orders import Directive, Mode, PlanFailure, PlanRequest
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
-
-
-class Mode(Enum):
-    """What the pilot is doing."""
-
-    WAITING = "waiting"  # hovering, a plan is wanted
-    FLYING = "flying"  # on a trajectory, nothing foreseen on it
-    EVADING = "evading"  # on a blocked trajectory, with time to go on while a new one is planned
-    SLOWING = "slowing"  # the same, with less time: at reduced speed
-    STOPPING = "stopping"  # no time left: braking, then planning from a hover
-    ARRIVED = "arrived"
-    GAVE_UP = "gave_up"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,42 +40,6 @@ class PilotParams:
     retry_s: float = 0.1  # pause after a failed plan
     look_round_after: int = 3  # failed plans in a row before looking all round
     tracking_error_max_m: float = 2.0  # farther than this from the reference: stop and plan anew
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanRequest:
-    """What a plan must connect, and what its maker must know."""
-
-    stamp_s: float  # when the trajectory shall begin
-    position_enu_m: FloatArray  # (3,)
-    velocity_enu_mps: FloatArray  # (3,)
-    yaw_rad: float
-    goal_enu_m: FloatArray  # (3,)
-    attempt: int  # counts all plans of the mission; seeds the planner
-    trajectory_seq: int  # newest one known; the plan's own comes after it
-    future_collision_seq: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanFailure:
-    """A planner that found nothing."""
-
-    stamp_s: float  # when the trajectory should have begun
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Directive:
-    """What the control stage shall do in this tick."""
-
-    mode: Mode
-    trajectory: Trajectory | None  # None: hold `hold_enu_m`
-    time_s: float  # point on the trajectory, from its first waypoint
-    rate: float  # trajectory seconds per second, 0..1
-    rate_change_per_s: float
-    hold_enu_m: FloatArray  # (3,)
-    hold_yaw_rad: float
-    plan: PlanRequest | None = None
 
 
 @dataclass(slots=True)
@@ -158,8 +110,7 @@ class Pilot:
         if self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.WAITING):
             return False
         self._next = None
-        if not self._awaiting_plan:
-            self._wanted = True
+        self.want_plan()
         self._react(report)
         return True
 
@@ -243,8 +194,13 @@ class Pilot:
     def reject_plan(self) -> None:
         """The plan that is awaited has come and cannot be trusted: ask for another."""
         self.counters.plans_rejected += 1
-        self._awaiting_plan = False
-        self._wanted = True
+        self.plan_lost()
+
+    def plan_lost(self) -> None:
+        """The plan that is awaited will not come, as its planner died: ask for another."""
+        if self._awaiting_plan:
+            self._awaiting_plan = False
+            self._wanted = True
 
     def want_plan(self) -> None:
         """Ask for a new plan from where the vehicle will be, unless one is on its way."""
@@ -347,8 +303,7 @@ class Pilot:
         reference = self.flown.reference()
         self._hold, self._hold_yaw = reference[0:3].copy(), float(reference[3])
         self.flown.stand()
-        if not self._awaiting_plan:
-            self._wanted = True
+        self.want_plan()
         self.mode = Mode.WAITING
 
     def _hold_here(self, state: VehicleState) -> None:

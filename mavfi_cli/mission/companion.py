@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.autonomy import occupancy
-from mavfi_cli.autonomy.pilot import Directive, Mode, Pilot, PilotParams, PlanFailure
+from mavfi_cli.autonomy.orders import Directive, Mode, PlanFailure
+from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.trajectory import waypoint_index
 from mavfi_cli.core.states import of_stage
@@ -34,7 +35,7 @@ from mavfi_cli.fi.source.activation import Follower
 from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.executor import Executor
+from mavfi_cli.mission.executor import Executor, Node
 from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels, tracking_inputs
 from mavfi_cli.mission.platform import PlatformProfile, latency_model
@@ -94,7 +95,7 @@ class Companion:
         add("point_cloud", kernels.point_cloud, self._take_cloud)
         add("octomap", kernels.octomap, self._take_snapshot)
         add("collision_check", kernels.collision_check, self._take_report)
-        add("planner", kernels.planner, self._take_plan)
+        add("planner", kernels.planner, self._take_plan, self._planner_is_up)
         add("control", kernels.control, lambda _output, _stamp_s: None)
         if injection.follower is not None:
             self.executor.on_start = self._on_start
@@ -153,6 +154,11 @@ class Companion:
             if self._injection.follower is not None:
                 self._injection.follower.read(result, "mission logic", stamp_s, PLAN_STATES)
         self.pilot.on_plan(result)
+
+    def _planner_is_up(self, planner: Node) -> None:
+        """It died over a request; unless a newer one waits for it, the mission asks again."""
+        if planner.pending is None:
+            self.pilot.plan_lost()
 
     def _on_start(self, node: str, value: Any, start_s: float) -> None:
         """A node begins to work on its input: it has read it."""

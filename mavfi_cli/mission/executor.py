@@ -45,6 +45,7 @@ class Node:
     name: str
     run: Run
     publish: Publish
+    on_restart: Callable[[Node], None]
     pending: Any = None
     busy: bool = False
     invocations: int = 0
@@ -140,9 +141,22 @@ class Executor:
     _working: int = 0
     _count: int = 0
 
-    def add(self, name: str, run: Run, publish: Publish) -> Node:
-        """Add a node; its name selects its latency."""
-        node = Node(name=name, run=run, publish=publish)
+    def add(
+        self,
+        name: str,
+        run: Run,
+        publish: Publish,
+        on_restart: Callable[[Node], None] = lambda _node: None,
+    ) -> Node:
+        """Add a node.
+
+        Args:
+            name: selects its latency.
+            run: the kernel.
+            publish: takes its output, when it is due.
+            on_restart: hears that it is up again after its end, before it takes its next input.
+        """
+        node = Node(name=name, run=run, publish=publish, on_restart=on_restart)
         self._nodes[name] = node
         return node
 
@@ -293,4 +307,5 @@ class Executor:
         node.process = NodeProcess.fork({node.name: node.run})
         node.restarts += 1
         node.busy = False
+        node.on_restart(node)
         self._start_if_free(node)

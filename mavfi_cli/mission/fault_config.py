@@ -107,7 +107,7 @@ def parse_trigger(text: str) -> Trigger:
         UnknownName: no such kind of trigger, or no such phase.
         FaultSpecError: a number that is none.
     """
-    from mavfi_cli.autonomy.pilot import Mode
+    from mavfi_cli.autonomy.orders import Mode
 
     kind, _, value = text.partition("=")
     when: When = _member(When, "trigger", kind)

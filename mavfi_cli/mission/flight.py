@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.autonomy.pilot import Mode
+from mavfi_cli.autonomy.orders import Mode
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState

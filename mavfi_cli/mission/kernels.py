@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
-from mavfi_cli.autonomy.pilot import Directive, PlanFailure, PlanRequest
+from mavfi_cli.autonomy.orders import Directive, PlanFailure, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import (

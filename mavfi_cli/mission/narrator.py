@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mavfi_cli.autonomy.pilot import Mode
+from mavfi_cli.autonomy.orders import Mode
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
 from mavfi_cli.mission.companion import Companion

@@ -16,7 +16,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from mavfi_cli.autonomy.pilot import Directive, Pilot
+from mavfi_cli.autonomy.orders import Directive
+from mavfi_cli.autonomy.pilot import Pilot
 from mavfi_cli.autonomy.tracking import TrackingState
 from mavfi_cli.autonomy.trajectory import without_waypoint
 from mavfi_cli.core.states import Message

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavfi_cli.autonomy.pilot import Mode, Pilot, PilotParams, PlanFailure
+from mavfi_cli.autonomy.orders import Mode, PlanFailure
+from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.core.types import CollisionReport, Trajectory, VehicleState
 
 TICK_S = 0.02
@@ -455,6 +456,22 @@ def test_the_failure_of_an_abandoned_request_is_not_taken_for_the_new_one_s(driv
     assert driver.pilot.counters.plans_failed == 0
     driver.tick(20)
     assert len(driver.requests) == 3
+
+
+def test_a_plan_that_was_lost_is_asked_for_again_but_only_if_it_is_awaited(driver):
+    driver.pilot.plan_lost()
+    driver.tick(5)
+    assert len(driver.requests) == 1  # it had asked for none yet
+    driver.pilot.plan_lost()
+    driver.tick(5)
+    first, again = driver.requests
+    assert again.attempt == first.attempt + 1
+    assert driver.pilot.counters.plans_failed == 0
+    driver.pilot.on_plan(straight(again))
+    driver.tick(5)
+    driver.pilot.plan_lost()
+    driver.tick(5)
+    assert len(driver.requests) == 2
 
 
 def test_a_success_forgives_the_failures_before_it():

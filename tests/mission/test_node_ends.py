@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mavfi_cli.autonomy import point_cloud, tracking
+from mavfi_cli.autonomy import planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import OccupancyMap
 from mavfi_cli.mission import node_process
 from mavfi_cli.mission.executor import Executor
@@ -32,9 +32,10 @@ def at_invocation(monkeypatch):
         os.set_blocking(token, False)
 
         def kernel(*arguments):
-            calls.append(1)
-            if len(calls) == number and os.getpid() != here and taken(token):
-                action()
+            if os.getpid() != here:
+                calls.append(1)
+                if len(calls) == number and taken(token):
+                    action()
             return real(*arguments)
 
         monkeypatch.setattr(owner, name, kernel)
@@ -80,6 +81,14 @@ def test_a_crashed_node_is_restarted_and_the_mission_goes_on(fly_short, at_invoc
     (event,) = [e for e in result["events"] if e["kind"] == "node"]
     assert event["text"] == f"node {node} crashed: killed by SIGSEGV"
     assert result["outcome"] == "success"
+
+
+def test_a_planner_that_dies_over_the_first_plan_is_asked_again(fly_short, at_invocation):
+    at_invocation(planning, "plan", 1, crash)
+    _, result = record(fly_short(isolate=("planner",)))
+    assert (result["nodes"]["planner"]["restarts"], result["outcome"]) == (1, "success")
+    assert result["pilot"]["plans_requested"] == 2
+    assert result["pilot"]["plans_failed"] == 0  # it never answered
 
 
 def broken():

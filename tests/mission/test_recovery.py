@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.pilot import Mode, Pilot, PilotParams
+from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.detect.gate import Alarm
 from mavfi_cli.fi.source.activation import Follower

@@ -10,7 +10,7 @@ from typing import Any
 
 from mavfi_cli.autonomy import planners, tracking, warm_up
 from mavfi_cli.autonomy.collision import CollisionInputs
-from mavfi_cli.autonomy.pilot import Directive, PlanRequest
+from mavfi_cli.autonomy.orders import Directive, PlanRequest
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.campaign.kernels.inputs import (
     INPUTS,
