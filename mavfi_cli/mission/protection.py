@@ -2,7 +2,8 @@
 
 A message that raises an alarm is withheld and its stage computes again (paper, section V-E). That
 is bounded: the `alarms_max`-th alarm of a stage in a row makes the vehicle hold and plan anew, and
-what comes after it passes, because so many computations agree.
+what comes after it passes, because so many computations agree. What passes while the vehicle hovers
+does not end the row: it says nothing about the waypoints that raised the alarms.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ class Protection(NoProtection):
         """Judge perception's message on its arrival."""
         alarm = self._judge("report", self.gate.judge_report, report)
         if alarm is None:
-            self._recovered(Stage.PERCEPTION, stamp_s)
+            self._recovered(Stage.PERCEPTION, stamp_s, proven=True)
             return Response.PASS
         response = self._respond(alarm, "report", Stage.PERCEPTION, stamp_s)
         if response is Response.ACCEPT:
@@ -135,7 +136,7 @@ class Protection(NoProtection):
         """Judge a plan on its arrival."""
         alarm = self._judge("plan", self.gate.judge_plan, plan)
         if alarm is None:
-            self._recovered(Stage.PLANNING, stamp_s)
+            self._recovered(Stage.PLANNING, stamp_s, proven=False)
             return Response.PASS
         return self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
 
@@ -154,8 +155,9 @@ class Protection(NoProtection):
         """Judge the followed waypoint and the command that would go out; and who is to blame."""
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         if alarm is None:
-            self._recovered(Stage.CONTROL, stamp_s)
-            if Stage.PLANNING in self.gate.fresh:
+            flown = Stage.PLANNING in self.gate.fresh
+            self._recovered(Stage.CONTROL, stamp_s, proven=flown or self.gate.detector.per_stage)
+            if flown:
                 self._recoveries[Stage.PLANNING].in_a_row = 0
             return Response.PASS, Stage.CONTROL
         response = self._respond(alarm, "tick", alarm.stage, stamp_s)
@@ -207,9 +209,17 @@ class Protection(NoProtection):
         where = ", ".join(alarm.states[:2]) or "all states together"
         self._news.append(f"{alarm.detector} alarm in {stage.value}: {where}; {response.value}")
 
-    def _recovered(self, stage: Stage, stamp_s: float) -> None:
+    def _recovered(self, stage: Stage, stamp_s: float, *, proven: bool) -> None:
+        """A message passed.
+
+        Args:
+            proven: all that its stage's alarms are raised for was in it. Nothing less ends the row
+                of a vehicle that holds: the steps within a plan, or the commands of a hover, pass
+                whatever the first waypoint of the next plan is compared with.
+        """
         recovery = self._recoveries[stage]
-        recovery.in_a_row = 0
+        if proven or recovery.in_a_row < self._config.alarms_max:
+            recovery.in_a_row = 0
         if recovery.since_s is not None:
             self._close(recovery, stamp_s)
 

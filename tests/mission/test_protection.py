@@ -9,7 +9,7 @@ import pytest
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, UnknownName
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.detect.preprocess import SPANS
+from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission import protection as protection_module
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
@@ -87,6 +87,22 @@ def test_a_message_that_passes_ends_the_row(limit):
     told = [tick(gate, c) for c in (COMMAND, WILD, WILD, COMMAND, WILD, WILD, COMMAND)]
     assert told.count(Response.RECOMPUTE) == 4
     assert told.count(Response.PASS) == 3
+
+
+def test_a_hover_does_not_end_the_row(limit):
+    """A flip in the gate's own reference: the first waypoint of every plan looks wrong."""
+    gate = protection(limit)
+    tick(gate, COMMAND)
+    gate.gate.memory["gate"][REFERENCE, NAMES.index("waypoint_vy")] += 2048
+    told = [gate.tick(TRAJECTORY, 1, COMMAND, at_s)[0] for at_s in (0.02, 0.04, 0.06)]
+    assert told == [Response.RECOMPUTE, Response.RECOMPUTE, Response.HOLD]
+    plan = replace(TRAJECTORY, trajectory_seq=2)
+    assert gate.tick(None, -1, COMMAND, 0.08)[0] is Response.PASS
+    assert gate.plan(plan, 0.1) is Response.PASS
+    assert gate.ahead(plan, 0, None, 0.1)[0] is Response.PASS
+    assert gate.tick(plan, 0, COMMAND, 0.1)[0] is Response.ACCEPT
+    assert gate.tick(plan, 1, COMMAND, 0.12)[0] is Response.PASS
+    assert tick(gate, WILD, 0.14) is Response.RECOMPUTE  # a row of its own
 
 
 def test_people_hear_of_a_row_of_alarms_once_and_of_a_hold_always(limit):
