@@ -209,6 +209,7 @@ class _Run:
 
     def fly(self, asked: Sequence[int]) -> None:
         """Until nothing is missing, or somebody asks to stop."""
+        told = False
         with self._seats() as slots:
             while len(asked) < 2:
                 self._fill(slots, asked)
@@ -219,6 +220,9 @@ class _Run:
                 for ended in over:
                     self._take(ended)
                 self._spectator.on_progress(self._progress())
+                if asked and self._flying and not told:
+                    told = True
+                    self._spectator.on_note("finishing what flies; Ctrl-C once more ends it")
         if asked:
             raise Interrupted("interrupted; run again to go on")
         if self._given_up:

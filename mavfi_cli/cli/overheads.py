@@ -52,6 +52,7 @@ def measured(text: str) -> dict[str, tuple[float, str]]:
         others = f", only with {', '.join(of_each)}" if of_each else ""
         raise RecordError(
             f"{path}: no error-free flight with {' or '.join(DETECTORS)} is recorded there{others}"
+            f"; mavfi fly --detector {DETECTORS[-1]} records one"
         )
     return {name: (100.0 * each.share, each.told(text)) for name, each in known.items()}
 

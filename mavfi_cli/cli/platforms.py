@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import click
@@ -51,9 +52,9 @@ def _explained(profile: Any) -> str:
     based = f"; latencies from {profile.base}" if profile.base else ""
     where = "carried" if profile.carried else "stays on the ground"
     lines = [
-        f"{profile.name}: {profile.description}",
-        f"{profile.cores} cores, {profile.power_w:g} W, {1000 * profile.mass_kg:g} g + "
-        f"{1000 * profile.heatsink_kgpw:g} g/W of heat sink, {where}{based}",
+        f"{_title(profile)}; {where}{based}",
+        *_hardware(profile),
+        "",
         f"{'kernel':<16} {'median':>10}  {'5 % to 95 %':>22}  source",
     ]
     for name, latency in profile.kernels.items():
@@ -64,7 +65,25 @@ def _explained(profile: Any) -> str:
             f"{latency.source or 'not given'}"
         )
     lines.append(f"{'all of them':<16} {1000 * _all_s(profile):>7.2f} ms")
-    return "\n".join([*lines, *profile.sources])
+    if "spread" in profile.sources:
+        lines.append(f"{'their spread':<53} {profile.sources['spread']}")
+    return "\n".join(lines)
+
+
+def _title(profile: Any) -> str:
+    return f"{profile.name}: {profile.description}" if profile.description else profile.name
+
+
+def _hardware(profile: Any) -> Iterator[str]:
+    """A line a number of the computer itself, with its source; nothing is lifted on the ground."""
+    rows = [("cores", f"{profile.cores}", "cores"), ("power", f"{profile.power_w:g} W", "power_w")]
+    if profile.carried:
+        rows += [
+            ("board", f"{1000 * profile.mass_kg:g} g", "mass_kg"),
+            ("heat sink", f"{1000 * profile.heatsink_kgpw:g} g/W", "heatsink_kgpw"),
+        ]
+    for title, value, key in rows:
+        yield f"{title:<16} {value:>10}  {profile.sources.get(key, 'not given')}"
 
 
 def _measured(profile: Any) -> str:

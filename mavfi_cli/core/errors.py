@@ -36,9 +36,10 @@ class MavfiError(Exception):
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name most like `name`, or None where none is close."""
-    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return matches[0] if matches else None
+    """The known name most like `name`, capitals apart, or None where none is close."""
+    spelled = {each.lower(): each for each in known}
+    matches = difflib.get_close_matches(name.lower(), list(spelled), n=1, cutoff=0.5)
+    return spelled[matches[0]] if matches else None
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:

@@ -60,7 +60,7 @@ class PlatformProfile:
     power_w: float = 0.0  # thermal design power
     mass_kg: float = 0.0  # the board, without its heat sink
     heatsink_kgpw: float = 0.0  # mass of the heat sink for each watt of power_w
-    sources: list[str] = field(default_factory=list)
+    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
     base: str = ""  # the platform whose latencies are scaled, where there is one
     measured_factor: float | None = None  # the host's own times, times this, are the latencies
 
@@ -102,7 +102,7 @@ class _PlatformFile:
     power_w: float = 0.0
     mass_kg: float = 0.0
     heatsink_kgpw: float = 0.0
-    sources: list[str] = field(default_factory=list)
+    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
 
     def __post_init__(self) -> None:
         _check_names(self.kernels)
@@ -226,12 +226,9 @@ def _kernels(
     file: _PlatformFile, base: dict[str, KernelLatency], path: Path
 ) -> dict[str, KernelLatency]:
     """Every kernel's latency: the base's times the file's factor, or the kernel's own entry."""
+    told = _scaled(file.base, file.scale, file.sources.get("scale", ""))
     kernels = {
-        name: replace(
-            latency,
-            latency_s=latency.latency_s * file.scale,
-            source=f"{file.base} x {file.scale:g}",
-        )
+        name: replace(latency, latency_s=latency.latency_s * file.scale, source=told)
         for name, latency in base.items()
     }
     for name, entry in file.kernels.items():
@@ -246,12 +243,17 @@ def _latency(entry: _KernelEntry, base: KernelLatency | None, base_name: str) ->
     if entry.scale is None or base is None:
         assert entry.latency_s is not None
         return KernelLatency(latency_s=entry.latency_s, spread=spread, source=entry.source)
-    told = f"{base_name} x {entry.scale:g}"
     return KernelLatency(
         latency_s=entry.scale * base.latency_s,
         spread=spread,
-        source=f"{told}: {entry.source}" if entry.source else told,
+        source=_scaled(base_name, entry.scale, entry.source),
     )
+
+
+def _scaled(base_name: str, scale: float, source: str) -> str:
+    """Where a latency comes from that is a multiple of another platform's."""
+    told = f"{base_name} x {scale:g}"
+    return f"{told}: {source}" if source else told
 
 
 class LatencyModel:

@@ -114,6 +114,7 @@ def _times(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
             for f in told["flights"]
             if _shown(f) and (f["platform"], f["setting"]) == key
         ]
+        _foot(axes, x, row, len(times), colour)
         if not times:
             continue
         spread = [x + 0.62 * width * ((0.5 + n * _TURN) % 1.0 - 0.5) for n in range(len(times))]
@@ -130,16 +131,24 @@ def _times(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
             f"{times[worst]:.1f} s", (x, times[worst]), xytext=(0, 8), textcoords="offset points",
             ha="center", fontsize=8.5, color=colour,
         )  # fmt: skip
-        failed = row["counted"] - len(times)
-        if failed:
-            axes.annotate(
-                f"{failed} failed", (x, 0.0), xycoords=("data", "axes fraction"), xytext=(0, 4),
-                textcoords="offset points", ha="center", fontsize=8, color=NOTE,
-            )  # fmt: skip
-    axes.set_ylim(min(flown) - 1.2 * room, max(flown) + 1.2 * room)
+    axes.set_ylim(min(flown) - 2.2 * room, max(flown) + 1.2 * room)
     axes.set_ylabel("flight time, s", fontsize=9)
     _setting_ticks(axes, settings)
     _frame(axes, "Flight time of each successful mission; bar: median; ring: the worst", "y")
+
+
+def _foot(axes: Axes, x: float, row: Row, succeeded: int, colour: str) -> None:
+    """Below a setting's flights: the mean number of replans, and how many flights failed."""
+    replans, failed = row["quantities"]["replans"]["mean"]["value"], row["counted"] - succeeded
+    lines = [f"{failed} failed"] if failed else []
+    if not math.isnan(replans):
+        lines.append(f"{replans:.1f} replans")
+    for height, text in zip((4, 15), reversed(lines), strict=False):
+        axes.annotate(
+            text, (x, 0.0), xycoords=("data", "axes fraction"), xytext=(0, height),
+            textcoords="offset points", ha="center", fontsize=8,
+            color=NOTE if text.endswith("failed") else colour,
+        )  # fmt: skip
 
 
 def _shown(flight: Row) -> bool:

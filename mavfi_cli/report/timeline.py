@@ -71,10 +71,10 @@ def _panel(axes: Axes, row: Row, platform: Row, shown: list[float]) -> None:
     axes.set_xlim(*shown)
     for lane, (kernel, (_, strong, pale)) in enumerate(_LANES.items()):
         axes.axhspan(lane - 0.5, lane + 0.5, color="#f7f8fa" if lane % 2 else "white", zorder=0)
-        _others(axes, lane, row["lanes"][kernel], pale, width_s)
-        if kernel in row["chain"]:
-            _bar(axes, lane, row["chain"][kernel], strong, width_s)
-            _duration(axes, lane, row["chain"][kernel], strong, width_s)
+        _others(axes, lane, row["lanes_s"][kernel], pale, width_s)
+        if kernel in row["chain_s"]:
+            _bar(axes, lane, row["chain_s"][kernel], strong, width_s)
+            _duration(axes, lane, row["chain_s"][kernel], strong, width_s)
     axes.vlines(
         row["setpoints_s"], _SETPOINT - 0.16, _SETPOINT + 0.16, color="#b9c0ca", linewidth=0.7
     )
@@ -139,14 +139,14 @@ def _steps(axes: Axes, row: Row) -> None:
     links = [("point_cloud", "octomap"), ("octomap", "collision_check"),
              ("collision_check", "control")]  # fmt: skip
     for first, second in links:
-        if first in row["chain"] and second in row["chain"]:
-            _step(axes, places[first], row["chain"][first][1], places[second],
-                  row["chain"][second][0], INK)  # fmt: skip
-    if "control" in row["chain"]:
-        _step(axes, places["control"], row["chain"]["control"][1], _SETPOINT, row["response_s"],
+        if first in row["chain_s"] and second in row["chain_s"]:
+            _step(axes, places[first], row["chain_s"][first][1], places[second],
+                  row["chain_s"][second][0], INK)  # fmt: skip
+    if "control" in row["chain_s"]:
+        _step(axes, places["control"], row["chain_s"]["control"][1], _SETPOINT, row["response_s"],
               INK)  # fmt: skip
     if row["plan_setpoint_s"] is not None:
-        _step(axes, places["planner"], row["chain"]["planner"][1], _SETPOINT,
+        _step(axes, places["planner"], row["chain_s"]["planner"][1], _SETPOINT,
               row["plan_setpoint_s"], _LANES["planner"][1])  # fmt: skip
 
 

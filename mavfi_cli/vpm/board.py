@@ -34,12 +34,13 @@ class Board:
     def of_platform(cls, platform: PlatformProfile) -> Board:
         """The board of a platform; one that stays on the ground has neither mass nor power."""
         told = f"platform {platform.name}"
+        sources = {key: f"{told}: {platform.sources.get(key, 'not given')}" for key in HARDWARE}
         if not platform.carried:
-            told = f"{told} stays on the ground"
+            sources = dict.fromkeys(HARDWARE, f"{told} stays on the ground")
         return cls(
             name=platform.name,
             description=platform.description,
-            sources=dict.fromkeys(HARDWARE, told),
+            sources=sources,
             **{key: getattr(platform, key) if platform.carried else 0.0 for key in HARDWARE},
         )
 

@@ -223,9 +223,10 @@ def test_ctrl_c_once_lets_missions_finish(campaign):
     notes = campaign.notes
     missions = planned("sleep:1.5", "sleep:1.5", "fly")
     thread = interrupt(1, when=lambda: notes.last is not None and notes.last.running == 2)
-    with pytest.raises(Interrupted):
+    with pytest.raises(Interrupted, match="run again to go on"):
         campaign.run(missions)
     thread.join()
+    assert notes.lines == ["finishing what flies; Ctrl-C once more ends it"]
     with Ledger(campaign.folder) as ledger:
         assert [result.number for result in ledger.results()] == [0, 1]
     with campaign.run(missions) as ledger:

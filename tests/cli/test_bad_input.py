@@ -34,6 +34,7 @@ def refused(command_line, tmp_path):
         ("--planner", "rtstar", "planner", "rrtstar"),
         ("--vehicle", "sollo", "vehicle", "solo"),
         ("--platform", "x68", "platform", "x86"),
+        ("--platform", "TX2", "platform", "tx2"),
         ("--isolate", "octomapp", "node", "octomap"),
     ],
 )

@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
+from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.report.summary import event_lines, summary_lines
 
 HEAVY = ("numba", "numpy", "torch", "matplotlib", "scipy", "pyarrow", "ompl", "fcl", "pymavlink")
@@ -34,6 +35,15 @@ def test_help_names_every_command(command_line):
         assert f"\n  {name} " in out
         sub_code, _, _ = command_line(name, "--help")
         assert sub_code == 0
+
+
+def test_who_interrupts_is_told_how_to_go_on(command_line, monkeypatch):
+    def flying(*_):
+        raise Interrupted("interrupted; run again to go on")
+
+    monkeypatch.setattr("mavfi_cli.campaign.compare.fly.compare", flying)
+    code, out, err = command_line("compare", "--quiet")
+    assert (code, out, err) == (130, "", "interrupted; run again to go on\n")
 
 
 # show ----------------------------------------------------------------------------------------

@@ -29,8 +29,8 @@ def panel(platform, factor):
         "answer": "stops before an obstacle",
         "plan_setpoint_s": answer + 0.1 * factor,
         "shown_s": [-0.05, 2.5],
-        "chain": chain,
-        "lanes": {name: lane(span) for name, span in chain.items()},
+        "chain_s": chain,
+        "lanes_s": {name: lane(span) for name, span in chain.items()},
         "setpoints_s": [0.02 * tick for tick in range(125)],
     }
 

@@ -163,3 +163,7 @@ def test_text_and_csv_say_every_number_with_its_unit(whole):
     ]  # fmt: skip
     assert (ratio["platform"], ratio["reference"], ratio["statistic"]) == ("tx2", "x86", "ratio")
     assert float(ratio["value"]) == pytest.approx(1.5)
+    worst = {r["setting"]: float(r["value"]) for r in rows if r["statistic"] == "ratio of the "
+             "largest"}  # fmt: skip
+    assert worst == {r["setting"]: r["worst_ratio"] for r in whole["worst_ratios"]}
+    assert len(worst) == 4

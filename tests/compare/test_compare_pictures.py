@@ -50,6 +50,12 @@ def test_compare_names_platforms_settings_and_what_is_measured(whole, tmp_path):
         assert wanted in said, wanted
 
 
+def test_the_replans_stand_below_the_flights(whole):
+    said = [text.get_text() for text in draw_compare_plot(whole).axes[0].texts]
+    means = [row["quantities"]["replans"]["mean"]["value"] for row in whole["settings"]]
+    assert [text for text in said if "replans" in text] == [f"{m:.1f} replans" for m in means]
+
+
 def test_the_worst_case_bars_are_as_high_as_the_numbers(whole):
     worst = draw_compare_plot(whole).axes[4]
     heights = [bar.get_height() for bar in bars(worst)]
@@ -100,7 +106,7 @@ def test_bars_lie_where_the_kernels_ran_on_one_axis_for_all(whole):
     panels = draw_timeline(whole).axes
     for axes, row in zip(panels, whole["timeline"]["platforms"], strict=True):
         assert axes.get_xlim() == (-0.05, 2.5)
-        start, end = row["chain"]["octomap"]
+        start, end = row["chain_s"]["octomap"]
         (octomap,) = bars(axes, "#1b4965")
         assert octomap.get_x() == pytest.approx(start)
         assert octomap.get_x() + octomap.get_width() == pytest.approx(end)

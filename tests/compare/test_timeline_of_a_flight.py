@@ -68,14 +68,14 @@ def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_f
     acted = {round(e["stamp_s"], 6): e["text"] for e in run.result["events"]
              if e["kind"] in ("slow", "stop")}  # fmt: skip
     assert told["answer"] == acted[round(stamp_s, 6)]
-    chain = told["chain"]
+    chain = told["chain_s"]
     order = ("point_cloud", "octomap", "collision_check", "control", "planner")
     assert tuple(chain) == order
     ends = [0.0]
     for kernel in order:
         start, end = chain[kernel]
         assert start >= ends[-1 if kernel != "planner" else -2] - 1e-9
-        assert [start, end] in told["lanes"][kernel]
+        assert [start, end] in told["lanes_s"][kernel]
         ends.append(end)
     assert chain["control"][0] == pytest.approx(told["response_s"])
     assert told["plan_setpoint_s"] >= chain["planner"][1]

@@ -34,6 +34,9 @@ def test_shipped_platforms_have_every_kernel_with_its_source(name):
     for kernel in KERNELS:
         assert platform.kernels[kernel].latency_s > 0.0
         assert platform.kernels[kernel].source
+    assert {"cores", "power_w", "spread"} <= set(platform.sources)
+    if platform.carried:
+        assert {"mass_kg", "heatsink_kgpw"} <= set(platform.sources)
 
 
 def test_x86_is_the_paper_s(load):

@@ -16,6 +16,7 @@ NONE = "none"  # no detector: faults without protection are what detectors are h
 GOLDEN, FAULTY = "golden", "FI"  # settings, named as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # of detectors, in the names of settings
 STAGES = tuple(stage.value for stage in Stage)
+MOST = 100_000  # missions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +52,8 @@ class ComparePlan:
                 raise ConfigError("name at least one", key=key)
         if self.missions < 1:
             raise ConfigError(f"must be at least 1, got {self.missions}", key="missions")
+        if self.missions > MOST:
+            raise ConfigError(f"must be at most {MOST}, got {self.missions}", key="missions")
         for key, least in (("first_seed", 0), ("seed", 0)):
             if getattr(self, key) < least:
                 raise ConfigError(f"must not be negative, got {getattr(self, key)}", key=key)

@@ -272,6 +272,10 @@ def _csv_rows(told: Row) -> Iterator[dict[str, Any]]:
         for title, statistic, unit, key in _WORST:
             yield {**at, "quantity": title, "statistic": statistic, "unit": unit,
                    "value": row[key], "count": row["flights"]}  # fmt: skip
+    for row in told["worst_ratios"]:
+        yield {"table": "worst", **{k: row[k] for k in ("platform", "reference", "setting")},
+               "quantity": "flight time", "statistic": "ratio of the largest", "unit": "1",
+               "value": row["worst_ratio"]}  # fmt: skip
 
 
 _WORST = (

@@ -45,7 +45,8 @@ def timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any
 
     Where a verdict had the vehicle slow down or stop, the frame is of such a verdict, and what
     follows is shown up to the first setpoint of the new plan. Times count from the frame's stamp,
-    s. `chain` holds the invocations that led to the setpoints, `lanes` all that ran in the window.
+    s. `chain_s` holds the invocations that led to the setpoints, `lanes_s` all that ran in the
+    window.
 
     Args:
         run: with its time table and trace.
@@ -76,11 +77,11 @@ def timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any
         "answer": told.get(answer_s, "knows of the frame"),
         "plan_setpoint_s": None if plan_setpoint_s is None else plan_setpoint_s - zero_s,
         "shown_s": [shown[0] - zero_s, shown[1] - zero_s],
-        "chain": {
+        "chain_s": {
             each.node: [each.start_s - zero_s, each.end_s - zero_s]
             for each in (*chain, *(() if plan is None else (plan,)))
         },
-        "lanes": {kernel: _spans(ran, kernel, shown, zero_s) for kernel in KERNELS},
+        "lanes_s": {kernel: _spans(ran, kernel, shown, zero_s) for kernel in KERNELS},
         "setpoints_s": [s - zero_s for s in stamps if shown[0] <= s <= shown[1]],
     }
 
