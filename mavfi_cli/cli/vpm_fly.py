@@ -63,8 +63,8 @@ def fly_and_report(
 ) -> dict[str, Any]:
     """The model's report with the flights of all its rows in `flights`.
 
-    The flights are flown with the overheads that are given, or else the paper's; the model's rows
-    have those that were measured in the flights, where none is given.
+    The flights, and the model beside them, have the overheads that are given, or else the paper's;
+    the model's own rows have those that were measured in the flights, where none is given.
 
     Args:
         overheads: of a detector's name to per cent and source.
@@ -74,7 +74,8 @@ def fly_and_report(
     """
     percents = {name: percent for name, (percent, _) in overheads.items()}
     sources = {name: source for name, (_, source) in overheads.items()}
-    plans = make_plans(ask, schemes_with(percents, sources), options, spectator)
+    schemes = schemes_with(percents, sources)
+    plans = make_plans(ask, schemes, options, spectator)
     arms = [
         Arm(group=vehicle, name=scheme, mission=plan.mission)
         for (vehicle, scheme), plan in plans.items()
@@ -86,13 +87,14 @@ def fly_and_report(
     for name, found in measured.items():
         if name not in percents:
             percents[name], sources[name] = 100.0 * found.share, found.told("--fly")
+    as_flown = report(ask.vehicles, ask.choices, schemes)
     told = report(ask.vehicles, ask.choices, schemes_with(percents, sources))
     told["flights"] = {
         "worlds": list(ask.worlds),
         "missions_each": ask.missions,
         "first_seed": ask.first_seed,
         "detectors": _models_told(ask),
-        **side_by_side(told, plans, flown, paired_ratio, measured),
+        **side_by_side(as_flown, plans, flown, paired_ratio, measured),
     }
     return told
 

@@ -24,8 +24,8 @@ def flight_table(flights: Mapping[str, Any]) -> list[str]:
     lines = [
         "",
         f"Flights in {', '.join(flights['worlds'])}: {flights['missions_each']} missions a scheme "
-        f"and world, seeds from {flights['first_seed']}; numbers are of successful flights, "
-        "(low to high) are 95 % intervals over missions",
+        f"and world, seeds from {flights['first_seed']}",
+        "Numbers are of successful flights, (low to high) are 95 % intervals over missions",
         f"Detectors: {flights['detectors']}",
     ]
     for one in flights["vehicles"]:
@@ -56,11 +56,10 @@ def _vehicle(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str
     yield f"== {one['vehicle']} flown, board {one['board']} =="
     rows = [row for row in one["schemes"] if row["problem"] is None]
     yield from columns(
-        ["scheme", "mass", "v-max", "a-max", "safe with its braking", "missions", "success",
-         "ends"],
+        ["scheme", "mass", "v-max", "a-max", "safe, braking", "success", "ends"],
         [[row["scheme"], f"{row['mass_kg']:.3f} kg", f"{row['v_max_mps']:.3f} m/s",
           f"{row['a_max_mps2']:.2f} m/s²", f"{row['braking_velocity_mps']:.3f} m/s",
-          f"{row['missions']}", _success(row), _ends(row)]
+          _success(row), _ends(row)]
          for row in rows],
     )  # fmt: skip
     for name, key, unit, factor, digits, heading in _NUMBERS:
@@ -144,6 +143,11 @@ def _remarks(row: Mapping[str, Any]) -> Iterator[str]:
     if row["problem"] is not None:
         yield f"{row['scheme']}: not flown: {row['problem']}"
         return
+    if row["overhead_percent"]:
+        yield (
+            f"{row['scheme']}: an overhead of {row['overhead_percent']:.4g} % in its flights and "
+            "in the model beside them"
+        )
     yield from _false_alarms(row)
     if row["cut"]:
         yield f"{row['scheme']}: flown with {', '.join(row['cut'])}"

@@ -88,7 +88,7 @@ def side_by_side(
     """What is not scaled, overheads, and for each vehicle a flat row a scheme.
 
     Args:
-        told: the model's report.
+        told: the model's report, with the overheads that the plans have.
         plans: by vehicle and scheme; a text where the scheme cannot be flown, and why.
         flown: the flights of those that can.
         ratio: of two arms over the missions in which both succeeded.
@@ -139,7 +139,8 @@ def _scheme(
     plan = plans[key]
     told: dict[str, Any] = {
         "scheme": row["scheme"], "title": row["title"], "boards": row["boards"],
-        "mass_kg": row["mass_kg"], "problem": None, "errors": [], "cut": [],
+        "overhead_percent": row["overhead_percent"], "mass_kg": row["mass_kg"], "problem": None,
+        "errors": [], "cut": [],
     }  # fmt: skip
     if isinstance(plan, str):
         return {**told, "problem": plan}

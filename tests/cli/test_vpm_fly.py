@@ -45,6 +45,7 @@ def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     energies = [rows[name]["flight_energy_j"] for name in ("none", "dmr", "tmr")]
     assert energies == sorted(energies)
     _flown_as_planned(told, rows)
+    _like_beside_like(rows)
     _units(told)
     _files(folder, rows)
     before = {path: path.read_bytes() for path in folder.glob("*.*")}
@@ -53,6 +54,13 @@ def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     assert {path: path.read_bytes() for path in folder.glob("*.*")} == before
     overhead = command_line("vpm", "--vehicle", "spark", "--overhead", "out")[1]
     assert "measured in 1 flight of out: checks " in overhead
+
+
+def _like_beside_like(rows):
+    """The model beside a flight has the overhead with which it was flown, not the measured one."""
+    assert rows["gad"]["overhead_percent"] == pytest.approx(2.2223)
+    for row in rows.values():
+        assert row["model_velocity_mps"] == pytest.approx(row["v_max_mps"])
 
 
 def _flown_as_planned(told, rows):
