@@ -19,7 +19,8 @@ def folder(mavfi, tmp_path_factory):
     out = tmp_path_factory.mktemp("small") / "training"
     done = mavfi(
         "train", "--world", WORLD, "--first-seed", FIRST_SEED, "--flights", FLIGHTS,
-        *(word for kind in KINDS for word in ("--kind", kind)), "--out", out, "--quiet", timeout=900.0,
+        *(word for kind in KINDS for word in ("--kind", kind)), "--out", out, "--quiet",
+        timeout=900.0,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return out
