@@ -45,6 +45,8 @@ def changes(
 def coding(runs: list[Run]) -> None:
     """Candidates: normal range of the deltas, and the material flips that leave it."""
     training, held = apart(runs)
+    if not (training and held):
+        raise SystemExit(f"error: {len(training)} runs of training worlds, {len(held)} of others")
     rng = np.random.default_rng(1)
     ways = [("12 bits", 0), ("two's complement", 0)]
     ways += [("signed log", floor) for floor in (-10, -4, -3, -2, -1, 0, 1, 2)]
@@ -72,7 +74,7 @@ def coding(runs: list[Run]) -> None:
                         for run in training
                     ]
                 )
-                limit = int(np.abs(trained).max())
+                limit = int(np.abs(trained).max(initial=0))  # a calm flight has one report
                 normal = max(normal, limit)
                 for run in held:
                     values = samples_of(run, name)

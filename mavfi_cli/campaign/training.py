@@ -18,7 +18,7 @@ from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.dataset import Dataset, Flight
-from mavfi_cli.detect.fit import KINDS, fit
+from mavfi_cli.detect.fit import KINDS, check, fit
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import columns_of, flight_of
 from mavfi_cli.detect.preprocess import PreprocessParams
@@ -127,10 +127,12 @@ def train(
         tell: hears what is done, a line each.
 
     Raises:
-        ModelError: too few flights, or torch is missing.
-        ConfigError: the folder holds the flights of another plan.
+        ModelError: too few flights, an unknown kind, or torch is missing; before anything is
+            flown, unless too many flights fail.
+        ConfigError: n sigma out of range; the folder holds the flights of another plan.
         RecordError: a file cannot be written.
     """
+    check(plan.kinds, len(plan.missions()), plan.n_sigma)
     dataset, failed = fly_training(plan, folder, options, spectator)
     fitted = {}
     for kind in plan.kinds:

@@ -14,14 +14,15 @@ import click
 @click.option("--world", "worlds", multiple=True,
               help="Where to fly; may be repeated  [the paper's four: two densities, two "
                    "sizes].")  # fmt: skip
-@click.option("--flights", default=25, show_default=True, help="Of each world.")
+@click.option("--flights", type=click.IntRange(min=1), default=25, show_default=True,
+              help="Of each world.")  # fmt: skip
 @click.option("--first-seed", default=10_000, show_default=True,
               help="Of the flights; seeds count up from here.")  # fmt: skip
 @click.option("--kind", "kinds", multiple=True, help="gad, aad, range, l2  [all].")
 @click.option("--n-sigma", type=float, help="Threshold of the Gaussian model  [its default].")
 @click.option("--seed", default=1, show_default=True,
               help="Of the split and of the autoencoder's first weights.")  # fmt: skip
-@click.option("--jobs", default=0, help="Missions at the same time  [one a core].")
+@click.option("--jobs", type=click.IntRange(min=1), help="Missions at the same time  [one a core].")
 @click.option("--json", "as_json", is_flag=True, help="Print the models' provenance.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def train(
@@ -32,7 +33,7 @@ def train(
     kinds: tuple[str, ...],
     n_sigma: float | None,
     seed: int,
-    jobs: int,
+    jobs: int | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -57,7 +58,7 @@ def train(
         kinds=kinds or KINDS,
     )
     with missions_view(quiet=quiet) as view:
-        trained = run(plan, out, Options(jobs=jobs), view, view.on_note)
+        trained = run(plan, out, Options(jobs=jobs or 0), view, view.on_note)
     if "aad" in trained.models:
         model, _ = trained.models["aad"]
         write_loss_curve(model.provenance["loss_curve"]["rows"], out / "loss.svg")

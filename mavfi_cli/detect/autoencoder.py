@@ -105,6 +105,7 @@ class AutoencoderDetector(FittedDetector):
     per_stage = False
     scratch: ClassVar[int] = COUNT + HIDDEN + CODED
     shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,), **WEIGHTS}
+    divisors: ClassVar[tuple[str, ...]] = ("scale",)
     tick_judge = staticmethod(judge_tick)
     plan_judge = staticmethod(judge_plan)
 

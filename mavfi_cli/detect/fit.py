@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,8 +55,7 @@ def split(dataset: Dataset, seed: int) -> Split:
     Raises:
         ModelError: fewer than FLIGHTS_MIN flights.
     """
-    if len(dataset) < FLIGHTS_MIN:
-        raise ModelError(f"{len(dataset)} flights are too few to fit to: {FLIGHTS_MIN} at least")
+    _refuse_few(len(dataset))
     drawn = generator(seed, Stream.MISSION, "detector-split").permutation(len(dataset))
     worlds = [dataset.flights[place].world for place in drawn]
     ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
@@ -64,6 +63,35 @@ def split(dataset: Dataset, seed: int) -> Split:
     for number, place in enumerate(ordered):
         parts[_TURNS[number % len(_TURNS)]].append(place)
     return Split(**{name: tuple(sorted(places)) for name, places in parts.items()})
+
+
+def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
+    """Say before the flights what would keep `fit` from fitting to them.
+
+    Args:
+        flights: how many there will be at most.
+
+    Raises:
+        ModelError: too few flights, an unknown kind, or torch is missing for aad.
+        ConfigError: n sigma out of range.
+    """
+    for kind in kinds:
+        if kind not in KINDS:
+            raise _unknown(kind)
+    _refuse_few(flights)
+    if n_sigma is not None:
+        checked_threshold(n_sigma, "n sigma")
+    if "aad" in kinds:
+        train_autoencoder.require_torch()
+
+
+def _refuse_few(flights: int) -> None:
+    if flights < FLIGHTS_MIN:
+        raise ModelError(f"{flights} flights are too few to fit to: {FLIGHTS_MIN} at least")
+
+
+def _unknown(kind: str) -> ModelError:
+    return ModelError(f"no way to fit a detector {kind!r}; known: {', '.join(KINDS)}")
 
 
 def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = None) -> Model:
@@ -118,7 +146,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         detector.memory["threshold"][0] = _largest(detector, held_out)
         told.update(trained.told)
     else:
-        raise ModelError(f"no way to fit a detector {kind!r}; known: {', '.join(KINDS)}")
+        raise _unknown(kind)
     arrays = {name: np.array(array) for name, array in detector.memory.items()}
     return Model(
         detector=kind,

@@ -30,6 +30,7 @@ class FittedDetector:
     Attributes:
         shapes: names and shapes of the pieces of the memory, in their order; the first one, a
             single number, is the threshold.
+        divisors: pieces besides the threshold of which every number must be above 0.
         scratch: numbers that compiled code wants for itself, after the pieces.
         tick_judge: `preprocess.take_tick`, then score and learn as the gate does, in one call.
         plan_judge: `preprocess.plan_deltas`, and the score of each step that it finds.
@@ -37,6 +38,7 @@ class FittedDetector:
 
     name: ClassVar[str]
     shapes: ClassVar[Shapes]
+    divisors: ClassVar[tuple[str, ...]] = ()
     scratch: ClassVar[int] = 0
     tick_judge: ClassVar[TickJudge | None] = None
     plan_judge: ClassVar[PlanJudge | None] = None
@@ -74,7 +76,8 @@ class FittedDetector:
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
         """The detector of a model file; None takes the shipped one. See `base.Factory`."""
         path = model_file.shipped(cls.name) if model is None else model
-        detector = cls(model_file.load(path, cls.name, cls.shapes).arrays)
+        positive = (next(iter(cls.shapes)), *cls.divisors)
+        detector = cls(model_file.load(path, cls.name, cls.shapes, positive).arrays)
         if threshold is not None:
             detector._flat[0] = model_file.checked_threshold(threshold)
         return detector

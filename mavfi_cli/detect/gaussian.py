@@ -128,6 +128,7 @@ class GaussianDetector(FittedDetector):
         "mean": (COUNT,),
         "sum_of_squares": (COUNT,),
     }
+    divisors: ClassVar[tuple[str, ...]] = ("sigma_floor",)
     tick_judge = staticmethod(judge_tick)
     plan_judge = staticmethod(judge_plan)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -74,13 +74,21 @@ def save(path: Path, model: Model) -> None:
     )
 
 
-def load(path: Path, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> Model:
+def load(
+    path: Path,
+    detector: str,
+    shapes: Mapping[str, tuple[int, ...]],
+    positive: Collection[str] = (),
+) -> Model:
     """Read a model of that kind, whose arrays have these shapes.
+
+    Args:
+        positive: arrays of which every number must be above 0.
 
     Raises:
         ModelError: the file cannot be read or is corrupt; it is of another schema or mavfi
             version, states table, preprocessing or kind; an array is missing, unknown, of another
-            shape, or not finite.
+            shape, not finite, or out of range.
     """
     data = _read(path)
     if set(data) != _KEYS:
@@ -96,9 +104,13 @@ def load(path: Path, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> Mo
         raise ModelError("made with another preprocessing; train it anew", path=path)
     if not isinstance(data["provenance"], dict):
         raise ModelError("corrupt model file: provenance is no object", path=path)
+    arrays = _arrays(path, data["arrays"], shapes)
+    for name in positive:
+        if not (arrays[name] > 0.0).all():
+            raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
     return Model(
         detector=detector,
-        arrays=_arrays(path, data["arrays"], shapes),
+        arrays=arrays,
         preprocess=preprocess,
         provenance=data["provenance"],
         mavfi=data["mavfi"],

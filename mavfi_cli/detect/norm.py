@@ -17,6 +17,7 @@ class NormDetector(FittedDetector):
     name: ClassVar[str] = "l2"
     per_stage = False
     shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,)}
+    divisors: ClassVar[tuple[str, ...]] = ("scale",)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Norm of the scaled deltas."""

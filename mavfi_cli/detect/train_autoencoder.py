@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,16 @@ class Trained:
     told: Mapping[str, Any]
 
 
+def require_torch() -> None:
+    """Say whether training can begin, without the seconds that the import takes.
+
+    Raises:
+        ModelError: torch is not installed.
+    """
+    if find_spec("torch") is None:
+        raise ModelError("training the autoencoder needs torch: pip install 'mavfi[train]'")
+
+
 def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> Trained:
     """Train on scaled vectors (n, 13), keep what meets those for validation (m, 13) best.
 
@@ -43,12 +54,9 @@ def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> Trained:
     Raises:
         ModelError: torch is not installed.
     """
-    try:
-        import torch
-    except ImportError:
-        raise ModelError(
-            "training the autoencoder needs torch: pip install 'mavfi[train]'"
-        ) from None
+    require_torch()
+    import torch
+
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

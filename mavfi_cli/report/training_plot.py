@@ -25,15 +25,15 @@ def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:
     """A matplotlib figure: mean squared errors of scaled deltas, logarithmic, over the epochs.
 
     Args:
-        curve: rows of epoch, error on training and on validation flights.
+        curve: rows of epoch, mean error of the training vectors, largest of the validation ones.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.2, 3.2), layout="constrained")
     axes = figure.add_subplot()
     epochs, training, validation = zip(*curve, strict=True)
-    axes.plot(epochs, training, color="#1b4965", linewidth=1.4, label="training")
-    axes.plot(epochs, validation, color="#e4572e", linewidth=1.4, label="validation")
+    axes.plot(epochs, training, color="#1b4965", linewidth=1.4, label="training, mean")
+    axes.plot(epochs, validation, color="#e4572e", linewidth=1.4, label="validation, largest")
     axes.set_yscale("log")
     axes.set_xlabel("epoch")
     axes.set_ylabel("mean squared error of scaled deltas")

@@ -158,6 +158,8 @@ def test_trained_weights_reconstruct_better_than_the_first_ones(quick):
 
 def test_without_torch_only_the_autoencoder_is_missing(dataset, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ModelError, match=r"needs torch: pip install 'mavfi\[train\]'"):
-        fit.fit("aad", dataset)
+    for begin in (lambda: fit.check(fit.KINDS, 100), lambda: fit.fit("aad", dataset)):
+        with pytest.raises(ModelError, match=r"needs torch: pip install 'mavfi\[train\]'"):
+            begin()
+    fit.check(["gad", "l2", "range"], 100)
     assert fit.fit("l2", dataset).detector == "l2"

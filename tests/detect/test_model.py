@@ -86,6 +86,21 @@ def test_arrays_are_checked(path, value, problem):
         model.load(path, "gad", SHAPES)
 
 
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [("gad", "n_sigma"), ("gad", "sigma_floor"), ("aad", "threshold"), ("aad", "scale"),
+     ("l2", "threshold"), ("l2", "scale"), ("range", "margin")],
+)  # fmt: skip
+@pytest.mark.parametrize("value", [0.0, -2.0])
+def test_thresholds_and_divisors_out_of_range_are_refused(tmp_path, name, array, value):
+    data = json.loads(model.shipped(name).read_text())
+    data["arrays"][array][-1] = value
+    path = tmp_path / "odd.json"
+    path.write_text(json.dumps(data))
+    with pytest.raises(ModelError, match=f"array '{array}' holds a number that is not above 0"):
+        registry.find(name, model=path)
+
+
 @pytest.mark.parametrize("content", [b"", b"{", b"[1, 2]", b"\xff\xfe", b"null", b"[" * 100000])
 def test_a_corrupt_file_is_refused(tmp_path, content):
     path = tmp_path / "broken.json"

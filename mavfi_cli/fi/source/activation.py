@@ -38,7 +38,7 @@ class Follower:
     """Follows the struck message until one of its corrupted values is read.
 
     Attributes:
-        activation: the best that is known; READ or WITHHELD once, so for ever.
+        activation: the best that is known; READ once, so for ever; WITHHELD, until one is read.
         reader: the first one.
     """
 
@@ -55,11 +55,12 @@ class Follower:
 
     def struck(self, message: Message, strike: Strike) -> None:
         """A message was corrupted; it goes on as `message`."""
-        if self.activation in (Activation.READ, Activation.WITHHELD):
+        if self.activation is Activation.READ:
             return
         self._corrupted = {c.state: c.index for c in strike.changes if c.bits}
         if self._corrupted:
-            self._message, self.activation = message, Activation.NOT_READ
+            self._message = message
+            self._become(Activation.NOT_READ)
         elif self.activation is Activation.NOT_INJECTED:
             self.activation = Activation.UNCHANGED
 
@@ -88,4 +89,10 @@ class Follower:
     def settle(self, held: Callable[[Message], bool]) -> None:
         """Anyone who asks whether the message still counts: if not, it was overwritten."""
         if self._message is not None and not held(self._message):
-            self.activation, self._message = Activation.OVERWRITTEN, None
+            self._message = None
+            self._become(Activation.OVERWRITTEN)
+
+    def _become(self, activation: Activation) -> None:
+        """Of a later strike of a lasting fault: less than what befell an earlier one is no news."""
+        if self.activation is not Activation.WITHHELD:
+            self.activation = activation

@@ -84,6 +84,17 @@ def test_a_later_strike_of_a_lasting_fault_may_still_be_read(follower):
     assert follower.activation is Activation.READ
 
 
+def test_what_passes_the_gate_after_another_was_withheld_is_read(follower):
+    follower.withheld(STRUCK)
+    follower.struck(OTHER, strike())
+    follower.settle(lambda _message: False)
+    assert follower.activation is Activation.WITHHELD
+    follower.struck(OTHER, strike())
+    follower.read(OTHER, "control", 9.5, {"waypoint_x"})
+    assert follower.activation is Activation.READ
+    assert follower.reader == Reader(name="control", stamp_s=9.5, state="waypoint_x")
+
+
 def test_a_strike_that_changes_no_bit_is_unchanged():
     follower = Follower()
     follower.struck(STRUCK, strike(bits=()))

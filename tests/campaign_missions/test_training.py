@@ -1,0 +1,82 @@
+"""`mavfi train` on a small scale: ten of the shipped models' own flights, flown and fitted anew."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mavfi_cli.detect import fit, model, registry
+from mavfi_cli.detect.dataset import Dataset
+
+WORLD, FIRST_SEED, FLIGHTS = "train-0.2-5", 10_075, 10
+FLOWN = {f"{WORLD}/{seed}" for seed in range(FIRST_SEED, FIRST_SEED + FLIGHTS)}
+KINDS = ["gad", "l2", "range"]
+
+
+@pytest.fixture(scope="module")
+def folder(mavfi, tmp_path_factory):
+    """Where the small training was done."""
+    out = tmp_path_factory.mktemp("small") / "training"
+    done = mavfi(
+        "train", "--world", WORLD, "--first-seed", FIRST_SEED, "--flights", FLIGHTS,
+        *(word for kind in KINDS for word in ("--kind", kind)), "--out", out, "--quiet",
+        timeout=900.0,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def flights_of(told):
+    return {flight for part in told["split"].values() for flight in part}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shipped_and_new_are_of_the_same_version_and_tell_the_same_things(folder, kind):
+    new, ours = (
+        json.loads(path.read_text()) for path in (folder / f"{kind}.json", model.shipped(kind))
+    )
+    for key in ("schema", "mavfi", "states", "preprocess", "preprocess_digest", "detector"):
+        assert new[key] == ours[key]
+    assert set(new["arrays"]) == set(ours["arrays"])
+    assert set(new["provenance"]) == set(ours["provenance"])
+    assert flights_of(new["provenance"]) == FLOWN <= flights_of(ours["provenance"])
+    for package in ("numpy", "python"):
+        assert new["provenance"]["versions"][package]
+        assert ours["provenance"]["versions"][package]
+
+
+def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_made_of(folder):
+    new, ours = (registry.find("range", model=p).memory for p in (folder / "range.json", None))
+    assert (new["lowest"] >= ours["lowest"]).all()
+    assert (new["highest"] <= ours["highest"]).all()
+    assert (new["highest"] > 0.0).any()
+    new, ours = (registry.find("l2", model=p).memory for p in (folder / "l2.json", None))
+    assert (new["scale"] <= ours["scale"]).all()
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "aad"])
+def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
+    detector = registry.find(kind)
+    setting = set(model.provenance(model.shipped(kind))["split"]["threshold"]) & FLOWN
+    flights = Dataset.load(folder / "dataset.parquet").flights
+    scores = [
+        fit.scores(detector, flight)
+        for flight in flights
+        if f"{flight.world}/{flight.seed}" in setting
+    ]
+    assert len(scores) == len(setting) > 0
+    assert np.concatenate(scores).max() <= detector.threshold
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--flights", "2"], "8 flights are too few to fit to: 10 at least"),
+        (["--kind", "gda"], "no way to fit a detector 'gda'; known: gad, aad, range, l2"),
+        (["--n-sigma", "-1"], "n sigma: must be a finite number above 0, got -1.0"),
+    ],
+)
+def test_what_cannot_be_fitted_to_is_said_before_anything_is_flown(mavfi, tmp_path, words, problem):
+    done = mavfi("train", *words, "--out", tmp_path / "training", "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"error: {problem}\n")
+    assert not (tmp_path / "training").exists()
