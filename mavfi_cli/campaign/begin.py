@@ -10,7 +10,13 @@ from typing import Any
 
 from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
-from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, golden_of
+from mavfi_cli.campaign.missions import (
+    PlannedMission,
+    canonical,
+    changes_of,
+    golden_of,
+    naming,
+)
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.run import require_versions, store_plan
 from mavfi_cli.campaign.spec import Spec, load_spec, parse_spec, presets
@@ -100,7 +106,8 @@ def _check(missions: list[PlannedMission]) -> None:
         key = canonical(_kind(changes_of(mission.config)))
         if key not in seen:
             seen.add(key)
-            check_names(mission.config, vehicle)
+            with naming(mission.labels):
+                check_names(mission.config, vehicle)
 
 
 def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -219,6 +219,7 @@ class _Run:
                 for ended in over:
                     self._take(ended)
                 self._spectator.on_progress(self._progress())
+        self._spectator.on_end(self._progress())
         if asked:
             raise Interrupted("interrupted; run again to go on")
         if self._given_up:
@@ -329,5 +330,6 @@ class _Run:
             again=self._repeated,
             elapsed_s=time.monotonic() - self._begun,
             inside_s=self._inside_s,
+            slots=self._jobs if self._options.cluster is None else None,
             outcomes=self._outcomes,
         )

@@ -154,7 +154,7 @@ def _planned(what: str, scale: float | None) -> dict[str, Any]:
     from collections import Counter
 
     from mavfi_cli.campaign.begin import chosen
-    from mavfi_cli.campaign.summary import label_text
+    from mavfi_cli.campaign.missions import label_text
 
     spec: Spec
     spec, _ = chosen(what, None, scale)

@@ -69,6 +69,10 @@ def test_faults_that_did_nothing_are_counted_apart(book):
     assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
     assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
     assert cell.metrics["flight_time_s"].count == 2
+    row = table(summarise(book.ledger))[1]
+    assert "  2/3  " in row
+    assert "  83.3 %  " in row  # of all six, as the paper counts
+    assert row.endswith("3  (collision 1, not activated 1, not injected 1, null 1)")
 
 
 def test_errors_are_counted_nowhere_else(book):
