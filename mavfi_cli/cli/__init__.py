@@ -77,8 +77,8 @@ def main() -> NoReturn:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except (Interrupted, KeyboardInterrupt, click.Abort):
-        click.echo("interrupted", err=True)
+    except (Interrupted, KeyboardInterrupt, click.Abort) as error:
+        click.echo(str(error) or "interrupted", err=True)
         sys.exit(130)
     except BrokenPipeError:
         sys.stderr.close()
