@@ -10,11 +10,19 @@ from typing import Any
 
 from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
-from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, golden_of
+from mavfi_cli.campaign.missions import (
+    PlannedMission,
+    canonical,
+    changes_of,
+    golden_of,
+    label_text,
+    naming,
+)
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.run import require_versions, store_plan
 from mavfi_cli.campaign.spec import Spec, load_spec, parse_spec, presets
 from mavfi_cli.campaign.spec_text import to_toml
+from mavfi_cli.campaign.stopping import Gate
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.config import MissionConfig
@@ -51,6 +59,17 @@ def _stored_spec(ledger: Ledger) -> Spec:
     if text is None:
         raise ConfigError("has no specification: a program made its list", path=ledger.folder)
     return parse_spec(text, ledger.folder / SPEC)
+
+
+def stopped(ledger: Ledger) -> list[str]:
+    """The settings that the campaign's own rule has ended before all of their missions."""
+    text = ledger.meta("spec")
+    stop = None if text is None else parse_spec(text, ledger.folder / SPEC).stop
+    if stop is None:
+        return []
+    cells = ledger.cells()
+    gate = Gate(stop, ledger.cell_of_each(), ledger.fates())
+    return [label_text(cells[cell]) for cell in sorted(gate.stopped)]
 
 
 def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool = False) -> Ledger:
@@ -100,7 +119,8 @@ def _check(missions: list[PlannedMission]) -> None:
         key = canonical(_kind(changes_of(mission.config)))
         if key not in seen:
             seen.add(key)
-            check_names(mission.config, vehicle)
+            with naming(mission.labels):
+                check_names(mission.config, vehicle)
 
 
 def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:

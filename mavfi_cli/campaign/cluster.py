@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.remote import Answer, Order, fly, unpack, worker_versions
@@ -118,6 +119,13 @@ def _connect(address: str) -> Client:
         raise ClusterError(
             "--cluster needs dask.distributed: pip install 'mavfi[cluster]'"
         ) from None
+    parts = urlsplit(address)
+    try:
+        usable = bool(parts.scheme and parts.hostname and parts.port)
+    except ValueError:  # a port that is no number
+        usable = False
+    if not usable:  # dask would try for half a minute, and then say so in a traceback
+        raise ClusterError(f"{address}: expected the scheduler's address, as tcp://host:8786")
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.campaign.groups import METRICS, BoolArray, Group, IntArray, matched
+from mavfi_cli.campaign.groups import METRICS, BoolArray, Group, IntArray, matched, untreated
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.paired import McNemar, holm, mcnemar
 from mavfi_cli.campaign.statistics.worst_case import WorstCase, worst_case
 from mavfi_cli.core.types import FloatArray
 
 RESAMPLES = 1999
-TREATMENT = ("setting", "detector", "protect")  # labels in which protected flights differ
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,21 +71,17 @@ def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Co
 
 def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[Comparison]:
     """Every protected setting against the unprotected one with the same faults."""
-    bare = {_untreated(group): group for group in groups if not (_protected(group) or group.golden)}
+    bare = {
+        untreated(group.labels): group for group in groups if not (group.watched or group.golden)
+    }
     found = []
-    for group in filter(_protected, groups):
-        faulty, golden = bare.get(_untreated(group)), _golden_for(group, groups)
+    for group in groups:
+        if not group.watched:
+            continue
+        faulty, golden = bare.get(untreated(group.labels)), _golden_for(group, groups)
         if faulty is not None and golden is not None:
             found.append(_Match(faulty, group, golden, *matched(faulty, group)))
     return _compared(found, confidence, protected=True)
-
-
-def _protected(group: Group) -> bool:
-    return bool(group.labels.get("detector") not in (None, "none"))
-
-
-def _untreated(group: Group) -> frozenset[tuple[str, Any]]:
-    return frozenset((k, v) for k, v in group.labels.items() if k not in TREATMENT)
 
 
 def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
@@ -96,7 +91,7 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     shared = [
         (int((group.flown_pairs & each.flown_pairs).sum()), -index)
         for index, each in enumerate(groups)
-        if each.golden and not _protected(each)
+        if each.golden and not each.watched
     ]
     most = max(shared, default=(0, 0))
     return groups[-most[1]] if most[0] else None

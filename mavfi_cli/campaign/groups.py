@@ -24,6 +24,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
+TREATMENT = ("setting", "detector", "protect")  # labels in which protected flights differ
 INACTIVE = frozenset(each.value for each in Injected) - COUNTED
 
 
@@ -62,16 +63,22 @@ class Group:
         labels: what they have in common.
         planned, errors: on the list; of them such that could not begin.
         outcome, injected: (n,) how each ended, and the fate of its fault.
+        watched: whether a detector watches all of them.
+        number: (n,) of each mission.
         pair: (n,) what golden, faulty and protected flights share.
+        strike: (n,) a code for what the labels say but for the treatment: of the fault.
         metrics: (n,) for each of METRICS; not a number where a mission has none.
     """
 
     labels: Mapping[str, Any]
     planned: int
     errors: int
+    watched: bool
+    number: IntArray
     outcome: Words
     injected: Words
     pair: Words
+    strike: IntArray
     metrics: Mapping[str, FloatArray]
 
     @cached_property
@@ -105,11 +112,16 @@ class Group:
 def matched(first: Group, second: Group) -> tuple[IntArray, IntArray]:
     """Missions of equal pairs that count: places in the first, places in the second, (m,) each.
 
-    In the order of the second. Of a pair that either flew more than once, the first time of one
-    goes with the first of the other, and so on; one golden flight serves all.
+    In the order of the second. Missions with faults are of equal pairs where the same faults strike
+    them. Of a pair that either flew more than once, the first time of one goes with the first of
+    the other, and so on; one golden flight serves all.
     """
     places, others = np.flatnonzero(second.counted), np.flatnonzero(first.counted)
     pairs, known = second.pair.codes[places], first.pair.codes[others]
+    if not first.golden:
+        strikes, others_strikes = second.strike[places], first.strike[others]
+        width = 1 + max(strikes.max(initial=0), others_strikes.max(initial=0))
+        pairs, known = pairs * width + strikes, known * width + others_strikes
     times, others_times = _times(pairs), _times(known)
     if first.golden:
         times = np.zeros_like(times)
@@ -133,6 +145,11 @@ def _times(codes: IntArray) -> IntArray:
     return times
 
 
+def untreated(labels: Mapping[str, Any]) -> str:
+    """What protected and unprotected flights with the same faults have in common, as one text."""
+    return canonical({name: value for name, value in labels.items() if name not in TREATMENT})
+
+
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
     """The settings, or those together that have equal values of the labels `by`.
 
@@ -149,7 +166,11 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
     for cell, each in enumerate(kept):
         members.setdefault(canonical(each), []).append(cell)
     planned, errors = ledger.planned_by_cell(), ledger.errors_by_cell()
-    cells, words, numbers = _columns(ledger)
+    cells, number, words, metrics = _columns(ledger)
+    codes: dict[str, int] = {}
+    strikes = np.array(
+        [codes.setdefault(untreated(each), len(codes)) for each in labels], dtype=np.int64
+    )
     group_of = np.zeros(len(labels), dtype=np.int64)
     for index, those in enumerate(members.values()):
         group_of[those] = index
@@ -161,19 +182,28 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
             labels=kept[those[0]],
             planned=sum(planned[cell] for cell in those),
             errors=sum(errors.get(cell, 0) for cell in those),
+            watched=all(labels[cell].get("detector") is not None for cell in those),
+            number=number[rows],
             outcome=words["outcome"].at(rows),
             injected=words["injected"].at(rows),
             pair=words["pair"].at(rows),
-            metrics={name: column[rows] for name, column in numbers.items()},
+            strike=strikes[cells[rows]],
+            metrics={name: column[rows] for name, column in metrics.items()},
         )
         for those, rows in zip(members.values(), np.split(order, ends[:-1]), strict=True)
     ]
 
 
-def _columns(ledger: Ledger) -> tuple[IntArray, dict[str, Words], dict[str, FloatArray]]:
-    """Of every flown mission its cell; outcome, fate and pair; METRICS."""
+def _columns(
+    ledger: Ledger,
+) -> tuple[IntArray, IntArray, dict[str, Words], dict[str, FloatArray]]:
+    """Of every flown mission its cell and number; outcome, fate and pair; METRICS."""
     codes: dict[str, dict[str, int]] = {"outcome": {}, "injected": {}, "pair": {}}
-    parts: dict[str, list[NDArray[Any]]] = {"cell": [], **{name: [] for name in codes}}
+    parts: dict[str, list[NDArray[Any]]] = {
+        "cell": [],
+        "number": [],
+        **{name: [] for name in codes},
+    }
     parts |= {name: [] for name in METRICS}
     for portion in ledger.columns(list(parts)):
         for name, column in zip(parts, portion, strict=True):
@@ -189,4 +219,4 @@ def _columns(ledger: Ledger) -> tuple[IntArray, dict[str, Words], dict[str, Floa
         for name, found in parts.items()
     }
     words = {name: Words(list(seen), whole[name]) for name, seen in codes.items()}
-    return whole["cell"], words, {name: whole[name] for name in METRICS}
+    return whole["cell"], whole["number"], words, {name: whole[name] for name in METRICS}

@@ -9,7 +9,8 @@ from pathlib import Path
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.run_folder import RESULT
 
-SAMPLE = 20  # one success in so many is kept by `sampled`
+SAMPLE = 20  # about one success in so many is kept by `sampled`
+_WORD = 1 << 32
 
 
 class Keep(Enum):
@@ -24,7 +25,16 @@ class Keep(Enum):
         """Whether the run folder of this mission is kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
-        return outcome != "success" or (self is Keep.SAMPLED and number % SAMPLE == 0)
+        return outcome != "success" or (self is Keep.SAMPLED and _sampled(number))
+
+
+def _sampled(number: int) -> bool:
+    """Whether this success is one of the sample: of every setting, however many take turns."""
+    mixed = number
+    for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers become one
+        mixed = mixed * factor % _WORD
+        mixed ^= mixed >> 15
+    return mixed < _WORD // SAMPLE
 
 
 def put_away(run: Path, runs: Path, number: int) -> Path:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.mission.config import MissionConfig
 
 Label = str | int | float | bool | None
+_FIRST = ("setting", "world")  # labels that are told before the others
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,3 +78,24 @@ def pair_of(config: MissionConfig) -> str:
     """A name for all that golden, faulty and protected flights of a pair share."""
     text = canonical(changes_of(golden_of(config)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def label_text(labels: Mapping[str, Any]) -> str:
+    """A setting in one phrase; the same whatever the order of its labels."""
+    rest = sorted(labels.keys() - set(_FIRST))
+    names = [name for name in _FIRST if name in labels] + rest
+    return " ".join(f"{name}={labels[name]}" for name in names) or "all missions"
+
+
+@contextlib.contextmanager
+def naming(labels: Mapping[str, Label]) -> Iterator[None]:
+    """Have a known error in here say which setting it is about.
+
+    Raises:
+        ConfigError: instead of any MavfiError.
+    """
+    try:
+        yield
+    except MavfiError as error:
+        place = f"{label_text(labels)}: " if labels else ""
+        raise ConfigError(f"{place}{error}") from None

@@ -18,6 +18,7 @@ class Progress:
         again: attempts that something outside ended, so that they were begun again.
         elapsed_s: of this run, host time.
         inside_s: of it within missions, summed over the slots.
+        slots: missions that can fly at the same time; None where that changes, as on a cluster.
         outcomes: of the missions that this run flew.
     """
 
@@ -28,6 +29,7 @@ class Progress:
     again: int
     elapsed_s: float
     inside_s: float
+    slots: int | None = None
     outcomes: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -42,6 +44,13 @@ class Progress:
         return 3600.0 * (self.total - self.over) / rate if rate > 0.0 else None
 
     @property
+    def outside(self) -> float | None:
+        """Share of the slots' time outside missions; None where their number is not known."""
+        if self.slots is None or self.elapsed_s <= 0.0:
+            return None
+        return max(0.0, 1.0 - self.inside_s / (self.slots * self.elapsed_s))
+
+    @property
     def success_rate(self) -> float | None:
         """Share of successes among the missions that this run flew; None before the first."""
         flown = sum(self.outcomes.values())
@@ -53,6 +62,9 @@ class Spectator:
 
     def on_progress(self, progress: Progress) -> None:
         """A mission is over, or a second has passed."""
+
+    def on_end(self, progress: Progress) -> None:
+        """Nothing flies any more: all is over, or somebody asked to stop."""
 
     def on_note(self, text: str) -> None:
         """Something that is worth a line."""

@@ -223,6 +223,7 @@ class _Run:
                 if asked and self._flying and not told:
                     told = True
                     self._spectator.on_note("finishing what flies; Ctrl-C once more ends it")
+        self._spectator.on_end(self._progress())
         if asked:
             raise Interrupted("interrupted; run again to go on")
         if self._given_up:
@@ -333,5 +334,6 @@ class _Run:
             again=self._repeated,
             elapsed_s=time.monotonic() - self._begun,
             inside_s=self._inside_s,
+            slots=self._jobs if self._options.cluster is None else None,
             outcomes=self._outcomes,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import itertools
 import math
 import tomllib
@@ -13,7 +14,7 @@ from typing import Any
 
 from mavfi_cli.campaign.factors import NAMES, Point
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.missions import Label, PlannedMission
+from mavfi_cli.campaign.missions import Label, PlannedMission, naming
 from mavfi_cli.core.config import syntax_error
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 from mavfi_cli.core.seeds import Stream, derive
@@ -24,6 +25,7 @@ _TOP = ("name", "about", "seed", "first_seed", "repetitions", "keep", "mission",
 _SETTING = ("name", "repetitions")
 # Factors whose value is a list already: a list of lists crosses several.
 _LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
+_NO_VALUES = (datetime.date, datetime.time)  # what TOML has and no factor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,7 +136,8 @@ class Spec:
         seed = point.values.get("seed", self.first_seed + repetition)
         # Neither stage nor detector has a part in it: settings differ in nothing but themselves.
         fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition)
-        return PlannedMission(config=point.mission(seed, fault_seed), labels=labels)
+        with naming(labels):
+            return PlannedMission(config=point.mission(seed, fault_seed), labels=labels)
 
 
 def _label(value: Any) -> Label:
@@ -195,6 +198,8 @@ class _Reader:
             raise ConfigError("expected tables [[setting]]", path=self._path, key="setting")
         fixed = self._table(data, "mission")
         self._known(fixed, NAMES, "mission.")
+        for name, value in fixed.items():
+            self._usable(name, value, "mission.")
         return Spec(
             name=self._text(data, "name", self._path.stem),
             about=self._text(data, "about", ""),
@@ -227,13 +232,28 @@ class _Reader:
     def _values(self, name: str, value: Any, prefix: str) -> tuple[Any, ...]:
         if name in _LISTS:
             several = isinstance(value, list) and any(isinstance(each, list) for each in value)
-            return tuple(value) if several else (value,)
-        values = tuple(value) if isinstance(value, list) else (value,)
+            values = tuple(value) if several else (value,)
+        else:
+            values = tuple(value) if isinstance(value, list) else (value,)
+        for each in values:
+            self._usable(name, each, prefix)
+        if name in _LISTS:
+            return values
         if not values:
             raise ConfigError("an empty list of values", path=self._path, key=f"{prefix}{name}")
         if len({repr(each) for each in values}) < len(values):
             raise ConfigError("a value is listed twice", path=self._path, key=f"{prefix}{name}")
         return values
+
+    def _usable(self, name: str, value: Any, prefix: str) -> None:
+        """Refuse one value that no mission can have, whatever the factor's own type is."""
+        if name in _LISTS and not isinstance(value, list):
+            problem = f"expected a list, got {value!r}"
+        elif isinstance(value, _NO_VALUES):
+            problem = f"no factor is a date or a time, got {value}"
+        else:
+            return
+        raise ConfigError(problem, path=self._path, key=f"{prefix}{name}")
 
     def _known(self, data: Mapping[str, Any], names: tuple[str, ...], prefix: str) -> None:
         for key in data:

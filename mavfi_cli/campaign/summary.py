@@ -10,6 +10,7 @@ from typing import Any
 from mavfi_cli.campaign.comparison import RESAMPLES, Comparison, against_golden, protection
 from mavfi_cli.campaign.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.campaign.stopping import COUNTED
@@ -104,17 +105,12 @@ def _cell(group: Group, confidence: float) -> Cell:
     )
 
 
-def label_text(labels: Mapping[str, Any]) -> str:
-    """A setting in one phrase."""
-    return " ".join(f"{name}={value}" for name, value in labels.items()) or "all missions"
-
-
 def table(summary: Summary) -> list[str]:
     """The settings and the comparisons as lines of text."""
     width = max(len("setting"), *(len(label_text(cell.labels)) for cell in summary.cells))
     interval_name = f"{100 * summary.confidence:g} % interval"
     lines = [
-        f"{'setting':<{width}}  {'over':>11}  {'success':>9}  {interval_name:>16}  "
+        f"{'setting':<{width}}  {'over':>11}  {'success':>9}  {interval_name:>16}  {'of all':>7}  "
         f"{'time':>8}  {'distance':>8}  {'energy':>8}  {'replans':>7}  inactive"
     ]
     lines += [_cell_line(cell, width) for cell in summary.cells]
@@ -133,11 +129,14 @@ def _cell_line(cell: Cell, width: int) -> str:
     success = f"{share.count}/{share.total}"
     ends = f"{100 * share.low:.1f} to {100 * share.high:.1f} %" if share.total else "-"
     time, distance, energy, replans = (cell.metrics[name].value for name in METRICS)
+    every = f"{100 * cell.every.share:.1f} %" if cell.every.total else "-"
     told = [f"{name} {count}" for name, count in cell.outcomes.items() if name != "success"]
+    told += [f"{name.replace('_', ' ')} {count}"
+             for name, count in cell.injected.items() if name in INACTIVE]  # fmt: skip
     told += [f"could not begin {cell.errors}"] if cell.errors else []
     return (
         f"{label_text(cell.labels):<{width}}  {f'{over}/{cell.planned}':>11}  {success:>9}  "
-        f"{ends:>16}  {_number(time, 's'):>8}  {_number(distance, 'm'):>8}  "
+        f"{ends:>16}  {every:>7}  {_number(time, 's'):>8}  {_number(distance, 'm'):>8}  "
         f"{_number(energy / 1e3, 'kJ'):>8}  {_number(replans, ''):>7}  {cell.inactive.total:>8}"
         + (f"  ({', '.join(told)})" if told else "")
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,14 +88,26 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 @click.option("--by", metavar="LABEL,LABEL", help="Gather settings by these labels  [all].")
 @click.option("--confidence", default=0.95, show_default=True,
               type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True))  # fmt: skip
+@click.option("--quality", is_flag=True,
+              help="Also time, distance, energy, replans: intervals and extremes.")  # fmt: skip
+@click.option("--failures", is_flag=True,
+              help="Also which share of faults fail missions that succeed without.")  # fmt: skip
+@click.option("--kernels", type=_FOLDER,
+              help="With --failures: folder of `mavfi kernels --out`, for the probability of "
+                   "failure given a kernel's silent corruption.")  # fmt: skip
+@click.option("--upsets", type=click.FloatRange(min=0.0),
+              help="With --failures: bit flips an hour that reach what is attacked, for failures "
+                   "a flight hour.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-def status(folder: Path, by: str | None, confidence: float, as_json: bool) -> None:
+def status(folder: Path, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
     """What a campaign has found so far; also while it runs."""
     from mavfi_cli.campaign.ledger import Ledger
 
+    if not options["failures"] and (options["kernels"] or options["upsets"] is not None):
+        raise click.UsageError("--kernels and --upsets go with --failures")
     with Ledger(folder) as ledger:
         names = [name for name in (by or "").split(",") if name]
-        _show(ledger, names, confidence, as_json=as_json)
+        _show(ledger, names, confidence, as_json=as_json, more=options)
 
 
 @campaign.command()
@@ -154,7 +167,7 @@ def _planned(what: str, scale: float | None) -> dict[str, Any]:
     from collections import Counter
 
     from mavfi_cli.campaign.begin import chosen
-    from mavfi_cli.campaign.summary import label_text
+    from mavfi_cli.campaign.missions import label_text
 
     spec: Spec
     spec, _ = chosen(what, None, scale)
@@ -191,14 +204,49 @@ def _plan_lines(told: dict[str, Any], options: dict[str, Any]) -> list[str]:
 
 
 def _show(
-    ledger: Ledger, by: list[str] | None = None, confidence: float = 0.95, *, as_json: bool
+    ledger: Ledger,
+    by: list[str] | None = None,
+    confidence: float = 0.95,
+    *,
+    as_json: bool,
+    more: Mapping[str, Any] | None = None,
 ) -> None:
+    from mavfi_cli.campaign.begin import stopped
     from mavfi_cli.campaign.summary import summarise, table
     from mavfi_cli.core.files import plain
 
     summary = summarise(ledger, by or [], confidence)
-    if as_json:
-        click.echo(json.dumps(plain(summary.to_dict()), indent=2))
+    ended = stopped(ledger)
+    told = {**summary.to_dict(), "stopped": ended}
+    lines = [f"{summary.name}: {summary.over} of {summary.missions} missions"]
+    lines += [f"known well enough, so not flown on: {text}" for text in ended]
+    lines += table(summary)
+    if more is not None:
+        _add_more(ledger, by or [], confidence, more, told, lines)
+    click.echo(json.dumps(plain(told), indent=2) if as_json else "\n".join(lines))
+
+
+def _add_more(
+    ledger: Ledger,
+    by: list[str],
+    confidence: float,
+    more: Mapping[str, Any],
+    told: dict[str, Any],
+    lines: list[str],
+) -> None:
+    """What --quality and --failures ask for, as plain values and as text."""
+    from mavfi_cli.campaign import across, quality
+    from mavfi_cli.campaign.groups import groups
+
+    if not (more["quality"] or more["failures"]):
         return
-    click.echo(f"{summary.name}: {summary.over} of {summary.missions} missions")
-    click.echo("\n".join(table(summary)))
+    found = groups(ledger, by)
+    if more["quality"]:
+        qualities = quality.qualities(found, confidence)
+        told["quality"] = [each.to_dict() for each in qualities]
+        lines += quality.lines(qualities, confidence)
+    if more["failures"]:
+        rows = across.across(ledger, found, more["kernels"], more["upsets"], confidence)
+        told["failures"] = [each.to_dict() for each in rows]
+        lines += ["", "injected faults that fail missions which succeed without:"]
+        lines += across.lines(rows)

@@ -32,6 +32,11 @@ class _Plain(Spectator):
             self._next_s = progress.elapsed_s + _PLAIN_EVERY_S
             click.echo(progress_line(progress), err=True)
 
+    def on_end(self, progress: Progress) -> None:
+        """What the flying took."""
+        if line := end_line(progress):
+            click.echo(line, err=True)
+
     def on_note(self, text: str) -> None:
         """A line of its own."""
         click.echo(text, err=True)
@@ -46,6 +51,11 @@ class _Live(Spectator):
     def on_progress(self, progress: Progress) -> None:
         """Rewrite the line."""
         self._live.update(progress_line(progress), refresh=True)
+
+    def on_end(self, progress: Progress) -> None:
+        """Print what the flying took; it stays."""
+        if line := end_line(progress):
+            self.on_note(line)
 
     def on_note(self, text: str) -> None:
         """Print above the line; not markup, whatever it says."""
@@ -66,6 +76,16 @@ def progress_line(progress: Progress) -> str:
     if progress.again:
         parts.append(f"{progress.again} begun again")
     return ", ".join(parts)
+
+
+def end_line(progress: Progress) -> str:
+    """What the flying took; empty where nothing was flown."""
+    flown = progress.over - progress.before
+    if not flown:
+        return ""
+    line = f"{flown} missions in {_duration(progress.elapsed_s)}, {progress.rate_per_h:.0f} an hour"
+    outside = progress.outside
+    return line if outside is None else f"{line}, {100.0 * outside:.1f} % of it outside missions"
 
 
 def _duration(seconds: float) -> str:

@@ -14,13 +14,19 @@ import click
 @click.option("--golden/--no-golden", default=True, show_default=True,
               help="Fly the golden pair once, to say what the fault changed.")  # fmt: skip
 @click.option("--events", is_flag=True, help="Also list every event of the flight.")
-def show(run: Path, as_json: bool, golden: bool, events: bool) -> None:
+@click.option("--picture", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+              help="Draw the flight from above, as SVG.")  # fmt: skip
+def show(run: Path, as_json: bool, golden: bool, events: bool, picture: Path | None) -> None:
     """Say what happened in RUN, a run folder."""
     from mavfi_cli.mission.golden import paired_golden
     from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report.summary import difference_lines, event_lines, summary_lines
 
     record = load_run(run)
+    if picture is not None:
+        from mavfi_cli.report.top_view import write_top_view
+
+        write_top_view(record, picture)
     if as_json:
         click.echo(json.dumps(record.result, indent=2, sort_keys=True))
         return

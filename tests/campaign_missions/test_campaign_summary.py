@@ -5,16 +5,23 @@ import math
 
 import pytest
 
+from mavfi_cli.campaign.across import across
+from mavfi_cli.campaign.across import lines as across_lines
+from mavfi_cli.campaign.begin import stopped
 from mavfi_cli.campaign.comparison import against_golden, protection
-from mavfi_cli.campaign.groups import groups
+from mavfi_cli.campaign.groups import METRICS, groups
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.quality import lines as quality_lines
+from mavfi_cli.campaign.quality import qualities
 from mavfi_cli.campaign.summary import summarise, table
-from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
+from mavfi_cli.fi.native.fault import FaultModel
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
 
 ACTIVE, GOLDEN = Injected.ACTIVE, Injected.GOLDEN
 FI = {"setting": "FI", "stage": "control"}
@@ -27,10 +34,11 @@ class Book:
     def __init__(self, folder):
         self.ledger = Ledger(folder, writing=True)
 
-    def add(self, labels, seed, time_s, *, injected=ACTIVE, outcome="success"):
+    def add(self, labels, seed, time_s, *, injected=ACTIVE, outcome="success", config=None):
         fault = None if injected is GOLDEN else FaultConfig(target="control", seed=seed)
         number = self.ledger.planned()
-        mission = PlannedMission(config=MissionConfig(seed=seed, fault=fault), labels=labels)
+        config = config or MissionConfig(seed=seed, fault=fault)
+        mission = PlannedMission(config=config, labels=labels)
         self.ledger.plan([mission])
         quality = {"flight_time_s": time_s, "distance_m": 50.0, "energy_regression_j": 9e3}
         self.ledger.add(
@@ -69,6 +77,10 @@ def test_faults_that_did_nothing_are_counted_apart(book):
     assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
     assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
     assert cell.metrics["flight_time_s"].count == 2
+    row = table(summarise(book.ledger))[1]
+    assert "  2/3  " in row
+    assert "  83.3 %  " in row  # of all six, as the paper counts
+    assert row.endswith("3  (collision 1, not activated 1, not injected 1, null 1)")
 
 
 def test_errors_are_counted_nowhere_else(book):
@@ -109,6 +121,20 @@ def test_protection_is_held_against_the_same_faults_without_it(book):
     assert saved.worst.recovered_share == pytest.approx(8.0 / 11.0)
 
 
+def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothing(book):
+    for seed in range(5):
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN)
+        for stage, idle, time_s in (("planning", seed == 0, 30.0), ("control", False, 50.0)):
+            fate = Injected.NOT_INJECTED if idle else ACTIVE
+            book.add({"setting": "FI", "stage": stage}, seed, time_s, injected=fate)
+            book.add({"setting": "D&R", "stage": stage, "detector": "gad"}, seed, time_s)
+    (saved,) = protection(groups(book.ledger, ["setting"]))
+    assert (saved.first, saved.second) == ({"setting": "FI"}, {"setting": "D&R"})
+    assert saved.success.pairs == 9
+    time = saved.differences["flight_time_s"]
+    assert (time.value, time.low, time.high) == (0.0, 0.0, 0.0)
+
+
 def test_settings_are_gathered_by_labels(book):
     for seed in range(4):
         book.add({"setting": "FI", "stage": "planning", "world": "farm"}, seed, 20.0)
@@ -143,3 +169,105 @@ def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
 def test_a_campaign_that_has_just_begun_has_a_table(book):
     book.ledger.plan([PlannedMission(config=MissionConfig(), labels={})])
     assert "all missions" in "\n".join(table(summarise(book.ledger)))
+
+
+def test_quality_has_intervals_and_extremes_of_every_metric(book):
+    fill(book)
+    found = qualities(groups(book.ledger))
+    assert [each.metric for each in found[::3]] == [*METRICS]
+    golden, faulty, _ = found[:3]
+    assert (golden.mean.value, golden.difference) == (20.0, None)
+    assert (faulty.least, faulty.median, faulty.most) == (30.0, 30.0, 31.0)
+    assert faulty.mean.count == 7
+    assert faulty.mean.value == pytest.approx(30.0 + 1 / 7)
+    assert 30.0 <= faulty.mean.low < faulty.mean.value < faulty.mean.high <= 31.0
+    assert faulty.difference.value == pytest.approx(10.0 + 1 / 7)
+    text = "\n".join(quality_lines(found))
+    assert "+10.14" in text
+    assert "replans" in text
+
+
+def test_quality_without_a_success_is_no_number(book):
+    book.add(FI, 1, 30.0, outcome="collision")
+    found = qualities(groups(book.ledger))
+    assert all(math.isnan(each.most) for each in found)
+    assert quality_lines(found)[2].split()[-6:] == ["0", "-", "-", "-", "-", "-"]
+
+
+def test_failures_are_of_missions_that_succeed_without_the_fault(book):
+    fill(book)
+    for seed, injected, golden in (
+        (20, ACTIVE, "collision"),  # it fails anyway
+        (21, Injected.NOT_ACTIVATED, "success"),  # a fault of the kernel that was benign
+        (22, Injected.NOT_INJECTED, "success"),  # no fault
+    ):
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN, outcome=golden)
+        outcome = "collision" if injected is ACTIVE else "success"
+        book.add(FI, seed, 20.0, injected=injected, outcome=outcome)
+    faulty, saved = across(book.ledger, groups(book.ledger), upsets_per_hour=2.0)
+    assert (faulty.labels, faulty.failure.count, faulty.failure.total) == (FI, 3, 11)
+    assert (saved.failure.count, saved.failure.total) == (1, 10)
+    assert faulty.per_hour == pytest.approx((6 / 11, 2 * faulty.failure.low,
+                                             2 * faulty.failure.high))  # fmt: skip
+    assert faulty.layers is None
+    assert "3 of 11 faults fail the mission, 27.3 %" in "\n".join(across_lines([faulty]))
+
+
+def native(book, seeds, **fault):
+    """A golden and an instruction-level mission of each seed; every second fault is fatal."""
+    for seed in seeds:
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN)
+        config = MissionConfig(
+            seed=seed, instruction=InstructionConfig(target="octomap", seed=seed, **fault)
+        )
+        outcome = "collision" if seed % 2 else "success"
+        book.add({"setting": "native"}, seed, 20.0, outcome=outcome, config=config)
+
+
+def kernels_folder(tmp_path, **changes):
+    """What `mavfi kernels` leaves: of 100 faults in octomap 80 corrupt its output in silence."""
+    plan = {
+        "rule": "instruction-uniform", "compat": None, "model": FaultModel().to_json(), **changes
+    }  # fmt: skip
+    kernels = [{"kernel": "octomap", "outcomes": {"sdc": {"count": 80, "of": 100}}}]
+    text = json.dumps({"plan": plan, "kernels": kernels})
+    (tmp_path / "kernels.json").write_text(text)
+    return tmp_path
+
+
+def test_failure_given_a_kernels_corruption(book, tmp_path):
+    native(book, range(10))
+    (row,) = across(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
+    assert row.kernel == "octomap"
+    assert row.layers.corruption.share == 0.8
+    assert row.layers.failure_given_corruption[0] == pytest.approx(0.5 / 0.8)
+    assert "failure given corruption 0.625 (" in "\n".join(across_lines([row]))
+
+
+def test_kernels_that_other_faults_struck_are_refused(book, tmp_path):
+    native(book, range(2), bits=3)
+    with pytest.raises(ConfigError, match=r"kernels.json: .*not the same population"):
+        across(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
+
+
+@pytest.mark.parametrize("text", [None, "no json", "{}", '{"plan": [], "kernels": []}'])
+def test_a_folder_without_kernels_is_refused(book, tmp_path, text):
+    native(book, range(2))
+    if text is not None:
+        (tmp_path / "kernels.json").write_text(text)
+    with pytest.raises(RecordError, match=r"kernels.json: "):
+        across(book.ledger, groups(book.ledger), tmp_path)
+
+
+def test_settings_that_their_rule_has_stopped_are_named(book):
+    assert stopped(book.ledger) == []  # a program made the list
+    text = "repetitions = 40\n[stop]\nmargin = 0.1\nbatch = 20\n"
+    book.ledger.set_meta({"spec": text, "name": "stopping"})
+    for seed in range(20):
+        book.add(FI, seed, 20.0)
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN,
+                 outcome="collision" if seed % 2 else "success")  # fmt: skip
+    for labels in (FI, {"setting": "golden"}):
+        left = [PlannedMission(config=MissionConfig(seed=s), labels=labels) for s in range(20, 40)]
+        book.ledger.plan(left)
+    assert stopped(book.ledger) == ["setting=FI stage=control"]

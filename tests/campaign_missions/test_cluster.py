@@ -14,6 +14,7 @@ import pytest
 from conftest import planned
 from killing import results_of
 
+from mavfi_cli.campaign.cluster import Cluster, ClusterError
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -157,6 +158,14 @@ def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port)
     assert (run.returncode, run.stdout) == (1, "")
     (line,) = run.stderr.splitlines()
     assert line.startswith(f"error: no scheduler at {address}: ")
+
+
+@pytest.mark.parametrize(
+    "address", ["nonsense", "127.0.0.1:8786", "tcp://127.0.0.1", "tcp://127.0.0.1:port"]
+)
+def test_what_is_no_address_is_refused_at_once(address):
+    with pytest.raises(ClusterError, match="expected the scheduler's address, as tcp://host:8786"):
+        Cluster(address, Keep.NONE)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sqlite3
 import subprocess
 import sys
@@ -58,6 +59,8 @@ def test_a_campaign_is_flown_and_summed_up(flown):
     assert faulty["success"]["total"] + faulty["inactive"]["total"] == 2
     assert golden["metrics"]["flight_time_s"]["value"] > 2.0
     assert "4/4 missions" in run.stderr
+    end = r"4 missions in \d+:\d\d min, \d+ an hour, \d+\.\d % of it outside missions"
+    assert re.search(f"^{end}$", run.stderr, re.MULTILINE)
     assert (folder / "campaign.toml").read_text().startswith('name = "short"\n')
     assert len(list((folder / "runs").glob("*/result.json"))) == 4
 
@@ -133,6 +136,15 @@ def refused(mavfi, tmp_path):
 def test_a_bad_specification_gets_one_line_and_flies_nothing(refused, tmp_path, old, new, problem):
     assert old in SPEC
     assert problem in refused("run", written(tmp_path, SPEC.replace(old, new)))
+
+
+def test_a_refused_setting_is_named_among_many(refused, tmp_path):
+    spec = SPEC.replace('site = "waypoint_position"', 'site = ["command", "future_collision_seq"]')
+    spec = spec.replace("mantissa", "exponent").replace('"command"', '"command_yaw"')
+    line = refused("run", written(tmp_path, spec))
+    assert line.startswith("setting=FI world=farm ")
+    assert "site=future_collision_seq" in line
+    assert "int32 has no field 'exponent'" in line
 
 
 def test_what_does_not_exist_gets_one_line(refused, tmp_path):

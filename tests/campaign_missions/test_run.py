@@ -167,6 +167,15 @@ def test_run_folders_are_kept_by_policy(campaign, keep, kept):
     assert (sorted(p.name for p in runs.iterdir()) if runs.is_dir() else []) == kept
 
 
+@pytest.mark.parametrize("settings", [1, 7, 20, 40, 136, 137])
+def test_the_sample_of_successes_has_some_of_every_setting(settings):
+    repetitions = 200  # the settings take turns in the list
+    kept = [Keep.SAMPLED.wants(n, "success") for n in range(settings * repetitions)]
+    for setting in range(settings):
+        assert 1 <= sum(kept[setting::settings]) <= 25
+    assert sum(kept) / len(kept) == pytest.approx(1 / 20, rel=0.1 if settings > 1 else 0.5)
+
+
 def test_the_folder_of_a_mission_that_was_cut_off_is_kept_with_its_last_words(campaign):
     result = only(campaign.run(planned(f"signal:{int(signal.SIGSEGV)}"), keep=Keep.ALL))
     assert result.path.name == "000000-cut-off"

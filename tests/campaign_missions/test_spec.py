@@ -146,6 +146,11 @@ def test_instruction_level_and_lists_of_values():
         ("name = 3", ConfigError, r"name: expected a text"),
         ("seed =\nname = 'x'", ConfigError, r"mine.toml:1: "),
         ("[factors]\nbits = [{}, {}]", ConfigError, r"factors.bits: a value is listed twice"),
+        ("[factors]\nworld = [1979-05-27]", ConfigError, r"factors.world: no factor is a date"),
+        ("[mission]\nworld = 07:32:00", ConfigError, r"mission.world: no factor is a date or a t"),
+        ("[[setting]]\nprotect = 'control'", ConfigError, r"protect: expected a list, got 'cont"),
+        ("[[setting]]\nprotect = ['control', ['planning']]", ConfigError, r"expected a list, got"),
+        ("[mission]\nstart = 2.0", ConfigError, r"mission.start: expected a list, got 2.0"),
         ("[stop]\nmargin = 0.7", ConfigError, r"stop: needs a margin between"),
         ("[stop]\nmargn = 0.1", UnknownKey, r"did you mean 'margin'"),
     ],
@@ -175,6 +180,21 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
 def test_a_combination_that_makes_no_mission_is_refused(text, problem):
     with pytest.raises(MavfiError, match=problem):
         spec_of(f"[factors]\n{text}").missions()
+
+
+def test_what_is_wrong_with_one_of_many_settings_names_it():
+    text = """
+    [factors]
+    world = ["farm", "sparse"]
+    [[setting]]
+    name = "golden"
+    [[setting]]
+    name = "FI"
+    stage = "control"
+    bits = [1, "two"]
+    """
+    with pytest.raises(MavfiError, match=r"^setting=FI world=farm bits=two stage=control: fault"):
+        spec_of(text).missions()
 
 
 @pytest.mark.parametrize("name", presets())

@@ -58,6 +58,14 @@ def test_show_says_what_fly_said(command_line, short_flight):
     assert command_line("show", short_flight.result)[1] == out
 
 
+def test_show_draws_a_run_that_has_no_picture(command_line, short_flight, tmp_path):
+    path = tmp_path / "above.svg"
+    code, out, err = command_line("show", short_flight.path, "--picture", path)
+    assert (code, err) == (0, "")
+    assert path.read_text().startswith("<?xml")
+    assert f"Run folder  {short_flight.path}" in out
+
+
 def test_show_events_and_json(command_line, troubled_flight):
     result = json.loads(troubled_flight.result.read_text())
     _, out, _ = command_line("show", troubled_flight.path, "--events")

@@ -205,7 +205,7 @@ class EvaluationPlan:
                 seed=derive(*drawn, number),
             )
             # Drawn again until the state is of the wanted type, so each of them is as likely.
-            if _is_float(replace(fault, field=Field.ANY.value)) is not whole:
+            if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:
                 return {"fault": fault}
         raise ConfigError(f"no state of {place.target} has a bit field {place.field}")
 
@@ -218,10 +218,6 @@ def _require_distinct(what: str, chosen: Sequence[str], known: Sequence[str]) ->
             raise UnknownName(what, name, known)
         if name in chosen[:place]:
             raise ConfigError(f"{name} is named twice", key=what)
-
-
-def _is_float(fault: FaultConfig) -> bool:
-    return fault.draw().states[0].dtype is DType.FLOAT64
 
 
 def labels_of(

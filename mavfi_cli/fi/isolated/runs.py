@@ -45,19 +45,13 @@ class FaultPlan:
 
     def to_json(self) -> dict[str, Any]:
         """What results depend on; how many runs there are is not part of it."""
-        model = self.strategy().model
         return {
             "seed": self.seed,
             "rule": self.rule,
             "compat": self.compat,
             "windows": self.windows,
             "null": self.null,
-            "model": {
-                "sites": sorted(site.value for site in model.sites),
-                "roles": sorted(role.value for role in model.roles),
-                "field": model.field.value,
-                "bits": model.count,
-            },
+            "model": self.strategy().model.to_json(),
         }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -84,6 +85,15 @@ class FaultModel:
     count: int = 1
     excluded: frozenset[str] = frozenset()  # operands that are never drawn (compat modes)
     low_byte_only: bool = False  # compat rosfi-2021
+
+    def to_json(self) -> dict[str, Any]:
+        """What is drawn from, but for the habits of compat modes."""
+        return {
+            "sites": sorted(site.value for site in self.sites),
+            "roles": sorted(role.value for role in self.roles),
+            "field": self.field.value,
+            "bits": self.count,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

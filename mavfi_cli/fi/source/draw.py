@@ -10,7 +10,7 @@ from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import BY_NAME, State, of_stage
 from mavfi_cli.core.types import Stage
-from mavfi_cli.fi.bits import NUMPY_TYPES, mask_of
+from mavfi_cli.fi.bits import NUMPY_TYPES, Field, mask_of
 from mavfi_cli.fi.source.fault import Corruption, Effect, SourceFault, Trigger
 
 GROUPS = tuple(dict.fromkeys(state.group for state in BY_NAME.values()))
@@ -28,8 +28,8 @@ def draw_fault(
     """The fault that a target and a seed stand for.
 
     Args:
-        target: a stage (a state of it is drawn), a state, or a group of states (one is drawn,
-            unless `together`).
+        target: a stage (a state of it is drawn, of those that have the corruption's field), a
+            state, or a group of states (one is drawn, unless `together`).
         seed: root of the fault's own random stream.
         together: strike all states of the target's group at once, as the paper's Table III does
             with the three components of the acceleration.
@@ -40,7 +40,7 @@ def draw_fault(
         FaultSpecError: a bit outside the width, a field that the type has not.
     """
     rng = generator(seed, Stream.FAULT, "site")
-    states = _states(target, rng, together)
+    states = _states(target, rng, together, corruption.field)
     for state in states:
         kind = NUMPY_TYPES[state.dtype.value]
         if bits is not None:
@@ -56,14 +56,18 @@ def draw_fault(
     return SourceFault(states=states, trigger=trigger, corruption=corruption, bits=chosen)
 
 
-def _states(target: str, rng: np.random.Generator, together: bool) -> tuple[State, ...]:
+def _states(
+    target: str, rng: np.random.Generator, together: bool, field: Field
+) -> tuple[State, ...]:
     stages = {stage.value: stage for stage in Stage}
     if target in BY_NAME:
         candidates: tuple[State, ...] = (BY_NAME[target],)
     elif target in GROUPS:
         candidates = _group(target)
     elif target in stages:
-        candidates = of_stage(stages[target])
+        whole = of_stage(stages[target])
+        has = [state for state in whole if field in NUMPY_TYPES[state.dtype.value].fields]
+        candidates = tuple(has) or whole
     else:
         raise UnknownName("stage, state or group", target, {*stages, *BY_NAME, *GROUPS})
     state = candidates[int(rng.integers(len(candidates)))]

@@ -1,0 +1,172 @@
+"""What faults cost beyond the golden flights, and what that means across layers and an hour.
+
+A fault counts against a mission whose golden flight succeeds, whatever became of it once it was
+injected: a flip that nothing read is one of the kernel's benign runs too. So a campaign and
+`mavfi kernels` count the same population.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.campaign.groups import Group
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.missions import canonical, label_text
+from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.campaign.statistics.layers import CrossLayer, cross_layer, failures_per_hour
+from mavfi_cli.campaign.statistics.proportions import rate
+from mavfi_cli.campaign.stopping import COUNTED
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.fi.isolated.outcome import Share
+from mavfi_cli.mission.config import MissionConfig
+
+KERNELS = "kernels.json"  # what `mavfi kernels --out` leaves
+_STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
+Runs = Mapping[str, tuple[int, int]]  # kernel -> silent corruptions, injected faults
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Across:
+    """One setting with faults.
+
+    Attributes:
+        failure: injected faults that fail a mission, of those whose golden flight succeeds.
+        kernel: that all of its faults strike at instruction level; None where there are several.
+        layers: its own corruption beside that; None without runs of the kernel by itself.
+        per_hour: failures a flight hour, with the ends of the interval; None where not asked for.
+    """
+
+    labels: Mapping[str, Any]
+    failure: Share
+    kernel: str | None
+    layers: CrossLayer | None
+    per_hour: tuple[float, float, float] | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def across(
+    ledger: Ledger,
+    found: Sequence[Group],
+    kernels: Path | None = None,
+    upsets_per_hour: float | None = None,
+    confidence: float = 0.95,
+) -> list[Across]:
+    """Every setting with faults that has golden flights beside it.
+
+    Args:
+        found: the settings of the ledger.
+        kernels: folder of `mavfi kernels --out`.
+        upsets_per_hour: bit flips that reach what is attacked in an hour of flight.
+
+    Raises:
+        RecordError: no such folder, or what is in it cannot be read.
+        ConfigError: the kernels were attacked with other faults; a negative rate.
+    """
+    alone = None if kernels is None else _Alone(kernels)
+    succeeds = [each.pair.codes[each.counted & each.succeeded]
+                for each in found if each.golden and not each.watched]  # fmt: skip
+    golden = np.concatenate([np.zeros(0, dtype=np.int64), *succeeds])
+    rows = []
+    for group in found:
+        places = group.injected.among(_STRUCK) & np.isin(group.pair.codes, golden)
+        struck = int(places.sum())
+        if group.golden or not struck:
+            continue
+        failed = struck - int(group.succeeded[places].sum())
+        failure = rate(failed, struck, confidence)
+        numbers = group.number[places].tolist()
+        configs = [each.mission.config for each in ledger.results(numbers)] if alone else []
+        kernel, layers = _kernel(configs), None
+        if alone is not None and kernel is not None and kernel in alone.runs:
+            alone.require(configs[0])
+            layers = cross_layer(*alone.runs[kernel], failed, struck, confidence)
+        rows.append(
+            Across(
+                labels=group.labels,
+                failure=failure,
+                kernel=kernel,
+                layers=layers,
+                per_hour=None
+                if upsets_per_hour is None
+                else failures_per_hour(upsets_per_hour, failure),
+            )
+        )
+    return rows
+
+
+def _kernel(configs: Sequence[MissionConfig]) -> str | None:
+    """The one kernel that all these missions attack, as `mavfi kernels` calls it."""
+    faults = [config.instruction for config in configs]
+    if not faults or any(fault is None for fault in faults):
+        return None
+    nodes = {
+        config.planner if config.instruction.node() == "planner" else config.instruction.node()
+        for config in configs
+        if config.instruction is not None
+    }
+    return nodes.pop() if len(nodes) == 1 else None
+
+
+class _Alone:
+    """What faults did to the kernels by themselves."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / KERNELS
+        try:
+            told = json.loads(self._path.read_text(encoding="utf-8"))
+            plan = told["plan"]
+            self._population = {name: plan[name] for name in ("rule", "compat", "model")}
+            self.runs: Runs = {
+                each["kernel"]: (each["outcomes"]["sdc"]["count"], each["outcomes"]["sdc"]["of"])
+                for each in told["kernels"]
+            }
+        except OSError as error:
+            raise RecordError(f"{self._path}: {error.strerror or error}") from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise RecordError(f"{self._path}: no summary of `mavfi kernels`: {error!r}") from None
+
+    def require(self, config: MissionConfig) -> None:
+        """Have a mission's fault be drawn as those that struck the kernels."""
+        fault = config.instruction
+        assert fault is not None
+        drawn = fault.strategy()
+        ours = {"rule": drawn.rule.value, "compat": fault.compat, "model": drawn.model.to_json()}
+        if ours != self._population:
+            raise ConfigError(
+                f"faults were drawn by {canonical(self._population)}, in the campaign by "
+                f"{canonical(ours)}: not the same population",
+                path=self._path,
+            )
+
+
+def lines(rows: Sequence[Across]) -> list[str]:
+    """What was found, a line a setting."""
+    return [f"  {label_text(each.labels)}: {', '.join(_parts(each))}" for each in rows]
+
+
+def _parts(each: Across) -> list[str]:
+    failure = each.failure
+    parts = [f"{failure.count} of {failure.total} faults fail the mission, {_share(failure)}"]
+    if each.layers is not None:
+        parts.append(f"{each.kernel} corrupted by {_share(each.layers.corruption)} of its faults")
+        given = each.layers.failure_given_corruption
+        if given is None:
+            parts.append("failure given corruption unknown: more fail than are corrupted")
+        else:
+            parts.append("failure given corruption {:.3g} ({:.3g} to {:.3g})".format(*given))
+    if each.per_hour is not None:
+        parts.append("{:.3g} failures a flight hour ({:.3g} to {:.3g})".format(*each.per_hour))
+    return parts
+
+
+def _share(share: Share) -> str:
+    return f"{100 * share.share:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
