@@ -80,7 +80,9 @@ class Companion:
             ),
             briefing.goal_enu_m,
         )
-        self._recovery = Recovery(protection, self.pilot, injection.follower, self._exchange)
+        self._recovery = Recovery(
+            protection, self.pilot, injection.follower, self._exchange, self._look_anew
+        )
         self._latency = latency_model(platform, config.seed, wall)
         self.executor = Executor(
             draw_latency_s=self._latency.draw_s,
@@ -136,14 +138,17 @@ class Companion:
         report, self._fresh_frame_s = checked
         report = self._injection.pass_on(report, self._moment(stamp_s))
         if not self._recovery.admit_report(report, stamp_s):
-            if self._frame is not None:  # look anew: point cloud, OctoMap, collision check
-                self.executor.submit("point_cloud", self._frame)
             return
         self.report = report
         timely = self.pilot.on_report(report)
         if self._injection.follower is not None:
             states = VERDICT_STATES if timely else VERDICT_STATES - {"time_to_collision"}
             self._injection.follower.read(report, "mission logic", stamp_s, states)
+
+    def _look_anew(self) -> None:
+        """Point cloud, OctoMap and collision check once more, of the newest frame."""
+        if self._frame is not None:
+            self.executor.submit("point_cloud", self._frame)
 
     def _take_plan(self, result: Trajectory | PlanFailure, stamp_s: float) -> None:
         if isinstance(result, Trajectory):

@@ -65,9 +65,9 @@ class NoProtection:
 
     gate: Gate | None = None
 
-    def report(self, report: CollisionReport, stamp_s: float) -> Response:
+    def report(self, report: CollisionReport, stamp_s: float) -> tuple[Response, Stage]:
         """Passes."""
-        return Response.PASS
+        return Response.PASS, Stage.PERCEPTION
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Response:
         """Passes."""
@@ -121,16 +121,16 @@ class Protection(NoProtection):
         config = self._config
         return find(config.name, model=config.model_path, threshold=config.threshold)
 
-    def report(self, report: CollisionReport, stamp_s: float) -> Response:
-        """Judge perception's message on its arrival."""
+    def report(self, report: CollisionReport, stamp_s: float) -> tuple[Response, Stage]:
+        """Judge perception's message on its arrival; and which stage is to compute again."""
         alarm = self._judge("report", self.gate.judge_report, report)
         if alarm is None:
             self._recovered(Stage.PERCEPTION, stamp_s, proven=True)
-            return Response.PASS
+            return Response.PASS, Stage.PERCEPTION
         response = self._respond(alarm, "report", Stage.PERCEPTION, stamp_s)
         if response is Response.ACCEPT:
             self.gate.accept_report()
-        return response
+        return response, alarm.stage
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Response:
         """Judge a plan on its arrival."""

@@ -6,6 +6,9 @@
     RECOMPUTE   look anew          ask for another    drop the waypoint    compute it again
     HOLD        look anew, hold    hold               hold                 hold
 
+Perception looks anew where the alarm is its own. That of a detector over all stages recomputes
+control (section V-D), which it does in the next tick, without the report.
+
 To hold is to give the plan up, hover, and plan anew from there. PASS and ACCEPT let the message
 take effect. Where computing a command again did not help, or its waypoint is to blame, control
 drops that waypoint, takes the next, and begins afresh (paper, section V-E).
@@ -58,6 +61,7 @@ class Recovery:
         pilot: whose plan is dropped, changed or asked for.
         follower: is told which message was withheld; None where no fault is followed.
         exchange: puts a changed version of a plan in the place of the one that is flown.
+        look_anew: has perception compute again, from the newest frame.
 
     Attributes:
         state: the vehicle's newest state, from which a vehicle that holds plans anew.
@@ -69,20 +73,24 @@ class Recovery:
         pilot: Pilot,
         follower: Follower | None,
         exchange: Callable[[Trajectory, Trajectory], None],
+        look_anew: Callable[[], None],
     ) -> None:
         self._protection = protection
         self._pilot = pilot
         self._follower = follower
         self._exchange = exchange
+        self._look_anew = look_anew
         self._looked: tuple[Trajectory | None, int] = (None, -1)
         self.state: VehicleState | None = None
 
     def admit_report(self, report: CollisionReport, stamp_s: float) -> bool:
-        """Whether perception's message takes effect; else perception is to look anew."""
-        response = self._protection.report(report, stamp_s)
+        """Whether perception's message takes effect."""
+        response, stage = self._protection.report(report, stamp_s)
         if response not in WITHHELD:
             return True
         self._withhold(report)
+        if stage is Stage.PERCEPTION:
+            self._look_anew()
         if response is Response.HOLD:
             self._hold()
         return False

@@ -120,10 +120,10 @@ def test_a_wild_report_is_withheld(limit):
     calm = CollisionReport(
         stamp_s=0.0, collision=True, time_to_collision_s=3.0, future_collision_seq=1
     )
-    assert gate.report(calm, 0.0) is Response.PASS
+    assert gate.report(calm, 0.0)[0] is Response.PASS
     wild = replace(calm, future_collision_seq=1 << 20)
-    assert gate.report(wild, 0.3) is Response.RECOMPUTE
-    assert gate.report(calm, 0.6) is Response.PASS
+    assert gate.report(wild, 0.3)[0] is Response.RECOMPUTE
+    assert gate.report(calm, 0.6)[0] is Response.PASS
     assert gate.summary()["recoveries"]["perception"] == {"count": 1, "total_s": 0.3}
 
 

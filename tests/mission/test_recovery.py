@@ -40,7 +40,7 @@ class Told(NoProtection):
         self.looked = []
 
     def report(self, report, stamp_s):
-        return self.answer
+        return self.answer, self.stage
 
     def tick(self, trajectory, index, command, stamp_s):
         return self.answer, self.stage
@@ -67,8 +67,14 @@ class Desk:
         self.pilot.mode = Mode.FLYING
         self.exchanged = []
         self.follower = Follower()
-        self.recovery = Recovery(protection, self.pilot, self.follower, self.exchange)
+        self.looks = 0
+        self.recovery = Recovery(
+            protection, self.pilot, self.follower, self.exchange, self.look_anew
+        )
         self.recovery.state = STATE
+
+    def look_anew(self):
+        self.looks += 1
 
     def exchange(self, flown, changed):
         self.exchanged.append((flown, changed))
@@ -90,6 +96,14 @@ def test_what_passes_changes_nothing(answer):
     assert desk.command() == (True, None)
     assert desk.pilot.flown.trajectory is desk.plan
     assert desk.exchanged == []
+
+
+@pytest.mark.parametrize(("stage", "looks"), [(Stage.PERCEPTION, 1), (Stage.CONTROL, 0)])
+def test_perception_looks_anew_only_where_the_alarm_is_its_own(stage, looks):
+    desk = Desk(Told(Response.RECOMPUTE, stage))
+    assert not desk.recovery.admit_report(REPORT, 1.0)
+    assert desk.looks == looks
+    assert desk.pilot.flown.trajectory is desk.plan
 
 
 def test_to_hold_is_to_give_up_the_plan_and_hover():

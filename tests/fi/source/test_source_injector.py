@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.core.errors import BitOutsideWidth, FaultSpecError, FieldUnavailable, UnknownName
-from mavfi_cli.core.states import BY_NAME, STATES, DType, Message
+from mavfi_cli.core.states import BY_NAME, STATES, DType, Message, of_stage
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field, pattern_of
 from mavfi_cli.fi.source.draw import GROUPS, draw_fault
@@ -239,3 +239,16 @@ def test_impossible_corruptions(options):
 def test_impossible_triggers(options):
     with pytest.raises(FaultSpecError):
         Trigger(when=When.TIME, **options)
+
+
+@pytest.mark.parametrize("stage", [stage.value for stage in Stage])
+@pytest.mark.parametrize("field", [Field.EXPONENT, Field.MANTISSA])
+def test_of_a_stage_only_states_that_have_the_field_are_drawn(stage, field):
+    corruption = Corruption(field=field)
+    drawn = [
+        draw_fault(stage, seed=seed, trigger=Trigger(), corruption=corruption).states[0]
+        for seed in range(60)
+    ]
+    assert {state.dtype.value for state in drawn} == {"float64"}
+    able = {state.name for state in of_stage(Stage(stage)) if state.dtype.value == "float64"}
+    assert {state.name for state in drawn} == able
