@@ -18,12 +18,12 @@ from mavfi_cli.campaign.ledger import RUNS, Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
 from mavfi_cli.campaign.outcome import State, injected_of
 from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.seats import Assignment, Ended, Seats
-from mavfi_cli.campaign.slots import TASK, Slots
+from mavfi_cli.campaign.slots.local import TASK, Slots
+from mavfi_cli.campaign.slots.seats import Assignment, Ended, Seats
+from mavfi_cli.campaign.slots.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.campaign.spec import Stop
 from mavfi_cli.campaign.stopping import Entry, Gate, Queue
 from mavfi_cli.campaign.together import Together
-from mavfi_cli.campaign.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions, interruptible
@@ -237,7 +237,7 @@ class _Run:
         options = self._options
         if options.cluster is None:
             return Slots(self._jobs, options.task, fork=options.fork)
-        from mavfi_cli.campaign.cluster import Cluster
+        from mavfi_cli.campaign.slots.cluster import Cluster
 
         return Cluster(options.cluster, options.keep, options.task)
 

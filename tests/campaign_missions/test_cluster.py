@@ -14,9 +14,9 @@ import pytest
 from conftest import planned
 from killing import results_of
 
-from mavfi_cli.campaign.cluster import Cluster, ClusterError
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.slots.cluster import Cluster, ClusterError
 from mavfi_cli.core.errors import ConfigError, RecordError
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")

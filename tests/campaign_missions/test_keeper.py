@@ -7,9 +7,9 @@ import time
 import pytest
 from test_run import alive
 
-from mavfi_cli.campaign.keeper import UNBORN
-from mavfi_cli.campaign.seats import Assignment
-from mavfi_cli.campaign.slots import Slots
+from mavfi_cli.campaign.slots.keeper import UNBORN
+from mavfi_cli.campaign.slots.local import Slots
+from mavfi_cli.campaign.slots.seats import Assignment
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.desk import ERRORS, SCRATCH
 from mavfi_cli.campaign.outcome import State
-from mavfi_cli.campaign.seats import Ended
+from mavfi_cli.campaign.slots.desk import ERRORS, SCRATCH
+from mavfi_cli.campaign.slots.seats import Ended
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.run_folder import RunFolder

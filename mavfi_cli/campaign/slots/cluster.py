@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.remote import Answer, Order, fly, unpack, worker_versions
-from mavfi_cli.campaign.seats import Assignment, Ended, Seats
-from mavfi_cli.campaign.slots import TASK
+from mavfi_cli.campaign.slots.local import TASK
+from mavfi_cli.campaign.slots.remote import Answer, Order, fly, unpack, worker_versions
+from mavfi_cli.campaign.slots.seats import Assignment, Ended, Seats
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions

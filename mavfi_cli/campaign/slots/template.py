@@ -1,6 +1,6 @@
 """The template process: imports and warms everything once, then forks slots.
 
-    python -m mavfi_cli.campaign.template FD MODULE
+    python -m mavfi_cli.campaign.slots.template FD MODULE
 
 FD is a socket to the runner; each packet on it carries the descriptor of a new slot's channel.
 A mission is a fork of a slot, which is a fork of this process before any mission: a fresh process
@@ -17,7 +17,7 @@ import socket
 import sys
 from typing import NoReturn, cast
 
-from mavfi_cli.campaign.slot import Task, serve
+from mavfi_cli.campaign.slots.slot import Task, serve
 from mavfi_cli.core.processes import TEMPLATE, call_this_process, threads
 
 READY = b"ready"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mavfi_cli.campaign.desk import Desk
 from mavfi_cli.campaign.missions import config_from
+from mavfi_cli.campaign.slots.desk import Desk
 from mavfi_cli.mission.branching import Branching, Member
 
 

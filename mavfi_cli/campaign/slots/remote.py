@@ -17,10 +17,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.desk import SCRATCH
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.seats import Assignment, Ended
-from mavfi_cli.campaign.slots import Slots
+from mavfi_cli.campaign.slots.desk import SCRATCH
+from mavfi_cli.campaign.slots.local import Slots
+from mavfi_cli.campaign.slots.seats import Assignment, Ended
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
 from mavfi_cli.mission.run_folder import FAULT, RESULT

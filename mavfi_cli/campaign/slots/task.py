@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mavfi_cli.campaign.desk import Desk
+    from mavfi_cli.campaign.slots.desk import Desk
     from mavfi_cli.mission.vehicle_template import VehicleTemplate
 
 
@@ -57,7 +57,7 @@ def perform_together(desk: Desk, vehicles: VehicleTemplate | None) -> Path:
     Raises:
         MavfiError: as `perform`.
     """
-    from mavfi_cli.campaign.cast import Cast
+    from mavfi_cli.campaign.slots.cast import Cast
     from mavfi_cli.mission.run import fly_together
 
     assert vehicles is not None

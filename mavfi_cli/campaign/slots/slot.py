@@ -25,8 +25,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.campaign.desk import Desk
-from mavfi_cli.campaign.keeper import Keeper
+from mavfi_cli.campaign.slots.desk import Desk
+from mavfi_cli.campaign.slots.keeper import Keeper
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.core.processes import (
     MISSION,

@@ -12,13 +12,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from mavfi_cli.campaign.seats import Assignment, Ended, Seats
-from mavfi_cli.campaign.slot import PACKET
-from mavfi_cli.campaign.template import READY
+from mavfi_cli.campaign.slots.seats import Assignment, Ended, Seats
+from mavfi_cli.campaign.slots.slot import PACKET
+from mavfi_cli.campaign.slots.template import READY
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.processes import ONE_THREAD
 
-TASK = "mavfi_cli.campaign.task"
+TASK = "mavfi_cli.campaign.slots.task"
 _STOP_S = 10.0  # from the closing of the slots until what is left of them is killed
 
 
@@ -128,7 +128,7 @@ class Slots(Seats):
 
     def _start_template(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        line = [sys.executable, "-m", "mavfi_cli.campaign.template"]
+        line = [sys.executable, "-m", "mavfi_cli.campaign.slots.template"]
         with theirs:
             self._template = subprocess.Popen(
                 [*line, str(theirs.fileno()), self._module],
