@@ -97,5 +97,5 @@ def naming(labels: Mapping[str, Label]) -> Iterator[None]:
     try:
         yield
     except MavfiError as error:
-        place = f"{label_text(labels)}: " if labels else ""
-        raise ConfigError(f"{place}{error}") from None
+        place = f" (in {label_text(labels)})" if labels else ""
+        raise ConfigError(f"{error}{place}") from None

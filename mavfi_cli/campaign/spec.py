@@ -23,6 +23,7 @@ Axes = Mapping[str, tuple[Any, ...]]
 _TOP = ("name", "about", "seed", "first_seed", "repetitions", "keep", "mission", "factors",
         "setting", "stop")  # fmt: skip
 _SETTING = ("name", "repetitions")
+MOST = 1_000_000  # missions of one campaign
 # Factors whose value is a list already: a list of lists crosses several.
 _LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
 _NO_VALUES = (datetime.date, datetime.time)  # what TOML has and no factor
@@ -102,8 +103,10 @@ class Spec:
         """The list: repetition by repetition, so that pairs and settings grow together.
 
         Raises:
-            ConfigError: nothing to fly, or a combination that makes no mission.
+            ConfigError: nothing to fly, more than MOST, or a combination that makes no mission.
         """
+        if (planned := sum(self._size(setting) for setting in self.settings)) > MOST:
+            raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
         points = [
             (setting, Point(values={**self.fixed, **values}), labels)
             for setting in self.settings
@@ -121,6 +124,11 @@ class Spec:
             for (_, point, labels), count in zip(points, counts, strict=True)
             if repetition < count
         ]
+
+    def _size(self, setting: Setting) -> int:
+        """How many missions a setting has, without making them."""
+        count = self.repetitions if setting.repetitions is None else setting.repetitions
+        return count * math.prod(map(len, {**self.axes, **setting.axes}.values()))
 
     def _combinations(self, setting: Setting) -> Iterator[tuple[dict[str, Any], dict[str, Label]]]:
         axes = {**self.axes, **setting.axes}

@@ -83,6 +83,7 @@ def vpm(
     A copy of the computer adds mass and power; detection and recovery adds compute time.
     """
     from mavfi_cli.cli.overheads import overheads
+    from mavfi_cli.core.config import require_distinct
     from mavfi_cli.core.files import plain
     from mavfi_cli.vpm.flight_table import flight_rows_csv, flight_table
     from mavfi_cli.vpm.report import report
@@ -97,6 +98,7 @@ def vpm(
     if options["models"] is not None and options["train"]:
         raise click.UsageError("--models or --train, not both")
     chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
+    require_distinct([vehicle.name for vehicle in chosen], "vehicle")
     known = overheads(options["overheads"])
     schemes = schemes_with(
         {name: percent for name, (percent, _) in known.items()},

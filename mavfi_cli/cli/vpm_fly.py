@@ -16,6 +16,7 @@ from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
 from mavfi_cli.campaign.training import WORLDS as TRAINING_WORLDS
 from mavfi_cli.campaign.training import TrainingPlan, train
+from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.platform import load_platform
@@ -121,8 +122,7 @@ def make_plans(
         UnknownName, VehicleProcessError: a world or a simulated vehicle that does not exist.
         CannotLift: a vehicle that does not lift one board.
     """
-    _require_distinct([vehicle.name for vehicle in ask.vehicles], "vehicle")
-    _require_distinct(ask.worlds, "world")
+    require_distinct(ask.worlds, "world")
     if ask.train:
         _require_held_out(ask)
     for world in ask.worlds:
@@ -182,12 +182,6 @@ def _models_told(ask: Ask) -> str:
     if ask.models is not None:
         return f"of {ask.models}"
     return "the shipped ones, fitted to flights of the Solo at 3 m/s"
-
-
-def _require_distinct(names: Sequence[str], what: str) -> None:
-    for place, name in enumerate(names):
-        if name in names[:place]:
-            raise ConfigError(f"{name} is named twice", key=what)
 
 
 def _require_held_out(ask: Ask) -> None:

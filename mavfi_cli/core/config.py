@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -197,3 +197,17 @@ def _line_of(text: str, key: str) -> int | None:
                 return number
             fallback = fallback or number
     return fallback
+
+
+def require_distinct(names: Sequence[str], key: str) -> None:
+    """Refuse a list in which a name comes twice.
+
+    Args:
+        key: what the names are called.
+
+    Raises:
+        ConfigError: says which.
+    """
+    for place, name in enumerate(names):
+        if name in names[:place]:
+            raise ConfigError(f"{name} is named twice", key=key)

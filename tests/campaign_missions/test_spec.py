@@ -142,6 +142,13 @@ def test_instruction_level_and_lists_of_values():
         ("keep = 'some'", UnknownName, r"Known: all, failures, none, sampled"),
         ("setting = 3", ConfigError, r"setting: expected tables"),
         ("setting = []", ConfigError, r"has no mission"),
+        ("repetitions = 1_000_001", ConfigError, r"has 1000001 missions; at most 1000000"),
+        (
+            "repetitions = 50_001\n[factors]\nbits = [1, 2, 3, 4]\nworld = ['farm', 'dense',"
+            " 'sparse', 'factory', 'train-0.05-3']",
+            ConfigError,
+            r"has 1000020 missions",
+        ),
         ("factors = 3", ConfigError, r"factors: expected a table"),
         ("name = 3", ConfigError, r"name: expected a text"),
         ("seed =\nname = 'x'", ConfigError, r"mine.toml:1: "),
@@ -193,7 +200,7 @@ def test_what_is_wrong_with_one_of_many_settings_names_it():
     stage = "control"
     bits = [1, "two"]
     """
-    with pytest.raises(MavfiError, match=r"^setting=FI world=farm bits=two stage=control: fault"):
+    with pytest.raises(MavfiError, match=r"^fault.* \(in setting=FI world=farm bits=two stage="):
         spec_of(text).missions()
 
 

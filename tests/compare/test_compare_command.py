@@ -145,7 +145,7 @@ def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkey
         (["--missions", "1000000000"], "error: missions: must be at most 100000, got 1000000000\n"),
         (["--platform", "tx3"], "error: unknown platform 'tx3': did you mean 'tx2'? Known: "),
         (["--platform", "x86", "--platform", "x86"], "error: platform: x86 is named twice\n"),
-        (["--platform", "mine.toml"], "error: mine.toml: no such file\n"),
+        (["--platform", "mine.toml"], "error: mine.toml: no such file (in setting=golden "),
         (["--detector", "gda"], "error: unknown detector 'gda': did you mean 'gad'? Known: "),
         (["--detector", ","], "error: detector: name at least one\n"),
         (["--inject", ""], "error: inject: name at least one, or none\n"),

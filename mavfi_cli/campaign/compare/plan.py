@@ -8,6 +8,7 @@ from typing import Any
 
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.spec import Setting, Spec
+from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage
 
@@ -64,9 +65,7 @@ class ComparePlan:
             ("inject", self.inject),
             ("detector", self.detectors),
         ):
-            for place, name in enumerate(names):
-                if name in names[:place]:
-                    raise ConfigError(f"{name} is named twice", key=key)
+            require_distinct(names, key)
 
     @property
     def protectors(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.states import DType
@@ -104,10 +105,10 @@ class EvaluationPlan:
             )
         if self.level not in (SOURCE, INSTRUCTION):
             raise UnknownName("level", self.level, (SOURCE, INSTRUCTION))
-        _require_distinct("world", self.worlds, self.worlds)
-        _require_distinct("detector", self.detectors, (NONE, *names()))
-        _require_distinct("stage", self.protect, STAGES)
-        _require_distinct("field", self.fields, FIELDS)
+        _require_some("world", self.worlds, self.worlds)
+        _require_some("detector", self.detectors, (NONE, *names()))
+        _require_some("stage", self.protect, STAGES)
+        _require_some("field", self.fields, FIELDS)
 
     @property
     def everyone(self) -> tuple[str, ...]:
@@ -210,14 +211,13 @@ class EvaluationPlan:
         raise ConfigError(f"no state of {place.target} has a bit field {place.field}")
 
 
-def _require_distinct(what: str, chosen: Sequence[str], known: Sequence[str]) -> None:
+def _require_some(what: str, chosen: Sequence[str], known: Sequence[str]) -> None:
     if not chosen:
         raise ConfigError("none is named", key=what)
-    for place, name in enumerate(chosen):
+    for name in chosen:
         if name not in known:
             raise UnknownName(what, name, known)
-        if name in chosen[:place]:
-            raise ConfigError(f"{name} is named twice", key=what)
+    require_distinct(chosen, what)
 
 
 def labels_of(
