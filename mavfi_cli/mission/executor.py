@@ -221,11 +221,6 @@ class Executor:
         node.pending = value
         self._start_if_free(node)
 
-    def idle(self, name: str) -> bool:
-        """Whether a node neither works nor has an input waiting."""
-        node = self._nodes[name]
-        return not node.busy and node.pending is None
-
     def advance(self, stamp_s: float) -> None:
         """Publish every output that takes effect up to `stamp_s`, in the order of time."""
         while self._events and self._events[0][0] <= stamp_s:
