@@ -22,7 +22,7 @@ from missions import fly
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.detect import registry
 from mavfi_cli.detect.gate import Gate
-from mavfi_cli.vpm.overhead import recomputed_s
+from mavfi_cli.mission.detection_cost import detection_cost
 
 TICK_S = 0.02
 REPORT_EVERY = 15  # ticks
@@ -102,18 +102,14 @@ def in_flights(flights: int, fault_seed: int) -> None:
           f" {'recovery':>9} {'alarms':>7}")  # fmt: skip
     for name in registry.names():
         for kind, options in (("golden", ()), ("faulty", fault)):
-            costs, shares = [], []
-            for _ in range(flights):
-                result = fly("--world", "dense", "--detector", name, *options).result
-                checks = sum(result["detection"]["checks"].values())
-                gate_s = result["host"]["stage_wall_s"]["gate"]
-                flight_s = result["quality_of_flight"]["flight_time_s"]
-                costs.append(1e6 * gate_s / checks)
-                shares.append(gate_s / flight_s)
-            recovery_s = recomputed_s(result)
-            print(f"{name:10} {kind:8} {checks / flight_s:9.1f} {statistics.median(costs):12.2f}"
-                  f" {statistics.median(shares):10.4%} {recovery_s / flight_s:9.4%}"
-                  f" {result['detection']['alarm_count']:7d}")  # fmt: skip
+            flown = [fly("--world", "dense", "--detector", name, *options).result
+                     for _ in range(flights)]  # fmt: skip
+            costs = [cost for cost in map(detection_cost, flown) if cost is not None]
+            check_us = 1e6 * statistics.median(cost.check_host_s for cost in costs)
+            share = statistics.median(cost.detection_share for cost in costs)
+            print(f"{name:10} {kind:8} {costs[-1].checks / costs[-1].flight_s:9.1f}"
+                  f" {check_us:12.2f} {share:10.4%} {costs[-1].recovery_share:9.4%}"
+                  f" {flown[-1]['detection']['alarm_count']:7d}")  # fmt: skip
 
 
 def main() -> None:

@@ -90,6 +90,9 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
               type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True))  # fmt: skip
 @click.option("--quality", is_flag=True,
               help="Also time, distance, energy, replans: intervals and extremes.")  # fmt: skip
+@click.option("--overhead", is_flag=True,
+              help="Also what detection and recovery cost of the flight time, stage by "
+                   "stage.")  # fmt: skip
 @click.option("--failures", is_flag=True,
               help="Also which share of faults fail missions that succeed without.")  # fmt: skip
 @click.option("--kernels", type=_FOLDER,
@@ -234,17 +237,21 @@ def _add_more(
     told: dict[str, Any],
     lines: list[str],
 ) -> None:
-    """What --quality and --failures ask for, as plain values and as text."""
-    from mavfi_cli.campaign import across, quality
+    """What --quality, --overhead and --failures ask for, as plain values and as text."""
+    from mavfi_cli.campaign import across, overhead, quality
     from mavfi_cli.campaign.groups import groups
 
-    if not (more["quality"] or more["failures"]):
+    if not (more["quality"] or more["overhead"] or more["failures"]):
         return
     found = groups(ledger, by)
     if more["quality"]:
         qualities = quality.qualities(found, confidence)
         told["quality"] = [each.to_dict() for each in qualities]
         lines += quality.lines(qualities, confidence)
+    if more["overhead"]:
+        overheads = overhead.overheads(ledger, found, confidence)
+        told["overhead"] = [each.to_dict() for each in overheads]
+        lines += overhead.lines(overheads, confidence)
     if more["failures"]:
         rows = across.across(ledger, found, more["kernels"], more["upsets"], confidence)
         told["failures"] = [each.to_dict() for each in rows]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from mavfi_cli.mission.detection_cost import detection_cost
 from mavfi_cli.mission.replay import first_difference, largest_deviation_m
 from mavfi_cli.mission.run_folder import Run
 
@@ -101,10 +102,10 @@ def detection_lines(result: dict[str, Any]) -> list[str]:
     detection = result.get("detection")
     if not detection:
         return []
-    checks, responses = detection["checks"], detection["responses"]
+    responses = detection["responses"]
     lines = [
         f"Detector    {detection['detector']} on {', '.join(detection['protect'])}: "
-        f"{sum(checks.values())} checks, {detection['alarm_count']} alarms"
+        f"{sum(detection['checks'].values())} checks, {detection['alarm_count']} alarms"
     ]
     for alarm in detection["alarms"][:3]:
         where = ", ".join(alarm["states"][:2]) or "all states together"
@@ -122,13 +123,12 @@ def detection_lines(result: dict[str, Any]) -> list[str]:
             f"            recovered {'; '.join(recovered)}; {responses['hold']} holds, "
             f"{responses['accept']} accepted after all"
         )
-    gate_s = result["host"]["stage_wall_s"].get("gate")
-    if gate_s and sum(checks.values()):
-        each_us = 1e6 * gate_s / sum(checks.values())
-        share = (
-            100.0 * gate_s / (result["quality_of_flight"]["flight_time_s"] or result["simulated_s"])
+    cost = detection_cost(result)
+    if cost is not None:
+        lines.append(
+            f"            {1e6 * cost.check_host_s:.1f} us a check here, "
+            f"{100.0 * cost.detection_share:.4f} % of the flight time"
         )
-        lines.append(f"            {each_us:.1f} us a check here, {share:.4f} % of the flight time")
     return lines
 
 

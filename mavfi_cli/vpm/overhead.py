@@ -12,16 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mavfi_cli.core.types import Stage
-
-# What is computed again when a stage raises an alarm: from its first kernel to its last.
-RECOMPUTED = {
-    Stage.PERCEPTION.value: ("point_cloud", "octomap", "collision_check"),
-    Stage.PLANNING.value: ("planner",),
-    Stage.CONTROL.value: ("control",),
-}
-KERNELS = tuple(kernel for kernels in RECOMPUTED.values() for kernel in kernels)
-_RESPONSES = ("recompute", "hold")  # to alarms after which something is computed again
+from mavfi_cli.mission.detection_cost import KERNELS, detection_cost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,48 +78,23 @@ def overheads_of(results: Iterable[Mapping[str, Any]]) -> dict[str, Overhead]:
 
 
 def _of_flight(result: Mapping[str, Any]) -> Overhead | None:
-    detection, host = result.get("detection"), result.get("host") or {}
-    walls, kernels = host.get("stage_wall_s") or {}, result.get("kernels") or {}
-    if not detection or result.get("fault") or "gate" not in walls:
+    cost = None if result.get("fault") else detection_cost(result)
+    if cost is None:
         return None
+    walls, kernels = result["host"]["stage_wall_s"], result.get("kernels") or {}
     compute_s = math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels)
-    recompute_s = recomputed_s(result)
     host_compute_s = math.fsum(walls.get(name, 0.0) for name in KERNELS)
-    if compute_s <= recompute_s or host_compute_s <= 0.0:
+    if compute_s <= cost.recovered_s or host_compute_s <= 0.0:
         return None
     return Overhead(
-        detector=detection["detector"],
+        detector=cost.detector,
         flights=1,
-        detection_s=walls["gate"],
-        recompute_s=recompute_s,
+        detection_s=cost.checks_host_s,
+        recompute_s=cost.recovered_s,
         compute_s=compute_s,
         host_compute_s=host_compute_s,
-        alarms=round(math.fsum(_recomputations(detection).values())),
+        alarms=round(math.fsum(cost.recomputations.values())),
     )
-
-
-def recomputed_s(result: Mapping[str, Any]) -> float:
-    """Simulated seconds that what a detector had computed again took in a flight with one."""
-    kernels = result.get("kernels") or {}
-    return math.fsum(
-        count * _mean_s(kernels.get(name))
-        for stage, count in _recomputations(result["detection"]).items()
-        for name in RECOMPUTED[stage]
-    )
-
-
-def _recomputations(detection: Mapping[str, Any]) -> dict[str, float]:
-    """How often each stage computed again; the alarms beyond the listed ones are shared alike."""
-    listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _RESPONSES]
-    total = sum(detection["responses"].get(response, 0) for response in _RESPONSES)
-    return {
-        stage: listed.count(stage) * total / len(listed) if listed else 0.0 for stage in RECOMPUTED
-    }
-
-
-def _mean_s(kernel: Mapping[str, Any] | None) -> float:
-    """Mean latency of an invocation, s."""
-    return kernel["busy_s"] / kernel["invocations"] if kernel and kernel["invocations"] else 0.0
 
 
 def _sum(first: Overhead, second: Overhead) -> Overhead:

@@ -10,7 +10,6 @@ from mavfi_cli.campaign.across import lines as across_lines
 from mavfi_cli.campaign.begin import stopped
 from mavfi_cli.campaign.comparison import against_golden, protection
 from mavfi_cli.campaign.groups import METRICS, groups
-from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, State
 from mavfi_cli.campaign.quality import lines as quality_lines
@@ -20,40 +19,11 @@ from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.native.fault import FaultModel
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 
 ACTIVE, GOLDEN = Injected.ACTIVE, Injected.GOLDEN
 FI = {"setting": "FI", "stage": "control"}
 SAVED = {"setting": "D&R", "stage": "control", "detector": "gad"}
-
-
-class Book:
-    """Writes a ledger mission by mission."""
-
-    def __init__(self, folder):
-        self.ledger = Ledger(folder, writing=True)
-
-    def add(self, labels, seed, time_s, *, injected=ACTIVE, outcome="success", config=None):
-        fault = None if injected is GOLDEN else FaultConfig(target="control", seed=seed)
-        number = self.ledger.planned()
-        config = config or MissionConfig(seed=seed, fault=fault)
-        mission = PlannedMission(config=config, labels=labels)
-        self.ledger.plan([mission])
-        quality = {"flight_time_s": time_s, "distance_m": 50.0, "energy_regression_j": 9e3}
-        self.ledger.add(
-            number, state=State.FLOWN, reason="", injected=injected, wall_s=1.0, attempts=1,
-            path=None, result={
-                "outcome": outcome, "quality_of_flight": quality, "pilot": {"replans": seed},
-            },
-        )  # fmt: skip
-
-
-@pytest.fixture
-def book(tmp_path):
-    written = Book(tmp_path / "campaign")
-    yield written
-    written.ledger.close()
 
 
 def fill(book):

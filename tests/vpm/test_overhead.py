@@ -17,7 +17,13 @@ def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None):
         counts[response] += 1
     return {
         "detection": detector
-        and {"detector": detector, "alarms": listed, "responses": counts | (counted or {})},
+        and {
+            "detector": detector,
+            "alarms": listed,
+            "responses": counts | (counted or {}),
+            "checks": {"tick": 1000},
+        },
+        "quality_of_flight": {"flight_time_s": 20.0},
         "fault": fault,
         "kernels": {
             "point_cloud": {"invocations": 100, "busy_s": 1.0},

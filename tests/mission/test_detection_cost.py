@@ -1,0 +1,75 @@
+"""The cost of detection and recovery in one flight: sums by hand, and a record that was flown."""
+
+import json
+
+import pytest
+
+from mavfi_cli.mission.detection_cost import detection_cost
+from mavfi_cli.mission.detector_config import DetectorConfig
+
+RECORD = {
+    "detection": {
+        "detector": "gad",
+        "checks": {"report": 40, "plan": 4, "ahead": 56, "tick": 900},
+        "responses": {"recompute": 6, "hold": 2, "accept": 1},
+        "alarms": [
+            {"stage": "perception", "response": "recompute"},
+            {"stage": "planning", "response": "recompute"},
+            {"stage": "planning", "response": "hold"},
+            {"stage": "planning", "response": "accept"},
+            {"stage": "control", "response": "recompute"},
+        ],
+    },
+    "quality_of_flight": {"flight_time_s": 20.0},
+    "simulated_s": 32.0,
+    "host": {"stage_wall_s": {"gate": 0.005, "octomap": 0.2}},
+    "kernels": {
+        name: {"invocations": invocations, "busy_s": busy_s}
+        for name, invocations, busy_s in (
+            ("point_cloud", 100, 1.0), ("octomap", 20, 6.0), ("collision_check", 10, 0.5),
+            ("planner", 5, 1.0), ("control", 1000, 0.5),
+        )
+    },
+}  # fmt: skip
+
+
+def test_checks_take_host_time_and_recomputations_the_latency_of_their_kernels():
+    """Four of eight recomputations are listed: one, two and one, so they are two, four and two."""
+    cost = detection_cost(RECORD)
+    assert (cost.detector, cost.checks) == ("gad", 1000)
+    assert cost.check_host_s == pytest.approx(5e-6)
+    assert cost.detection_share == pytest.approx(0.005 / 20.0)
+    assert cost.recomputations == {"perception": 2.0, "planning": 4.0, "control": 2.0}
+    assert cost.recovery_s == pytest.approx(
+        {"perception": 2 * (0.01 + 0.3 + 0.05), "planning": 4 * 0.2, "control": 2 * 0.0005}
+    )
+    assert cost.recovered_s == pytest.approx(1.521)
+    assert cost.recovery_share == pytest.approx(1.521 / 20.0)
+
+
+def test_without_a_flight_time_the_whole_mission_counts():
+    cost = detection_cost(RECORD | {"quality_of_flight": {"flight_time_s": None}})
+    assert cost.detection_share == pytest.approx(0.005 / 32.0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"detection": None},
+        {"host": {"stage_wall_s": {"octomap": 0.2}}},
+        {"detection": RECORD["detection"] | {"checks": {"report": 0, "tick": 0}}},
+        {"quality_of_flight": {}, "simulated_s": 0.0},
+    ],
+)
+def test_a_flight_in_which_nothing_was_checked_has_no_cost(changes):
+    assert detection_cost(RECORD | changes) is None
+    assert detection_cost({"outcome": "hang"}) is None
+
+
+def test_a_real_record_has_what_it_takes(fly_short):
+    result = json.loads(fly_short(detector=DetectorConfig(name="aad")).result.read_text())
+    cost = detection_cost(result)
+    assert cost.checks_host_s == result["host"]["stage_wall_s"]["gate"] > 0.0
+    assert cost.flight_s == result["quality_of_flight"]["flight_time_s"]
+    assert 50.0 < cost.checks / cost.flight_s < 100.0  # a tick is 20 ms
+    assert set(cost.recovery_s) == {"perception", "planning", "control"}
