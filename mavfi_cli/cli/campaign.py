@@ -126,6 +126,45 @@ def export(folder: Path, path: Path) -> None:
 
 
 @campaign.command()
+@click.argument("folder", type=_FOLDER)
+@click.option("--pair", "number", type=click.IntRange(min=0), metavar="NUMBER",
+              help="The flights that share world, start and noise with this mission; its number is "
+                   "the first part of its run folder's name  [the pair in which a fault costs most "
+                   "flight time].")  # fmt: skip
+@click.option("--output", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+              required=True, help="The picture, an SVG.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
+def draw(folder: Path, number: int | None, output: Path, as_json: bool) -> None:
+    """Draw golden, faulty and protected flights of one pair over each other, from above.
+
+    From the run folders that were kept, all settings of the pair; a panel for each fault.
+    """
+    from dataclasses import asdict
+
+    from mavfi_cli.campaign.ledger import Ledger
+    from mavfi_cli.campaign.trajectories import pair
+    from mavfi_cli.core.files import plain
+    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.report.trajectories import Panel, lines, write_trajectories
+
+    with Ledger(folder) as ledger:
+        chosen = pair(ledger, number)
+    panels = [
+        Panel(
+            title=panel.title, flights=[(each.name, load_run(each.path)) for each in panel.flights]
+        )
+        for panel in chosen.panels
+    ]
+    write_trajectories(panels, output)
+    if as_json:
+        told = {**asdict(chosen), "picture": output}
+        click.echo(json.dumps(plain(told), indent=2, default=str))
+    else:
+        absent = [f"not in the picture: {text}" for text in chosen.absent]
+        click.echo("\n".join([*lines(panels), *absent, f"Picture  {output}"]))
+
+
+@campaign.command()
 @click.argument("what", metavar="[WHAT]", required=False)
 @click.option("--scale", type=float, help="So much of the repetitions.")
 @click.option("--margin", type=float,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,19 +50,21 @@ def draw_top_view(run: Run) -> Figure:
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
     axes = figure.add_subplot()
     world = run.result.get("world") or {}
-    positions, speeds = _path(run)
-    _draw_obstacles(axes, world, float(np.median(positions[:, 2])) if len(positions) else 5.0)
+    positions, speeds = path_of(run)
+    draw_obstacles(axes, world, positions)
     _draw_plans(axes, run.result.get("plans", []))
     if len(positions) > 1:
         _draw_path(figure, axes, positions, speeds, run.result["config"]["v_max_mps"])
-    _draw_places(axes, run.result, positions)
-    _draw_marks(axes, run.result["events"])
-    _frame(axes, world, positions)
+    draw_places(axes, run.result, positions)
+    draw_end(axes, run.result, positions)
+    for kind in _MARKS:
+        draw_marks(axes, run.result["events"], kind)
+    frame(axes, world, positions)
     _caption(figure, axes, run.result)
     return figure
 
 
-def _path(run: Run) -> tuple[np.ndarray, np.ndarray]:
+def path_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """Positions (n, 3) m and speeds (n,) m/s of the flight: the truth where it is known."""
     trace = run.trace
     if trace is None or trace.num_rows == 0:
@@ -80,9 +83,11 @@ def _path(run: Run) -> tuple[np.ndarray, np.ndarray]:
     return positions[known], speeds[known]
 
 
-def _draw_obstacles(axes: Axes, world: dict[str, Any], flight_height_m: float) -> None:
+def draw_obstacles(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
+    """The boxes of a world; pale where they end below the flight, whose positions are (n, 3) m."""
     from matplotlib.patches import Rectangle
 
+    flight_height_m = float(np.median(positions[:, 2])) if len(positions) else 5.0
     for box in world.get("boxes", []):
         low = box[5] < flight_height_m - 1.0
         axes.add_patch(
@@ -123,7 +128,8 @@ def _draw_path(
     bar.outline.set_linewidth(0.4)
 
 
-def _draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> None:
+def draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> None:
+    """Start and goal of a flight, whose positions are (n, 3) m."""
     from matplotlib.patches import Circle
 
     world = result.get("world") or {}
@@ -139,23 +145,29 @@ def _draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> N
             [positions[0, 0]], [positions[0, 1]], marker="^", s=55, color="#222831", zorder=5,
             label="start",
         )  # fmt: skip
-        if result["outcome"] != "success":
-            axes.scatter(
-                [positions[-1, 0]], [positions[-1, 1]], marker="X", s=90, color=_BAD,
-                edgecolors="white", linewidths=0.8, zorder=7, label=result["outcome"],
-            )  # fmt: skip
 
 
-def _draw_marks(axes: Axes, events: list[dict[str, Any]]) -> None:
-    for kind, style in _MARKS.items():
-        places = [e["position_enu_m"] for e in events if e["kind"] == kind and e["position_enu_m"]]
-        if places:
-            xy = np.array(places, dtype=float)
-            axes.scatter(xy[:, 0], xy[:, 1], linewidths=0.9, zorder=6, label=_LABELS[kind], **style)
+def draw_end(axes: Axes, result: dict[str, Any], positions: np.ndarray, colour: str = _BAD) -> None:
+    """Where a flight that failed ended; its positions are (n, 3) m."""
+    if len(positions) and result["outcome"] != "success":
+        axes.scatter(
+            [positions[-1, 0]], [positions[-1, 1]], marker="X", s=90, color=colour,
+            edgecolors="white", linewidths=0.8, zorder=7, label=result["outcome"],
+        )  # fmt: skip
 
 
-def _frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
-    """Limits round what matters, equal scales, quiet axes."""
+def draw_marks(axes: Axes, events: Iterable[dict[str, Any]], kind: str, **style: Any) -> np.ndarray:
+    """Where something of a kind happened, (n, 2) m; `style` is what is to look otherwise."""
+    found = [e["position_enu_m"] for e in events if e["kind"] == kind and e["position_enu_m"]]
+    places = np.array(found, dtype=float).reshape(-1, 3)[:, :2]
+    if found:
+        look = {"linewidths": 0.9, "zorder": 6, "label": _LABELS[kind], **_MARKS[kind], **style}
+        axes.scatter(places[:, 0], places[:, 1], **look)
+    return places
+
+
+def frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
+    """Limits round what matters, equal scales, quiet axes; positions are (n, 3) m."""
     places = [positions[:, :2]] if len(positions) else []
     places += [np.array([world[key][:2]], dtype=float) for key in ("start", "goal") if key in world]
     if places:
@@ -175,14 +187,19 @@ def _frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
     axes.tick_params(color="#aab1bd", labelsize=8)
 
 
+def place_of(result: dict[str, Any]) -> str:
+    """World and seed of a flight."""
+    config = result["config"]
+    world = config["link"] or config["world"].removesuffix(".toml").rpartition("/")[2]
+    return f"{world}, seed {config['seed']}"
+
+
 def _caption(figure: Figure, axes: Axes, result: dict[str, Any]) -> None:
-    config, qof = result["config"], result["quality_of_flight"]
+    qof = result["quality_of_flight"]
     time_s, distance_m = qof["flight_time_s"], qof["distance_m"]
     figures = "" if time_s is None else f", {time_s:.1f} s, {distance_m:.1f} m"
     axes.set_title(
-        f"{config['link'] or config['world'].removesuffix('.toml').rpartition('/')[2]}, "
-        f"seed {config['seed']}: "
-        f"{result['outcome'].replace('_', ' ')}{figures}",
+        f"{place_of(result)}: {result['outcome'].replace('_', ' ')}{figures}",
         fontsize=10, loc="left",
     )  # fmt: skip
     figure.legend(

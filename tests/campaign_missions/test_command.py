@@ -6,6 +6,7 @@ import re
 import sqlite3
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 
 import pyarrow.parquet as pq
 import pytest
@@ -92,6 +93,36 @@ def test_export_has_a_row_a_mission(flown, mavfi, tmp_path, name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("chosen", "seed"), [((), 1), (("--pair", "3"), 2)])
+def test_a_pair_is_drawn(flown, mavfi, tmp_path, chosen, seed):
+    """Neither of the two faults costs time, so the first pair is the default."""
+    folder, _ = flown
+    picture = tmp_path / "pair.svg"
+    run = mavfi("campaign", "draw", folder, *chosen, "--output", picture)
+    assert run.returncode == 0, run.stderr
+    place, title, golden, faulty, written_to = run.stdout.splitlines()
+    assert place == f"farm, seed {seed}"
+    assert title == "fault: field=mantissa site=waypoint_position together=True"
+    assert re.fullmatch(rf"  golden: success, \d\.\d s  {folder}/runs/00000\d-farm-{seed}", golden)
+    assert faulty.startswith("  FI: success, ")
+    assert written_to == f"Picture  {picture}"
+    ids = {each.get("id") for each in ET.parse(picture).iter("{http://www.w3.org/2000/svg}g")}
+    assert {"flight-0-0", "flight-0-1"} <= ids
+
+
+@pytest.mark.slow
+def test_what_was_drawn_in_json(flown, mavfi, tmp_path):
+    folder, _ = flown
+    run = mavfi("campaign", "draw", folder, "--output", tmp_path / "pair.svg", "--json")
+    told = json.loads(run.stdout)
+    (panel,) = told["panels"]
+    assert [each["name"] for each in panel["flights"]] == ["golden", "FI"]
+    assert panel["flights"][0]["path"] == str(folder / "runs" / "000000-farm-1")
+    assert told["absent"] == []
+    assert told["picture"] == str(tmp_path / "pair.svg")
+
+
+@pytest.mark.slow
 def test_a_changed_specification_shows_the_difference(flown, mavfi, tmp_path):
     folder, _ = flown
     changed = written(tmp_path, SPEC.replace("mantissa", "exponent"))
@@ -151,6 +182,7 @@ def test_what_does_not_exist_gets_one_line(refused, tmp_path):
     assert "did you mean 'table3'?" in refused("run", "table33")
     assert "No such file" in refused("run", "none.toml")
     assert "no campaign there" in refused("status", tmp_path / "nowhere")
+    assert "no campaign there" in refused("draw", tmp_path / "nowhere", "--output", "pair.svg")
     assert "no campaign was begun there" in refused(
         "run", written(tmp_path), "--missing-only", "--out", tmp_path / "nowhere"
     )
@@ -189,7 +221,14 @@ def test_plan_answers_how_many_missions_a_question_takes(mavfi):
 
 @pytest.mark.parametrize(
     "arguments",
-    [("plan",), ("run",), ("run", "table3", "--keep", "some"), ("run", "table3", "--jobs", "0")],
+    [
+        ("plan",),
+        ("run",),
+        ("run", "table3", "--keep", "some"),
+        ("run", "table3", "--jobs", "0"),
+        ("draw", "."),
+        ("draw", ".", "--output", "pair.svg", "--pair", "-1"),
+    ],
 )
 def test_wrong_usage_is_exit_code_2(mavfi, arguments):
     assert mavfi("campaign", *arguments).returncode == 2

@@ -1,0 +1,180 @@
+"""Flights of one mission side by side, from above: golden, with a fault, protected (Fig. 13)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mavfi_cli.mission.run_folder import Run
+from mavfi_cli.report.drawing import INK, write_svg
+from mavfi_cli.report.top_view import (
+    draw_end,
+    draw_marks,
+    draw_obstacles,
+    draw_places,
+    frame,
+    path_of,
+    place_of,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# By the order of the names: golden, faulty and protected flights are blue, orange and green, as in
+# the paper's figure.
+_COLOURS = (
+    "#3a7bd5", "#e8751a", "#1b7f4b", "#8e44ad", "#b8860b", "#00838f", "#c2185b", "#5d4037",
+)  # fmt: skip
+_WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # points: flights of one way are seen through each other
+_COLUMNS = 3
+_MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # points: so far beside its place
+_BESIDE = 11.0  # points between the marks of flights at one place
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Panel:
+    """Flights over one another; equal names have equal colours in all panels."""
+
+    title: str
+    flights: Sequence[tuple[str, Run]]
+
+
+def write_trajectories(panels: Sequence[Panel], path: Path) -> None:
+    """Draw flights of one world and write them as SVG, atomically; equal ones give equal bytes.
+
+    Raises:
+        RecordError: the file could not be written.
+    """
+    write_svg(draw_trajectories(panels), path)
+
+
+def draw_trajectories(panels: Sequence[Panel]) -> Figure:
+    """A matplotlib figure with a top view a panel, in metres, east to the right and north up.
+
+    Args:
+        panels: at least one, with at least one flight each; the first without fault and detector is
+            the one that the others' flight times are compared with.
+    """
+    from matplotlib.figure import Figure
+
+    columns = min(_COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    most = max(len(panel.flights) for panel in panels)
+    figure = Figure(figsize=(5.2 * columns, (5.3 + 0.19 * most) * rows), layout="constrained")
+    figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
+    names = dict.fromkeys(name for panel in panels for name, _ in panel.flights)
+    colours = {name: _COLOURS[n % len(_COLOURS)] for n, name in enumerate(names)}
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for number, axes in enumerate(grid.flat):
+        if number < len(panels):
+            _draw_panel(figure, axes, panels[number], number, colours)
+        else:
+            axes.set_axis_off()
+    _explain_marks(figure)
+    figure.suptitle(place_of(panels[0].flights[0][1].result), fontsize=11)
+    return figure
+
+
+def lines(panels: Sequence[Panel]) -> list[str]:
+    """The picture in words: world and seed; of every flight the end, the time, and its folder."""
+    told = [place_of(panels[0].flights[0][1].result)]
+    for panel in panels:
+        told += [f"fault: {panel.title}"] if panel.title else []
+        golden_s = _golden_s([run for _, run in panel.flights])
+        told += [
+            f"  {_told(name, run.result, golden_s)}  {run.folder.path}"
+            for name, run in panel.flights
+        ]
+    return told
+
+
+def _draw_panel(
+    figure: Figure, axes: Axes, panel: Panel, number: int, colours: Mapping[str, str]
+) -> None:
+    runs = [run for _, run in panel.flights]
+    paths = [path_of(run)[0] for run in runs]
+    everywhere = np.concatenate(paths)
+    first = runs[0].result
+    golden_s = _golden_s(runs)
+    draw_obstacles(axes, first.get("world") or {}, everywhere)
+    handles = []
+    for place, ((name, run), positions) in enumerate(zip(panel.flights, paths, strict=True)):
+        handles += axes.plot(
+            positions[:, 0], positions[:, 1], color=colours[name], zorder=4.0 + 0.01 * place,
+            linewidth=max(_LEAST, _WIDEST - _STEP * place), alpha=0.5 if place == 0 else 1.0,
+            solid_capstyle="round", solid_joinstyle="round", gid=f"flight-{number}-{place}",
+            label=_told(name, run.result, golden_s),
+        )  # fmt: skip
+        draw_end(axes, run.result, positions, colours[name])
+    draw_places(axes, first, paths[0])
+    _draw_marks(figure, axes, panel, colours)
+    frame(axes, first.get("world") or {}, everywhere)
+    if panel.title:
+        axes.set_title(f"fault: {panel.title}", fontsize=9.5, loc="left")
+    axes.legend(
+        handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, fontsize=8
+    )
+    for handle in handles:
+        handle.set_label(None)  # what is left is the same in all panels
+
+
+def _draw_marks(figure: Figure, axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
+    """Faults and alarms in their flights' colours, beside the way, so that all are seen."""
+    from matplotlib.transforms import offset_copy
+
+    for kind, (right, up) in _MARKED.items():
+        for name, run in panel.flights:
+            beside = offset_copy(axes.transData, figure, right, up, units="points")
+            places = draw_marks(
+                axes, run.result["events"], kind, facecolors=colours[name], edgecolors=INK,
+                linewidths=0.6, transform=beside,
+            )  # fmt: skip
+            for place in places:
+                axes.annotate(
+                    "", place, (right, up), textcoords="offset points", zorder=5.8,
+                    arrowprops={"arrowstyle": "-", "color": INK, "linewidth": 0.6},
+                )  # fmt: skip
+            right += math.copysign(_BESIDE, right) if len(places) else 0.0
+
+
+def _explain_marks(figure: Figure) -> None:
+    """One legend of all marks."""
+    marks: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            marks.setdefault(label.replace("_", " "), handle)
+    legend = figure.legend(
+        handles=list(marks.values()), labels=list(marks), loc="outside lower center", ncols=8,
+        frameon=False, fontsize=8, handletextpad=0.3, columnspacing=0.9,
+    )  # fmt: skip
+    for shown, label in zip(legend.legend_handles, marks, strict=True):
+        if label in _MARKED and shown is not None:  # it stands for flights of all colours
+            shown.set(facecolor="white", edgecolor=INK)
+
+
+def _golden_s(runs: Sequence[Run]) -> float | None:
+    """Flight time of the golden flight, where that succeeded."""
+    for run in runs:
+        if not (run.result.get("fault") or run.result.get("detection")):
+            time_s = run.result["quality_of_flight"]["flight_time_s"]
+            return time_s if run.result["outcome"] == "success" else None
+    return None
+
+
+def _told(name: str, result: Mapping[str, Any], golden_s: float | None) -> str:
+    """A flight in the legend: its setting, how it ended, how long it took."""
+    time_s = result["quality_of_flight"]["flight_time_s"]
+    told = f"{name}: {result['outcome'].replace('_', ' ')}"
+    if time_s is None:
+        return told
+    told += f", {time_s:.1f} s"
+    golden = not (result.get("fault") or result.get("detection"))
+    if golden or golden_s is None or result["outcome"] != "success":
+        return told
+    return f"{told} ({100.0 * (time_s / golden_s - 1.0):+.1f} %)"
