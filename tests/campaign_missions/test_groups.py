@@ -17,12 +17,13 @@ def group(missions, fates=FATES):
     counted, other = fates
     count = len(missions)
     return Group(
-        labels={}, planned=count, errors=0,
+        labels={}, planned=count, errors=0, watched=False, number=np.arange(count),
         outcome=Words(["success"], np.zeros(count, dtype=np.int64)),
         injected=Words(
             [counted, other], np.array([not counts for _, counts in missions], dtype=np.int64)
         ),
         pair=Words(PAIRS, np.array([PAIRS.index(pair) for pair, _ in missions], dtype=np.int64)),
+        strike=np.zeros(count, dtype=np.int64),
         metrics={name: np.zeros(count) for name in METRICS},
     )  # fmt: skip
 
