@@ -15,6 +15,7 @@ from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.outcome import Injected, MissionResult, State
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.mission.run_folder import RESULT
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 
@@ -86,16 +87,29 @@ def pair(ledger: Ledger, number: int | None = None) -> Pair:
     lost = [each.number for each in flown if each.path is None]
     if lost:
         raise RecordError(f"{ledger.folder}: no run folder of {_told(lost)} was kept; {_KEPT}")
+    whole = [each for each in flown if not _cut_off(each)]
+    if not whole:
+        raise RecordError(f"{ledger.folder}: {_told(mine)} left no record to draw")
     missing = sorted(set(mine) - {each.number for each in over})
     return Pair(
-        panels=_panels(flown),
+        panels=_panels(whole),
         absent=[
             f"mission {each.number} could not begin: {each.reason}"
             for each in over
             if each.state is State.ERROR
         ]
+        + [
+            f"mission {each.number}: {each.outcome}, cut off before its record"
+            for each in flown
+            if _cut_off(each)
+        ]
         + ([f"{_told(missing)} not flown yet"] if missing else []),
     )
+
+
+def _cut_off(each: MissionResult) -> bool:
+    """Whether its process ended before it wrote what is drawn."""
+    return each.path is not None and each.path.is_dir() and not (each.path / RESULT).is_file()
 
 
 def _told(numbers: Sequence[int]) -> str:

@@ -88,6 +88,22 @@ def test_what_is_not_in_the_picture_is_told(book):
     assert len(drawn.panels) == 2
 
 
+def test_a_flight_that_was_cut_off_is_told_and_the_others_are_drawn(book):
+    fly(book, 1, (20.0,) * 5)
+    runs = book.ledger.folder / "runs"
+    for number in range(5):
+        (runs / f"{number:06d}-dense-1").mkdir(parents=True)
+        if number != 2:
+            (runs / f"{number:06d}-dense-1" / "result.json").write_text("{}")
+    drawn = pair(book.ledger)
+    assert [each.number for each in drawn.panels[1].flights] == [0, 4]
+    assert drawn.absent == ["mission 2: success, cut off before its record"]
+    for left in runs.glob("*/result.json"):
+        left.unlink()
+    with pytest.raises(RecordError, match="missions 0, 1, 2, 3, 4 left no record to draw"):
+        pair(book.ledger)
+
+
 def test_settings_of_one_name_are_told_apart(book):
     labels = {"setting": "D&R", "stage": "planning"}
     for name, protect in (("gad", "planning"), ("gad", "control"), ("aad", "control")):
