@@ -105,6 +105,15 @@ def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothi
     assert (time.value, time.low, time.high) == (0.0, 0.0, 0.0)
 
 
+def test_the_detector_none_watches_nothing(book):
+    """An evaluation of detectors labels its bare flights so."""
+    for seed in range(4):
+        book.add({"kind": "golden", "detector": "none"}, seed, 20.0, injected=GOLDEN)
+        book.add({"kind": "fault", "detector": "none"}, seed, 22.0)
+    (faulty,) = against_golden(groups(book.ledger))
+    assert faulty.success.pairs == 4
+
+
 def test_settings_are_gathered_by_labels(book):
     for seed in range(4):
         book.add({"setting": "FI", "stage": "planning", "world": "farm"}, seed, 20.0)
