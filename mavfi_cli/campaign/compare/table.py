@@ -33,15 +33,15 @@ def table(told: Row) -> list[str]:
     lines += _columns(_worst_rows(told))
     lines += _worst_notes(told)
     share = 100 * told["confidence"]
+    lines.append("")
+    if told["errors"]:
+        lines.append(f"{len(told['errors'])} missions could not be flown.")
     return [
         *lines,
-        "",
-        f"{len(told['errors'])} missions could not be flown. In brackets: {share:g} % intervals, "
-        "Wilson for success, bootstrap",
-        "for the rest. Energy: the paper's regression; that of the propellers is in compare.json.",
-        "Response, depth frame to setpoint: each flight's median and 95th percentile; here the "
-        "median",
-        "over the flights.",
+        f"In brackets: {share:g} % intervals, Wilson for success, bootstrap for the rest.",
+        "Energy: the paper's regression; that of the propellers is in compare.json.",
+        "Response, depth frame to setpoint: each flight's median and 95th percentile; here the",
+        "median over the flights.",
     ]
 
 
