@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mavfi_cli.campaign.statistics.bootstrap import LARGE, interval, mean, median
+from mavfi_cli.campaign.statistics.bootstrap import BLOCKS, LARGE, interval, mean, median
 from mavfi_cli.campaign.statistics.layers import cross_layer, failures_per_hour
 from mavfi_cli.campaign.statistics.paired import holm, mcnemar
 from mavfi_cli.campaign.statistics.proportions import (
@@ -124,6 +124,17 @@ def test_intervals_of_large_samples_are_nearly_those_of_the_bootstrap():
     width = resampled.high - resampled.low
     assert normal.low == pytest.approx(resampled.low, abs=0.1 * width)
     assert normal.high == pytest.approx(resampled.high, abs=0.1 * width)
+
+
+def test_leaving_out_blocks_of_many_values_changes_no_interval_much():
+    values = np.random.default_rng(8).exponential(10.0, 2 * BLOCKS + 1)
+    found = interval(values, lambda drawn: drawn.std(axis=-1), resamples=1999)
+    oracle = stats.bootstrap(
+        (values,), np.std, n_resamples=1999, method="BCa", rng=np.random.default_rng(7)
+    ).confidence_interval
+    width = oracle.high - oracle.low
+    assert found.low == pytest.approx(oracle.low, abs=0.08 * width)
+    assert found.high == pytest.approx(oracle.high, abs=0.08 * width)
 
 
 def test_bootstrap_intervals_repeat_and_survive_few_values():

@@ -1,4 +1,4 @@
-"""The numbers of a comparison: settings, ratios between platforms, worst cases and recovery.
+"""The numbers of a comparison: settings, ratios between platforms, and what faults cost.
 
 Flight time, distance, energy and replans are of successful flights; response times of all counted
 ones. A faulty flight is counted where its fault struck something that was read or caught.
@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from mavfi_cli.campaign.compare.costs import (
+    CONFIDENCE,
+    RESAMPLES,
+    cost_difference,
+    cost_row,
+    struck,
+    worst_row,
+)
 from mavfi_cli.campaign.compare.flights import Flown
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE, ComparePlan
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval, mean, median
 from mavfi_cli.campaign.statistics.paired import mcnemar
 from mavfi_cli.campaign.statistics.proportions import rate
-from mavfi_cli.campaign.statistics.worst_case import worst_case
-
-CONFIDENCE = 0.95
-RESAMPLES = 1999
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,12 +59,18 @@ def figures(plan: ComparePlan, flights: Sequence[Flown]) -> dict[str, Any]:
     """All numbers of the flights, as plain values.
 
     `settings` has a row a platform and setting, `ratios` a row a setting and platform other than
-    the first, `worst` a row a platform and setting, `flights` a row a flight. Shares, increases and
-    ratios have no unit; everything else ends in its unit, or has it beside.
+    the first, `costs` and `worst` a row a platform and setting, `cost_differences` a row a setting
+    and platform other than the first, `flights` a row a flight. Shares, increases and ratios have
+    no unit; everything else ends in its unit, or has it beside.
     """
     table = _Table(flights)
-    worst = {name: _worst_rows(plan, table, name) for name in plan.platforms}
     first, *others = plan.platforms
+    faulty = [setting for setting in plan.settings if setting != GOLDEN]
+    found = {
+        (platform, setting): struck(table.won(platform, GOLDEN), table.counted(platform, setting))
+        for platform in plan.platforms
+        for setting in faulty
+    }
     return {
         "confidence": CONFIDENCE,
         "settings": [
@@ -73,11 +83,22 @@ def figures(plan: ComparePlan, flights: Sequence[Flown]) -> dict[str, Any]:
             for platform in others
             for setting in plan.settings
         ],
-        "worst": [row for rows in worst.values() for row in rows],
-        "worst_ratios": [
-            _worst_ratio(*rows)
+        "costs": [
+            cost_row(platform, setting, found[platform, setting], found[platform, NONE])
+            for platform in plan.platforms
+            for setting in faulty
+        ],
+        "cost_differences": [
+            cost_difference(
+                platform, first, setting, found[first, setting], found[platform, setting]
+            )
             for platform in others
-            for rows in zip(plan.settings, worst[first], worst[platform], strict=True)
+            for setting in faulty
+        ],
+        "worst": [
+            worst_row(platform, setting, *(table.won(platform, s) for s in (GOLDEN, NONE, setting)))
+            for platform in plan.platforms
+            for setting in plan.settings
         ],
         "flights": [asdict(each) for each in flights],
     }
@@ -184,73 +205,3 @@ def _compared(quantity: Quantity, first: float, second: float) -> float:
     if not quantity.ratio:
         return second - first
     return math.log(second / first) if first > 0.0 and second > 0.0 else math.nan
-
-
-# Worst cases, as in the paper's Fig. 16 -----------------------------------------------------------
-
-
-def _worst_rows(plan: ComparePlan, table: _Table, platform: str) -> list[dict[str, Any]]:
-    """The worst successful flights of each setting, and what detectors recover of the worst case.
-
-    Two measures. Over the golden flight of its own mission: the paper flies one fixed world, so
-    this is its measure where worlds differ. Over the mean golden flight: the longest flight of
-    all, whatever mission it is of; faults that are no worse than the worst golden flight leave
-    nothing to recover there.
-    """
-    golden, faulty = table.won(platform, GOLDEN), table.won(platform, NONE)
-    own = {each.seed: each.flight_time_s for each in golden}
-    worst = _over_own(faulty, own)
-    beyond = max(_times(faulty), default=math.nan) > max(_times(golden), default=math.nan)
-    rows = []
-    for setting in plan.settings:
-        flights = table.won(platform, setting)
-        protected = setting not in (GOLDEN, NONE)
-        found = worst_case(_times(golden), _times(flights))
-        case = worst_case(_times(golden), _times(faulty), _times(flights) if protected else ())
-        mine = _over_own(flights, own)
-        rows.append(
-            {
-                "platform": platform,
-                "setting": setting,
-                "flights": len(flights),
-                "golden_mean_s": found.golden,
-                "worst_s": found.faulty_worst,
-                "over_own_ratio": mine,
-                "over_own_recovered_share": (worst - mine) / (worst - 1.0)
-                if protected and worst > 1.0
-                else math.nan,
-                "over_mean_ratio": 1.0 + found.increase,
-                "over_mean_recovered_share": case.recovered_share if beyond else math.nan,
-                "worst_flight": _named(flights, own),
-            }
-        )
-    return rows
-
-
-def _times(flights: Sequence[Flown]) -> list[float]:
-    return [each.flight_time_s for each in flights]
-
-
-def _over_own(flights: Sequence[Flown], own: Mapping[int, float]) -> float:
-    """The largest flight time over that of the golden flight of the same mission."""
-    return max((e.flight_time_s / own[e.seed] for e in flights if e.seed in own), default=math.nan)
-
-
-def _named(flights: Sequence[Flown], own: Mapping[int, float]) -> dict[str, Any] | None:
-    """The flight that is longest over its own golden one, so that it can be flown again."""
-    known = [each for each in flights if each.seed in own]
-    if not known:
-        return None
-    most = max(known, key=lambda each: (each.flight_time_s / own[each.seed], -each.seed))
-    return {"seed": most.seed, "target": most.target, "fault_seed": most.fault_seed}
-
-
-def _worst_ratio(
-    setting: str, first: Mapping[str, Any], second: Mapping[str, Any]
-) -> dict[str, Any]:
-    return {
-        "platform": second["platform"],
-        "reference": first["platform"],
-        "setting": setting,
-        "worst_ratio": second["worst_s"] / first["worst_s"],
-    }

@@ -28,7 +28,7 @@ from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.run import installed_versions
 from mavfi_cli.mission.run_folder import load_run
 
-SCHEMA = 1
+SCHEMA = 2  # 1 had the costs of faults among the worst cases
 TIMELINE = "timeline"
 
 

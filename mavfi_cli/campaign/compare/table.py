@@ -13,7 +13,7 @@ from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
 
 Row = Mapping[str, Any]
 # The paper, section VII-E: on the TX2, a single bit flip in an inter-kernel state.
-PAPER = "paper: worst case x 2.8 on the TX2, of which GAD recovers 79.3 %, AAD 88.0 %"
+PAPER = "paper, Fig. 16: worst case x 2.8 on the TX2, of which GAD recovers 79.3 %, AAD 88.0 %"
 
 
 def setting_title(setting: str) -> str:
@@ -29,9 +29,17 @@ def table(told: Row) -> list[str]:
     lines += ["", *_columns(_work_rows(told))]
     for platform in told["plan"]["platforms"][1:]:
         lines += ["", *_ratio_lines(told, platform)]
-    lines += ["", "Worst case (paper, Fig. 16): the longest successful flight of each setting"]
+    if told["costs"]:
+        lines += [
+            "",
+            "What faults cost: over the golden flight of the same mission, both successful",
+        ]
+        lines += _columns(_cost_rows(told))
+        for platform in told["plan"]["platforms"][1:]:
+            lines += ["", *_difference_lines(told, platform)]
+    lines += ["", "The longest successful flights"]
     lines += _columns(_worst_rows(told))
-    lines += _worst_notes(told)
+    lines += _again(told)
     share = 100 * told["confidence"]
     lines.append("")
     if told["errors"]:
@@ -142,8 +150,50 @@ def _ratio_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
         ]
 
 
+def _cost_rows(told: Row) -> Iterator[list[str]]:
+    yield ["", "", "flights", "lost", "mean, s", "95th perc., x", "worst, x",
+           "recovered"]  # fmt: skip
+    titles, last = titles_of(told), ""
+    for row in told["costs"]:
+        title = titles[row["platform"]]
+        yield [
+            "" if title == last else title,
+            setting_title(row["setting"]),
+            f"{row['pairs']}",
+            f"{row['lost']}",
+            _spread(row["cost_s"]["mean"], digits=2),
+            _spread(row["over_own"]["p95"], digits=3),
+            _number(row["over_own"]["largest"], "{:.3f}"),
+            _number(row["over_own"]["recovered_share"], "{:.1%}"),
+        ]
+        last = title
+
+
+def _difference_lines(told: Row, platform: Row) -> list[str]:
+    """How much more the same faults cost on another platform than on the first."""
+    rows = [row for row in told["cost_differences"] if row["platform"] == platform["platform"]]
+    reference = titles_of(told)[rows[0]["reference"]]
+    title = f"{platform['title']} against {reference}, fault by fault"
+    return [
+        f"{title} (faults that both survive; worst: of all)",
+        *_columns(_difference_rows(rows)),
+    ]
+
+
+def _difference_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
+    yield ["", "pairs", "mean, s", "95th perc., x", "worst, x"]
+    for row in rows:
+        yield [
+            setting_title(row["setting"]),
+            f"{row['pairs']}",
+            _spread(row["extra_s"], digits=2),
+            _spread(row["p95_ratio"], digits=3),
+            _number(row["largest_ratio"], "{:.3f}"),
+        ]
+
+
 def _worst_rows(told: Row) -> Iterator[list[str]]:
-    yield ["", "", "worst, s", "over own golden", "recovered", "over mean golden", "recovered"]
+    yield ["", "", "longest, s", "over mean golden, x", "recovered"]
     titles, last = titles_of(told), ""
     for row in told["worst"]:
         title = titles[row["platform"]]
@@ -151,32 +201,25 @@ def _worst_rows(told: Row) -> Iterator[list[str]]:
             "" if title == last else title,
             setting_title(row["setting"]),
             _number(row["worst_s"], "{:.1f}"),
-            _number(row["over_own_ratio"], "x {:.3f}"),
-            _number(row["over_own_recovered_share"], "{:.1%}"),
-            _number(row["over_mean_ratio"], "x {:.3f}"),
+            _number(row["over_mean_ratio"], "{:.3f}"),
             _number(row["over_mean_recovered_share"], "{:.1%}"),
         ]
         last = title
 
 
-def _worst_notes(told: Row) -> list[str]:
+def _again(told: Row) -> list[str]:
+    """How to fly again what cost most."""
     titles = titles_of(told)
-    ratios = [
-        f"worst {setting_title(row['setting'])}: {titles[row['platform']]} over "
-        f"{titles[row['reference']]} x {row['worst_ratio']:.2f}"
-        for row in told["worst_ratios"]
-        if not math.isnan(row["worst_ratio"])
-    ]
     again = [
         line
-        for row in told["worst"]
+        for row in told["costs"]
         if row["setting"] == NONE and row["worst_flight"] is not None
         for line in (
-            f"worst with faults on {titles[row['platform']]}, over its own golden flight:",
+            f"the fault that costs most on {titles[row['platform']]}:",
             f"  {command_of(told, row)}",
         )
     ]
-    return [*ratios, *again, *([PAPER] if told["plan"]["inject"] else [])]
+    return [*again, *([PAPER] if told["plan"]["inject"] else [])]
 
 
 def command_of(told: Row, row: Row) -> str:
@@ -267,31 +310,40 @@ def _csv_rows(told: Row) -> Iterator[dict[str, Any]]:
             kind = found.pop("kind")
             unit = "1" if kind == "ratio" else found["unit"]
             yield {**at, "quantity": quantity.title, **found, "statistic": kind, "unit": unit}
+    for row in told["costs"]:
+        at = {"table": "costs", "platform": row["platform"], "setting": row["setting"]}
+        yield from _cost_csv(at, row)
+    for row in told["cost_differences"]:
+        at = {"table": "costs", **{k: row[k] for k in ("platform", "reference", "setting")}}
+        yield {**at, "quantity": "cost of a fault", "statistic": "mean difference", "unit": "s",
+               **row["extra_s"]}  # fmt: skip
+        yield {**at, "quantity": "flight time over own golden", "unit": "1",
+               "statistic": "ratio of 95th percentiles", **row["p95_ratio"]}  # fmt: skip
+        yield {**at, "quantity": "flight time over own golden", "statistic": "ratio of the largest",
+               "unit": "1", "value": row["largest_ratio"], "count": row["pairs"]}  # fmt: skip
     for row in told["worst"]:
-        at = {"table": "worst", "platform": row["platform"], "setting": row["setting"]}
-        for title, statistic, unit, key in _WORST:
-            yield {**at, "quantity": title, "statistic": statistic, "unit": unit,
-                   "value": row[key], "count": row["flights"]}  # fmt: skip
-    for row in told["worst_ratios"]:
-        yield {"table": "worst", **{k: row[k] for k in ("platform", "reference", "setting")},
-               "quantity": "flight time", "statistic": "ratio of the largest", "unit": "1",
-               "value": row["worst_ratio"]}  # fmt: skip
+        at = {"table": "worst", "platform": row["platform"], "setting": row["setting"],
+              "quantity": "flight time", "count": row["flights"]}  # fmt: skip
+        for statistic, unit, key in _WORST:
+            yield {**at, "statistic": statistic, "unit": unit, "value": row[key]}
+
+
+def _cost_csv(at: dict[str, Any], row: Row) -> Iterator[dict[str, Any]]:
+    cost, over, pairs = row["cost_s"], row["over_own"], {"count": row["pairs"]}
+    yield {**at, "quantity": "lost by faults", "statistic": "flights", "unit": "count",
+           "value": row["lost"], "count": row["pairs"] + row["lost"]}  # fmt: skip
+    of_cost = {**at, "quantity": "cost of a fault", "unit": "s"}
+    yield {**of_cost, "statistic": "mean", **cost["mean"]}
+    yield {**of_cost, "statistic": "largest", "value": cost["largest"], **pairs}
+    of_ratio = {**at, "quantity": "flight time over own golden", "unit": "1"}
+    yield {**of_ratio, "statistic": "95th percentile", **over["p95"]}
+    yield {**of_ratio, "statistic": "largest", "value": over["largest"], **pairs}
+    yield {**of_ratio, "statistic": "share of the largest increase recovered",
+           "value": over["recovered_share"], **pairs}  # fmt: skip
 
 
 _WORST = (
-    ("flight time", "largest", "s", "worst_s"),
-    ("flight time", "largest over own golden", "1", "over_own_ratio"),
-    (
-        "flight time",
-        "share of the increase over own golden recovered",
-        "1",
-        "over_own_recovered_share",
-    ),
-    ("flight time", "largest over mean golden", "1", "over_mean_ratio"),
-    (
-        "flight time",
-        "share of the increase over mean golden recovered",
-        "1",
-        "over_mean_recovered_share",
-    ),
+    ("largest", "s", "worst_s"),
+    ("largest over mean golden", "1", "over_mean_ratio"),
+    ("share of the increase over mean golden recovered", "1", "over_mean_recovered_share"),
 )

@@ -18,6 +18,7 @@ from mavfi_cli.core.types import FloatArray
 
 RESAMPLES = 9999
 LARGE = 500  # from so many values on the mean is normal, and the bootstrap would only be slow
+BLOCKS = 2000  # of more values whole blocks are left out in turn
 _CHUNK = 4_000_000  # numbers that are drawn at once
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
 
@@ -103,7 +104,8 @@ def _levels(
 
 
 def _left_out(sample: FloatArray, statistic: Statistic) -> FloatArray:
-    """The statistic without each of the values in turn."""
+    """The statistic without each of the values in turn; of many, without each of BLOCKS blocks."""
     if statistic is mean:
         return np.asarray((sample.sum() - sample) / (len(sample) - 1))
-    return np.array([float(statistic(np.delete(sample, i))) for i in range(len(sample))])
+    blocks = np.array_split(np.arange(len(sample)), min(len(sample), BLOCKS))
+    return np.array([float(statistic(np.delete(sample, block))) for block in blocks])
