@@ -44,7 +44,8 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     compare.csv, compare.svg and timeline.svg.
     """
     from mavfi_cli.campaign.compare.fly import compare as run
-    from mavfi_cli.campaign.compare.table import rows_csv, table
+    from mavfi_cli.campaign.compare.rows import rows_csv
+    from mavfi_cli.campaign.compare.table import table
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text

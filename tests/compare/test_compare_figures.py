@@ -9,7 +9,8 @@ from flown_twice import PLAN, SEEDS, flight
 
 from mavfi_cli.campaign.compare.figures import QUANTITIES, figures
 from mavfi_cli.campaign.compare.plan import ComparePlan
-from mavfi_cli.campaign.compare.table import rows_csv, table
+from mavfi_cli.campaign.compare.rows import rows_csv
+from mavfi_cli.campaign.compare.table import table
 from mavfi_cli.campaign.statistics.proportions import rate
 
 
