@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
@@ -19,7 +20,7 @@ class Progress:
         elapsed_s: of this run, host time.
         inside_s: of it within missions, summed over the slots.
         slots: missions that can fly at the same time; None where that changes, as on a cluster.
-        outcomes: of the missions that this run flew.
+        outcomes: of the missions that this run flew, by setting, in the order of the list.
     """
 
     total: int
@@ -30,7 +31,7 @@ class Progress:
     elapsed_s: float
     inside_s: float
     slots: int | None = None
-    outcomes: Counter[str] = field(default_factory=Counter)
+    outcomes: Mapping[str, Counter[str]] = field(default_factory=dict)
 
     @property
     def rate_per_h(self) -> float:
@@ -53,8 +54,18 @@ class Progress:
     @property
     def success_rate(self) -> float | None:
         """Share of successes among the missions that this run flew; None before the first."""
-        flown = sum(self.outcomes.values())
-        return self.outcomes["success"] / flown if flown else None
+        return _share(sum(self.outcomes.values(), Counter()))
+
+    @property
+    def success_rates(self) -> dict[str, float]:
+        """The same of each setting of which a mission is over."""
+        shares = {setting: _share(outcomes) for setting, outcomes in self.outcomes.items()}
+        return {setting: share for setting, share in shares.items() if share is not None}
+
+
+def _share(outcomes: Counter[str]) -> float | None:
+    flown = sum(outcomes.values())
+    return outcomes["success"] / flown if flown else None
 
 
 class Spectator:

@@ -200,7 +200,7 @@ class _Run:
         self._flying: dict[int, Entry] = {}
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
-        self._outcomes: Counter[str] = Counter()
+        self._setting_of, self._outcomes = _settings(ledger)
         self._errors = self._repeated = 0
         self._inside_s = 0.0
         self._total, self._before = ledger.planned(), ledger.over()
@@ -318,11 +318,11 @@ class _Run:
             fate = None if injected is None else injected.value
             self._gate.record(number, (result.get("outcome"), fate))
         if flown:
-            self._outcomes[str(result["outcome"])] += 1
+            self._outcomes[self._setting_of[number]][str(result["outcome"])] += 1
             return
         self._errors += 1
         self._spectator.on_note(f"mission {number} could not be flown: {verdict.reason}")
-        if self._errors >= _GIVE_UP and not self._outcomes:
+        if self._errors >= _GIVE_UP and not any(self._outcomes.values()):
             raise CampaignStopped(f"no mission can be flown; the last: {verdict.reason}")
 
     def _progress(self) -> Progress:
@@ -337,3 +337,9 @@ class _Run:
             slots=self._jobs if self._options.cluster is None else None,
             outcomes=self._outcomes,
         )
+
+
+def _settings(ledger: Ledger) -> tuple[list[str], dict[str, Counter[str]]]:
+    """The setting of each mission by its number, and a count of outcomes for each setting."""
+    names = [str(labels.get("setting", "")) for labels in ledger.cells()]
+    return [names[cell] for cell in ledger.cell_of_each()], {name: Counter() for name in names}

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.live import Live
 
 _PLAIN_EVERY_S = 10.0
+_MOST_SETTINGS = 6  # whose success rates are told one by one; `campaign status` tells all
 
 
 class _Plain(Spectator):
@@ -65,17 +66,29 @@ class _Live(Spectator):
 
 
 def progress_line(progress: Progress) -> str:
-    """How far it is: missions, rate, time left, success rate so far."""
+    """How far it is: missions, rate, time left, success rates so far."""
     parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
     if progress.eta_s is not None:
         parts.append(f"{progress.rate_per_h:.0f} an hour")
         if progress.over < progress.total:
             parts.append(f"{_duration(progress.eta_s)} to go")
     if progress.success_rate is not None:
-        parts.append(f"{100.0 * progress.success_rate:.1f} % success")
+        parts.append(f"{_percent(progress.success_rate)} % success{_by_setting(progress)}")
     if progress.again:
         parts.append(f"{progress.again} begun again")
     return ", ".join(parts)
+
+
+def _by_setting(progress: Progress) -> str:
+    """The rate of each setting, where there are a few."""
+    if not 2 <= len(progress.outcomes) <= _MOST_SETTINGS:
+        return ""
+    rates = [f"{name} {_percent(rate)}" for name, rate in progress.success_rates.items()]
+    return f" ({', '.join(rates)})"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f}"
 
 
 def end_line(progress: Progress) -> str:

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,20 @@ def test_results_come_in_the_order_of_the_list(campaign):
     assert {result.outcome for result in results} == {"success"}
     assert {result.injected for result in results} == {Injected.GOLDEN}
     assert campaign.notes.last.over == 31
-    assert campaign.notes.last.outcomes == {"success": 31}
+    assert campaign.notes.last.outcomes == {"": {"success": 31}}
+
+
+def test_outcomes_are_counted_by_setting_and_only_those_of_this_run(campaign):
+    missions = [
+        replace(mission, labels={"setting": "golden" if number < 3 else "FI", "n": number % 2})
+        for number, mission in enumerate(planned(*["fly"] * 7))
+    ]
+    campaign.run(missions[:5]).close()
+    assert campaign.notes.last.outcomes == {"golden": {"success": 3}, "FI": {"success": 2}}
+    assert campaign.notes.last.success_rates == {"golden": 1.0, "FI": 1.0}
+    campaign.run(missions, append=True).close()
+    assert campaign.notes.last.outcomes == {"golden": {}, "FI": {"success": 2}}
+    assert campaign.notes.last.success_rates == {"FI": 1.0}
 
 
 def test_a_second_run_flies_nothing(campaign):
