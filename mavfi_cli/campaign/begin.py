@@ -28,6 +28,7 @@ from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.config import MissionConfig
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
+_REMEDY = "--append adds what is new, another folder starts anew"
 # Missions that differ in these only are checked once.
 _ALIKE = ("seed", "time_limit_s", "isolate")
 
@@ -89,7 +90,7 @@ def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool 
         if missions is None and ledger.meta("spec") == text:  # the list is what it would expand to
             require_versions(ledger)
         else:
-            store_plan(ledger, missions or _flyable(spec), append=append)
+            store_plan(ledger, missions or _flyable(spec), append=append, remedy=_REMEDY)
             ledger.set_meta({"spec": text, "name": spec.name})
             write_text(ledger.folder / SPEC, text)
         undo.pop_all()

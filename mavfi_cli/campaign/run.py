@@ -93,12 +93,19 @@ def run_campaign(
     return Ledger(folder)
 
 
-def store_plan(ledger: Ledger, missions: Sequence[PlannedMission], *, append: bool = False) -> None:
+def store_plan(
+    ledger: Ledger,
+    missions: Sequence[PlannedMission],
+    *,
+    append: bool = False,
+    remedy: str = "another folder starts anew",
+) -> None:
     """Write the list down before anything flies, or compare it with the one that is there.
 
     Args:
         append: missions that are not among the stored ones are added; those that are only there
             stay.
+        remedy: what to tell about another list.
 
     Raises:
         ConfigError: it is another list; says the first difference.
@@ -114,7 +121,8 @@ def store_plan(ledger: Ledger, missions: Sequence[PlannedMission], *, append: bo
         else:
             new.append(mission)
     if stored and not append and (new or left.total()):
-        raise ConfigError(_difference(stored, len(missions), new, +left), path=ledger.folder)
+        found = _difference(stored, len(missions), new, +left)
+        raise ConfigError(f"{found}; {remedy}", path=ledger.folder)
     ledger.plan(new)
 
 
@@ -132,7 +140,7 @@ def _difference(
     if gone:
         labels, _, changes = next(iter(gone))
         parts.append(f"{gone.total()} are gone, the first is {labels} {changes}")
-    return "; ".join([*parts, "--append adds what is new, another folder starts anew"])
+    return "; ".join(parts)
 
 
 def require_versions(ledger: Ledger) -> None:

@@ -200,8 +200,11 @@ def test_another_list_is_refused_and_its_first_difference_shown(campaign):
     campaign.run(planned("fly")).close()
     with pytest.raises(ConfigError, match=r'1 missions, now there are 2; 1 are new.*"seed":1'):
         campaign.run(planned("fly", "fly"))
-    with pytest.raises(ConfigError, match=r'1 are new.*"seed":0,.*; 1 are gone.*"fly"'):
+    with pytest.raises(ConfigError, match=r'1 are new.*"seed":0,.*; 1 are gone.*"fly"') as told:
         campaign.run(planned("exit:1"))
+    # Not every command that flies a list can add to it.
+    assert str(told.value).endswith("; another folder starts anew")
+    assert "--append" not in str(told.value)
 
 
 def test_append_adds_what_is_new(campaign):
