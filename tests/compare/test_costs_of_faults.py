@@ -95,6 +95,15 @@ def test_platforms_are_compared_over_the_faults_that_both_have_a_cost_of():
     assert told["p95_ratio"]["value"] == pytest.approx(there / here)
     # A worst case is that of all flights of its platform.
     assert told["largest_ratio"] == pytest.approx(1.0)
+    assert told["longest_ratio"] == pytest.approx(1.0)
+
+
+def test_the_longest_flight_counts_where_its_golden_one_failed_too():
+    first = struck([flight("x86", 1, 20.0)], [flight("x86", s, 20.0 * s, "none") for s in (1, 2)])
+    second = struck([flight("tx2", 1, 20.0)], [flight("tx2", s, 30.0 * s, "none") for s in (1, 2)])
+    assert (len(second.costs), second.longest_s) == (1, 60.0)
+    told = cost_difference("tx2", "x86", "none", first, second)
+    assert (told["pairs"], told["longest_ratio"]) == (1, 1.5)
 
 
 def test_equal_costs_differ_by_nothing_with_no_width():

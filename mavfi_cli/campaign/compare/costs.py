@@ -34,11 +34,13 @@ class Struck:
     Attributes:
         costs: of each pair that reached the goal, by mission: the difference, s, and the ratio.
         lost: flights that failed where the golden one reached the goal.
+        longest_s: of all that reached the goal, whether or not the golden one did.
         worst: the one that is longest over its own golden one, the lowest seed of equal ones.
     """
 
     costs: Costs
     lost: int
+    longest_s: float
     worst: Flown | None
 
 
@@ -61,6 +63,7 @@ def struck(golden: Sequence[Flown], counted: Sequence[Flown]) -> Struck:
             for each in pairs
         },
         lost=len(known) - len(pairs),
+        longest_s=max(_times([each for each in counted if each.succeeded]), default=math.nan),
         worst=max(
             pairs, key=lambda each: (each.flight_time_s / own[each.seed], -each.seed), default=None
         ),
@@ -115,8 +118,9 @@ def cost_difference(
 
     Returns:
         `extra_s`: the mean difference of costs; `p95_ratio`: of the 95th percentiles over own
-        golden; `largest_ratio`: of the largest, each platform's of all its pairs. The first two are
-        over the faults that both platforms have a cost of.
+        golden; both are over the faults that both platforms have a cost of. Of all flights of
+        each platform: `largest_ratio` of the largest over own golden, `longest_ratio` of the
+        longest in seconds.
     """
     shared = sorted(first.costs.keys() & second.costs.keys())
     here = _by_mission({mission: first.costs[mission] for mission in shared})
@@ -135,6 +139,7 @@ def cost_difference(
             )
         ),
         "largest_ratio": _largest(second, 1) / _largest(first, 1),
+        "longest_ratio": second.longest_s / first.longest_s,
     }
 
 

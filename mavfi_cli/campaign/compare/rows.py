@@ -59,7 +59,9 @@ def _csv_rows(told: Row) -> Iterator[dict[str, Any]]:
         yield {**at, "quantity": "flight time over own golden", "unit": "1",
                "statistic": "ratio of 95th percentiles", **row["p95_ratio"]}  # fmt: skip
         yield {**at, "quantity": "flight time over own golden", "statistic": "ratio of the largest",
-               "unit": "1", "value": row["largest_ratio"], "count": row["pairs"]}  # fmt: skip
+               "unit": "1", "value": row["largest_ratio"]}  # fmt: skip
+        yield {**at, "quantity": "flight time", "statistic": "ratio of the longest", "unit": "1",
+               "value": row["longest_ratio"]}  # fmt: skip
     for row in told["worst"]:
         at = {"table": "worst", "platform": row["platform"], "setting": row["setting"],
               "quantity": "flight time", "count": row["flights"]}  # fmt: skip

@@ -29,7 +29,7 @@ def table(told: Row) -> list[str]:
     if told["costs"]:
         lines += [
             "",
-            "What faults cost: over the golden flight of the same mission, both successful",
+            "What faults cost (Fig. 16), over the mission's golden flight; both successful",
         ]
         lines += _columns(_cost_rows(told))
         for platform in told["plan"]["platforms"][1:]:
@@ -172,13 +172,13 @@ def _difference_lines(told: Row, platform: Row) -> list[str]:
     reference = titles_of(told)[rows[0]["reference"]]
     title = f"{platform['title']} against {reference}, fault by fault"
     return [
-        f"{title} (faults that both survive; worst: of all)",
+        f"{title} (faults that both survive; worst, longest: of all)",
         *_columns(_difference_rows(rows)),
     ]
 
 
 def _difference_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "pairs", "mean, s", "95th perc., x", "worst, x"]
+    yield ["", "pairs", "mean, s", "95th perc., x", "worst, x", "longest, x"]
     for row in rows:
         yield [
             setting_title(row["setting"]),
@@ -186,6 +186,7 @@ def _difference_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
             _spread(row["extra_s"], digits=2),
             _spread(row["p95_ratio"], digits=3),
             _number(row["largest_ratio"], "{:.3f}"),
+            _number(row["longest_ratio"], "{:.3f}"),
         ]
 
 
