@@ -8,6 +8,7 @@ import pytest
 from flown_twice import PLAN, SEEDS, flight
 
 from mavfi_cli.campaign.compare.figures import QUANTITIES, figures
+from mavfi_cli.campaign.compare.fly import plan_told
 from mavfi_cli.campaign.compare.plan import ComparePlan
 from mavfi_cli.campaign.compare.rows import rows_csv
 from mavfi_cli.campaign.compare.table import table
@@ -141,6 +142,19 @@ def test_nothing_flown_gives_no_number_and_no_error():
     assert all(r["pairs"] == 0 and r["worst_flight"] is None for r in told["costs"])
     assert all(math.isnan(r["extra_s"]["value"]) for r in told["cost_differences"])
     assert all(math.isnan(r["quantities"]["flight_time_s"]["value"]) for r in told["ratios"])
+
+
+def test_no_line_of_the_text_is_longer_than_100_columns_but_commands():
+    plan = ComparePlan(inject=("perception", "planning", "control"), field="exponent", missions=200)
+    flights = [
+        flight(platform, seed, 20.0 + seed % 7, setting,
+               outcome="collision" if platform == "tx2" and seed % 4 == 0 else "success")
+        for platform in plan.platforms for seed in range(200) for setting in plan.settings
+    ]  # fmt: skip
+    told = {"plan": plan_told(plan), "errors": ["mission 3: no"], **figures(plan, flights)}
+    text = table(told)
+    assert "-25.0 (p<.001)" in "\n".join(text)
+    assert [line for line in text if len(line) > 100 and not line.startswith("  mavfi fly")] == []
 
 
 def test_text_and_csv_say_every_number_with_its_unit(whole):

@@ -68,7 +68,7 @@ def _faults(plan: Row) -> str:
     if not plan["inject"]:
         return "none"
     bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
-    return f"{bits} in {', '.join(plan['inject'])}: a flight with each; fault seed {plan['seed']}"
+    return f"{bits} in {', '.join(plan['inject'])}: one a flight; fault seed {plan['seed']}"
 
 
 def titles_of(told: Row) -> dict[str, str]:
@@ -143,7 +143,7 @@ def _ratio_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
             _spread(found["response_median_s"], digits=2),
             "-"
             if math.isnan(difference)
-            else f"{100 * difference:+.1f} (p {row['success']['p_value']:.2g})",
+            else f"{100 * difference:+.1f} ({_chance(row['success']['p_value'])})",
         ]
 
 
@@ -249,6 +249,11 @@ def _columns(rows: Iterator[list[str]]) -> list[str]:
     ]
 
 
+def _chance(p_value: float) -> str:
+    """A p-value in little room."""
+    return "p<.001" if p_value < 0.001 else f"p {p_value:.1g}".replace("p 0.", "p .")
+
+
 def _rate(share: Row) -> str:
     if math.isnan(share["share"]):
         return "-"
@@ -260,8 +265,8 @@ def _spread(each: Row, *, scale: float = 1.0, digits: int) -> str:
     value, low, high = (scale * each[name] for name in ("value", "low", "high"))
     if math.isnan(value):
         return "-"
-    ends = "" if math.isnan(low) else f" ({low:.{digits}f} to {high:.{digits}f})"
-    return f"{value:.{digits}f}{ends}"
+    ends = "" if math.isnan(low) else f" ({low:z.{digits}f} to {high:z.{digits}f})"
+    return f"{value:z.{digits}f}{ends}"
 
 
 def _number(value: float, shape: str) -> str:
