@@ -55,6 +55,11 @@ class Point:
 
     values: Mapping[str, Any]
 
+    @property
+    def target(self) -> str:
+        """What the fault is to strike; empty without one."""
+        return next((str(self.values[name]) for name in _ALIASES if name in self.values), "")
+
     def mission(self, seed: int, fault_seed: int) -> MissionConfig:
         """The mission.
 

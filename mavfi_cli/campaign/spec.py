@@ -142,8 +142,9 @@ class Spec:
         self, point: Point, labels: Mapping[str, Label], repetition: int
     ) -> PlannedMission:
         seed = point.values.get("seed", self.first_seed + repetition)
-        # Neither stage nor detector has a part in it: settings differ in nothing but themselves.
-        fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition)
+        # What is struck has a part in it, else the faults of all states would be one draw. Nothing
+        # else has: the same place gets the same fault whatever protects it or computes.
+        fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition, point.target)
         with naming(labels):
             return PlannedMission(config=point.mission(seed, fault_seed), labels=labels)
 

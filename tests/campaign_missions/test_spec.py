@@ -56,10 +56,17 @@ def test_golden_faulty_and_other_faulty_flights_of_a_repetition_are_pairs():
     assert [len(each) for each in by_seed.values()] == [5, 5, 1]
     for each in by_seed.values():
         assert len({mission.pair for mission in each}) == 1
-        assert len({m.config.fault.seed for m in each if m.config.fault}) <= 1
-    seeds = [m.config.fault.seed for m in missions if m.config.fault]
-    assert len(set(seeds)) == 2
     assert len({mission.pair for mission in missions}) == 3
+
+
+def test_a_fault_is_drawn_anew_for_each_repetition_and_place_and_for_nothing_else():
+    """Else campaigns over all states would have a draw a repetition, and count it many times."""
+    text = CROSSED.replace('name = "FI"', 'name = "FI"\ndetector = ["gad", "aad"]')
+    text = text.replace("[factors]", '[factors]\nplatform = ["x86", "tx2"]')
+    faults = [(m.config.seed, m.config.fault) for m in spec_of(text).missions() if m.config.fault]
+    assert len(faults) == 2 * 2 * 2 * 2 * 2 * 2
+    assert len({fault.seed for _, fault in faults}) == 4
+    assert len({(seed, fault.target, fault.seed) for seed, fault in faults}) == 4
 
 
 def test_the_list_is_a_function_of_the_specification():
