@@ -272,11 +272,12 @@ def _costs(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
         x, late = places[row["platform"], row["setting"]], row["over_own"]["p95"]
         height = 100 * (row["over_own"]["largest"] - 1.0)
         axes.bar(x, height, width=0.9 * width, color=colours[row["platform"]])
-        axes.annotate(
-            f"{height:+.1f}", (x, max(0.0, height)), xytext=(0, 2), textcoords="offset points",
-            ha="center", fontsize=8.5, color=INK,
-        )  # fmt: skip
         percent = {key: 100 * (late[key] - 1.0) for key in ("value", "low", "high")}
+        top = max(0.0, height, *(end for end in percent.values() if not math.isnan(end)))
+        axes.annotate(
+            f"{height:+.1f}", (x, top), xytext=(0, 6 if percent["value"] >= 0.9 * top else 2),
+            textcoords="offset points", ha="center", fontsize=8.5, color=INK,
+        )  # fmt: skip
         axes.plot(
             x, percent["value"], "D", markersize=5, color="white", markeredgecolor=INK,
             label="95th percentile" if number == 0 else None,

@@ -135,6 +135,14 @@ def test_faults_no_longer_than_the_longest_golden_flight_leave_nothing_to_recove
         )
 
 
+def test_a_fault_that_cost_nothing_is_not_recommended():
+    flights = [flight(p, s, 20.0, setting) for p in PLAN.platforms for s in SEEDS
+               for setting in PLAN.settings]  # fmt: skip
+    text = "\n".join(table({"plan": plan_told(PLAN), "errors": [], **figures(PLAN, flights)}))
+    assert "no fault made a flight longer on tx2" in text
+    assert "mavfi fly" not in text
+
+
 def test_nothing_flown_gives_no_number_and_no_error():
     told = figures(PLAN, [])
     assert all(r["success"]["total"] == 0 for r in told["settings"])

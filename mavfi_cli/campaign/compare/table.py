@@ -207,17 +207,16 @@ def _worst_rows(told: Row) -> Iterator[list[str]]:
 
 def _again(told: Row) -> list[str]:
     """How to fly again what cost most."""
-    titles = titles_of(told)
-    again = [
-        line
-        for row in told["costs"]
-        if row["setting"] == NONE and row["worst_flight"] is not None
-        for line in (
-            f"the fault that costs most on {titles[row['platform']]}:",
-            f"  {command_of(told, row)}",
-        )
-    ]
-    return [*again, *([PAPER] if told["plan"]["inject"] else [])]
+    titles, lines = titles_of(told), []
+    for row in told["costs"]:
+        if row["setting"] != NONE or row["worst_flight"] is None:
+            continue
+        if row["over_own"]["largest"] > 1.0:
+            lines.append(f"the fault that costs most on {titles[row['platform']]}:")
+            lines.append(f"  {command_of(told, row)}")
+        else:
+            lines.append(f"no fault made a flight longer on {titles[row['platform']]}")
+    return [*lines, *([PAPER] if told["plan"]["inject"] else [])]
 
 
 def command_of(told: Row, row: Row) -> str:
