@@ -105,7 +105,7 @@ def plan_fault(
             "world, seed or node"
         )
     rng = generator(asked.seed, Stream.FAULT, "instruction")
-    drawn = _draw_invocation(node, counts, rng)
+    drawn = draw_invocation(node, counts, rng)
     profiling = generator(config.seed, Stream.FAULT, "profile", kernel, drawn.number)
     found: TargetProfile = _kept(
         folder / f"profile-{kernel}-{drawn.number}.pickle",
@@ -130,28 +130,35 @@ def plan_fault(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Invocation:
+class Invocation:
+    """One invocation of a kernel, and how it is reached."""
+
     number: int  # of the kernel, from 1
     of: int
     order: int  # of the node, from 1, in which it happens
     entry: int  # of the kernel, from 1, with which it begins
 
 
-def _draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> _Invocation:
+def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> Invocation:
     """One invocation of a kernel, uniformly, from how often it was entered up to each order.
 
     Each entry is an invocation. A planner node is entered once or more in a request (each time it
     builds an obstacle grid), and the request is the invocation.
+
+    Args:
+        node: whose kernel it is.
+        counts: entries up to each order of the golden flight, ascending; some.
+        rng: draws.
     """
     if node != "planner":
         entry = int(rng.integers(counts[-1])) + 1
         order = int(np.searchsorted(counts, entry)) + 1
-        return _Invocation(number=entry, of=counts[-1], order=order, entry=entry)
+        return Invocation(number=entry, of=counts[-1], order=order, entry=entry)
     before = np.array([0, *counts[:-1]])
     orders = np.flatnonzero(np.array(counts) > before)
     which = int(rng.integers(len(orders)))
     order = int(orders[which])
-    return _Invocation(
+    return Invocation(
         number=which + 1, of=len(orders), order=order + 1, entry=int(before[order]) + 1
     )
 
