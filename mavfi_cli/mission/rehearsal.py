@@ -8,6 +8,7 @@ stepped, or many, each for a part of the request, and each ends instead of answe
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -43,11 +44,14 @@ class Rehearsal:
         self._setup = setup
         self._last = orders[-1]
         self._spawned = SpawnedNode()
-        self.scope_of_node = self._spawned.begin(setup)
-        self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
-        for value, start_s in orders[:-1]:
-            self._process.take(self._process.order(setup.node, value, start_s))
-        self._image = Image(self._spawned.pid, self.scope_of_node.regions)
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
+            self.scope_of_node = self._spawned.begin(setup)
+            self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
+            for value, start_s in orders[:-1]:
+                self._process.take(self._process.order(setup.node, value, start_s))
+            self._image = Image(self._spawned.pid, self.scope_of_node.regions)
+            undo.pop_all()
 
     @property
     def name(self) -> str:
