@@ -116,12 +116,12 @@ def occupied_leaves(stream: bytes) -> NDArray[np.int64]:
     """
     # A node of two bytes has at most eight leaves.
     leaves = np.empty((4 * len(stream), 4), np.int64)
-    count = _decode(np.frombuffer(stream, np.uint8), leaves)
+    count = decode_leaves(np.frombuffer(stream, np.uint8), leaves)
     return leaves[:count].copy()
 
 
 @compiled
-def _decode(stream: NDArray[np.uint8], leaves: NDArray[np.int64]) -> int:
+def decode_leaves(stream: NDArray[np.uint8], leaves: NDArray[np.int64]) -> int:
     """Fill `leaves` from the node stream; returns how many."""
     stack = np.empty((8 * TREE_DEPTH + 8, 4), np.int64)  # x y z of the lower corner, size
     stack[0, 0], stack[0, 1], stack[0, 2] = -HALF_RANGE, -HALF_RANGE, -HALF_RANGE

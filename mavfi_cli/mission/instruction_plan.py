@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,17 +21,12 @@ from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.sources import own_digest
 from mavfi_cli.fi import record
+from mavfi_cli.fi.isolated.profile import TargetProfile
 from mavfi_cli.fi.native.fault import InstructionFault
-from mavfi_cli.fi.sampling import draw_fault
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.instruction_profile import (
-    KernelProfile,
-    Order,
-    count_entries,
-    profile_kernel,
-)
+from mavfi_cli.mission.instruction_profile import Order, count_entries, profile_kernel
 from mavfi_cli.mission.kernel_scope import kernel_of_node
 from mavfi_cli.mission.node_server import Setup
 
@@ -110,35 +105,62 @@ def plan_fault(
             "world, seed or node"
         )
     rng = generator(asked.seed, Stream.FAULT, "instruction")
-    invocation = int(rng.integers(counts[-1])) + 1
-    order = int(np.searchsorted(counts, invocation)) + 1
-    profiling = generator(config.seed, Stream.FAULT, "profile", kernel, invocation)
-    found: KernelProfile = _kept(
-        folder / f"profile-{kernel}-{invocation}.pickle",
-        lambda: profile_kernel(setup, orders[:order], invocation, profiling),
+    drawn = draw_invocation(node, counts, rng)
+    profiling = generator(config.seed, Stream.FAULT, "profile", kernel, drawn.number)
+    found: TargetProfile = _kept(
+        folder / f"profile-{kernel}-{drawn.number}.pickle",
+        lambda: profile_kernel(setup, orders[: drawn.order], drawn.entry, profiling),
     )
-    fault = draw_fault(
-        found.profile,
-        replace(strategy, whole_process=False),
-        rng,
-        code_at=found.first.code_at,
-        locate=found.first.image.locate,
-    )
+    fault = found.draw(replace(strategy, whole_process=False), rng)
     context = {
         "node": node,
         "kernel": kernel,
-        "invocation": invocation,
-        "invocations": counts[-1],
-        "node_invocation": order,
-        "stamp_s": round(orders[order - 1][1], 9),
+        "invocation": drawn.number,
+        "invocations": drawn.of,
+        "node_invocation": drawn.order,
+        "stamp_s": round(orders[drawn.order - 1][1], 9),
         "sampling": asked.sampling_name(),
         "windows": found.windows,
-        "profiled_instructions": found.profile.executed,
+        "profiled_instructions": found.executed,
         "seed": asked.seed,
         "request": asked.to_dict(),
     }
-    drawn = replace(fault, corruption=None) if asked.null else fault
-    return PlannedFault(fault=drawn, node=node, order=order, context=context)
+    struck = replace(fault, corruption=None) if asked.null else fault
+    return PlannedFault(fault=struck, node=node, order=drawn.order, context=context)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Invocation:
+    """One invocation of a kernel, and how it is reached."""
+
+    number: int  # of the kernel, from 1
+    of: int
+    order: int  # of the node, from 1, in which it happens
+    entry: int  # of the kernel, from 1, with which it begins
+
+
+def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> Invocation:
+    """One invocation of a kernel, uniformly, from how often it was entered up to each order.
+
+    Each entry is an invocation. A planner node is entered once or more in a request (each time it
+    builds an obstacle grid), and the request is the invocation.
+
+    Args:
+        node: whose kernel it is.
+        counts: entries up to each order of the golden flight, ascending; some.
+        rng: draws.
+    """
+    if node != "planner":
+        entry = int(rng.integers(counts[-1])) + 1
+        order = int(np.searchsorted(counts, entry)) + 1
+        return Invocation(number=entry, of=counts[-1], order=order, entry=entry)
+    before = np.array([0, *counts[:-1]])
+    orders = np.flatnonzero(np.array(counts) > before)
+    which = int(rng.integers(len(orders)))
+    order = int(orders[which])
+    return Invocation(
+        number=which + 1, of=len(orders), order=order + 1, entry=int(before[order]) + 1
+    )
 
 
 def planned_of(recorded: Mapping[str, Any]) -> PlannedFault:

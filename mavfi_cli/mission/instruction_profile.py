@@ -7,12 +7,12 @@ its own, at the speed of the machine, which is counted, and stepped at the invoc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
 from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.fi.isolated.profile import Stratum, TargetProfile
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.fault import Stage
 from mavfi_cli.fi.native.image import Image, scope_of
@@ -22,30 +22,19 @@ from mavfi_cli.fi.native.node import (
     count_executions,
     profile_invocation,
 )
-from mavfi_cli.fi.native.profile import Profile, Segment, WindowTooLong, record_window
+from mavfi_cli.fi.native.profile import Profile, Segment, record_window
 from mavfi_cli.fi.native.tracee import Tracee
 from mavfi_cli.fi.native.tracer import TracerThread
-from mavfi_cli.mission.kernel_scope import KernelScope, kernel_of_node
+from mavfi_cli.mission.kernel_scope import KernelScope
 from mavfi_cli.mission.node_process import NodeProcess
 from mavfi_cli.mission.node_server import Setup
+from mavfi_cli.mission.rehearsal import WHOLE_LIMIT, profile_request
 from mavfi_cli.mission.spawned_node import SpawnedNode
 
 T = TypeVar("T")
 Order = tuple[Any, float]  # input, start stamp
 Armed = Callable[[], None]
-WHOLE_LIMIT = 600_000  # instructions; more are sampled, where the kernel has inner functions
-# Always sampled, and how many windows: of some 300 instructions in OctoMap, 40,000 in RRT*.
-_WINDOWS = {"octomap": 16, "rrtstar": 4}
-_OTHER_WINDOWS = 4
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KernelProfile:
-    """What was executed, and what is needed to draw from it."""
-
-    profile: Profile
-    first: InvocationProfile  # any window: image and code
-    windows: str  # how many of how many
+_WINDOWS = {"octomap": 16}  # always sampled, and how many windows: of some 300 instructions
 
 
 def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
@@ -72,21 +61,25 @@ def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
 
 
 def profile_kernel(
-    setup: Setup, orders: Sequence[Order], invocation: int, rng: np.random.Generator
-) -> KernelProfile:
+    setup: Setup, orders: Sequence[Order], entry: int, rng: np.random.Generator
+) -> TargetProfile:
     """Profile one invocation of the kernel, which happens in the last of the orders.
 
+    Args:
+        setup: of the node.
+        orders: up to the one with the invocation.
+        entry: how many entries of the kernel there have been when it begins, itself included.
+        rng: draws what is stepped, where that is a sample.
+
     Raises:
-        TargetError: too long to be stepped, and without inner functions.
+        WindowTooLong: too long to be stepped, and without inner functions.
+        TargetError: nothing in scope executes.
     """
-    kernel = kernel_of_node(setup.node, setup.config.planner)
-    if kernel not in _WINDOWS:
-        try:
-            return _whole(setup, orders, invocation)
-        except WindowTooLong as error:
-            if setup.node != "planner":
-                raise error
-    return _sampled(setup, orders, invocation, _WINDOWS.get(kernel, _OTHER_WINDOWS), rng)
+    if setup.node == "planner":
+        return profile_request(setup, orders, entry, rng)
+    if setup.node in _WINDOWS:
+        return _sampled(setup, orders, entry, _WINDOWS[setup.node], rng)
+    return _whole(setup, orders, entry)
 
 
 def _traced(
@@ -113,7 +106,7 @@ def _traced(
         spawned.kill()
 
 
-def _whole(setup: Setup, orders: Sequence[Order], invocation: int) -> KernelProfile:
+def _whole(setup: Setup, orders: Sequence[Order], invocation: int) -> TargetProfile:
     def work(pid: int, scope: KernelScope, armed: Armed) -> InvocationProfile:
         """Step through the whole invocation."""
         return profile_invocation(
@@ -127,13 +120,12 @@ def _whole(setup: Setup, orders: Sequence[Order], invocation: int) -> KernelProf
         )
 
     found = _traced(setup, orders, work)
-    profile = Profile(segments=(found.segment,), windows_in_run=1, cost_s=0.0)
-    return KernelProfile(profile=profile, first=found, windows="1 of 1")
+    return _of_windows([found], 1)
 
 
 def _sampled(
     setup: Setup, orders: Sequence[Order], invocation: int, windows: int, rng: np.random.Generator
-) -> KernelProfile:
+) -> TargetProfile:
     """Step some invocations of one function of the kernel, drawn by how often it runs."""
     counts = _traced(
         setup,
@@ -154,10 +146,18 @@ def _sampled(
         return _windows(pid, scope, invocation, which, [int(m) for m in drawn], armed)
 
     found = _traced(setup, orders, work)
-    profile = Profile(
-        segments=tuple(each.segment for each in found), windows_in_run=total, cost_s=0.0
+    return _of_windows(found, total)
+
+
+def _of_windows(found: Sequence[InvocationProfile], windows_in_run: int) -> TargetProfile:
+    segments = tuple(each.segment for each in found)
+    profile = Profile(segments=segments, windows_in_run=windows_in_run, cost_s=0.0)
+    return TargetProfile(
+        strata=(Stratum(marker=segments[0].start[-1].location, profile=profile),),
+        image=found[0].image,
+        code=found[0].code,
+        cost_s=0.0,
     )
-    return KernelProfile(profile=profile, first=found[0], windows=f"{number} of {total}")
 
 
 def _windows(

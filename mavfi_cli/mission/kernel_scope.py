@@ -1,5 +1,9 @@
 """What "the kernel" is for an instruction-level fault: its native entry, and the code in scope.
 
+Of a planner there are two answers. In isolation the kernel is a search, since there is always one:
+OMPL's `solve`. In a mission it is what the planner node does for one request, whether the straight
+way is free or has to be searched for (`node_scope`).
+
 Ask in the process in which the kernel runs, after it has run once (`autonomy.warm_up`): a
 just-in-time compiled kernel has an address only then. The answer can be sent to a tracer.
 """
@@ -10,7 +14,7 @@ import hashlib
 import io
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from elftools.elf.elffile import ELFFile
@@ -67,12 +71,13 @@ class KernelScope:
 
     Attributes:
         entry: its invocation counts as one invocation of the kernel. The collision check enters
-            once for every point that it tries.
+            once for every point that it tries. Of a planner node it is where a request begins.
         objects: in scope, by name; regions among them.
         regions: for `Image`: compiled code without a file, and objects of which a part only is
             in scope.
         inner: functions of the kernel. Where it executes too many instructions for a profile of
-            all, invocations of these are sampled.
+            all, invocations of these are sampled; of a planner node, windows that begin at them,
+            and the first is the search.
     """
 
     kernel: str
@@ -100,6 +105,38 @@ def kernel_scope(kernel: str) -> KernelScope:
     if kernel not in known:
         raise UnknownName("kernel", kernel, KERNELS)
     return known[kernel]()
+
+
+def node_scope(node: str, planner: str) -> KernelScope:
+    """Entry and scope of what a mission's node does, in this process.
+
+    A planner node begins a request with reading the map, which is not in scope, as building the
+    obstacle grid of it is not. In scope is what follows up to the answer: each test whether a
+    straight segment or a piece of the trajectory is free, and the search where there is one.
+
+    Raises:
+        UnknownName: no such node or planner; names the nearest.
+        FaultError: its kernel has not run in this process yet.
+    """
+    kernel = kernel_of_node(node, planner)
+    found = kernel_scope(kernel)
+    return found if kernel not in PLANNERS else _whole_request(found)
+
+
+def _whole_request(search: KernelScope) -> KernelScope:
+    from mavfi_cli.autonomy.grid import path_free, segment_free
+    from mavfi_cli.autonomy.octree import decode_leaves
+
+    reader, begin, reading = compiled_region(decode_leaves)
+    pieces, piece, testing = compiled_region(path_free)
+    _, segment, _ = compiled_region(segment_free)
+    return replace(
+        search,
+        entry=begin,
+        objects=(*search.objects, pieces),
+        regions={**search.regions, pieces: testing, reader: reading},
+        inner=(search.entry, segment, piece, *search.inner),
+    )
 
 
 def kernel_of_node(node: str, planner: str) -> str:

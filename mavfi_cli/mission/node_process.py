@@ -41,6 +41,11 @@ class _Order:
     start_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Rehearse:
+    """Instead of an order: have a fork work on the order that comes next."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Answer:
     number: int
@@ -118,6 +123,21 @@ class NodeProcess:
             send(self._socket, order)
         return order.number
 
+    def rehearse(self) -> int:
+        """Fork the process; the fork works on the next order, ends, and never answers.
+
+        The process goes on, as if nothing had been, once the fork has ended.
+
+        Returns:
+            Process id of the fork, which waits for its order.
+
+        Raises:
+            OSError, EOFError: the process is gone.
+        """
+        send(self._socket, _Rehearse())
+        fork: int = receive(self._socket)
+        return fork
+
     def take(self, number: int) -> tuple[Any, float]:
         """Wait for the output of an order; the output and the host seconds it took.
 
@@ -191,7 +211,10 @@ def serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         while True:
-            order: _Order = receive(connection)
+            order: _Order | _Rehearse = receive(connection)
+            if isinstance(order, _Rehearse):
+                _rehearse(connection, runs)
+                continue
             begun = perf_counter()
             output, error = None, None
             try:
@@ -207,6 +230,17 @@ def serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
         os._exit(0)
     finally:
         os._exit(1)
+
+
+def _rehearse(connection: socket.socket, runs: Mapping[str, Run]) -> None:
+    pid = os.fork()
+    if pid:
+        send(connection, pid)
+        os.waitpid(pid, 0)
+        return
+    order: _Order = receive(connection)
+    runs[order.node](order.input, order.start_s)
+    os._exit(0)
 
 
 def send(connection: socket.socket, value: Any) -> None:

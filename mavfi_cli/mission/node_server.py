@@ -17,7 +17,7 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion import Companion
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.kernel_scope import kernel_of_node, kernel_scope
+from mavfi_cli.mission.kernel_scope import node_scope
 from mavfi_cli.mission.node_process import receive, send, serve
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.protection import NoProtection
@@ -50,7 +50,7 @@ def main() -> None:
         NoInjection(),
         NoProtection(),
     )
-    send(connection, kernel_scope(kernel_of_node(setup.node, config.planner)))
+    send(connection, node_scope(setup.node, config.planner))
     serve(connection, {setup.node: companion.executor.nodes[setup.node].run})
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.fi import record
+from mavfi_cli.fi.isolated.profile import Stratum, TargetProfile
 from mavfi_cli.fi.native import tracee
 from mavfi_cli.fi.native.arch import decode
 from mavfi_cli.fi.native.fault import InstructionFault, Role, Stage, explicit_corruption
@@ -22,7 +23,7 @@ from mavfi_cli.fi.native.node import (
     profile_invocation,
 )
 from mavfi_cli.fi.native.profile import Profile
-from mavfi_cli.fi.sampling import draw_fault, strategy
+from mavfi_cli.fi.sampling import strategy
 
 KERNEL = """
 __attribute__((noinline)) double inner(double x) { return x * x; }
@@ -121,6 +122,12 @@ def profiled(process, invocation=1):
     return tracer.result()
 
 
+def to_draw_from(found):
+    profile = Profile(segments=(found.segment,), windows_in_run=1, cost_s=0.0)
+    stratum = Stratum(marker=None, profile=profile)
+    return TargetProfile(strata=(stratum,), image=found.image, code=found.code, cost_s=0.0)
+
+
 def test_an_invocation_is_profiled_and_the_node_goes_on(node):
     found = profiled(node, 3)
     assert found.segment.start == (Stage(entry_of(node), 3),)
@@ -168,7 +175,7 @@ def test_a_large_kernel_is_profiled_by_sample(node):
 def test_a_fault_hits_exactly_its_invocation(node, tmp_path):
     found = profiled(node)
     image, entry = found.image, entry_of(node)
-    instruction_bytes = found.code_at(image.address(entry))
+    instruction_bytes = to_draw_from(found).code_at(image.address(entry))
     first = decode(instruction_bytes, image.address(entry))
     fault = InstructionFault(
         trigger=(Stage(entry, 3),),
@@ -191,11 +198,10 @@ def test_a_fault_hits_exactly_its_invocation(node, tmp_path):
 
 def test_drawn_faults_repeat_in_the_node(node, tmp_path):
     found = profiled(node)
-    profile = Profile(segments=(found.segment,), windows_in_run=1, cost_s=0.0)
     plan = strategy("instruction-uniform")
     rng = np.random.default_rng(21)
     for _ in range(40):
-        fault = draw_fault(profile, plan, rng, code_at=found.code_at, locate=found.image.locate)
+        fault = to_draw_from(found).draw(plan, rng)
         if fault.corruption.register.startswith(("xmm", "ymm", "zmm")):
             break
     answers = []
@@ -211,14 +217,7 @@ def test_drawn_faults_repeat_in_the_node(node, tmp_path):
 
 def test_a_node_that_crashes_is_reported(node, tmp_path):
     found = profiled(node)
-    profile = Profile(segments=(found.segment,), windows_in_run=1, cost_s=0.0)
-    fault = draw_fault(
-        profile,
-        strategy("instruction-uniform"),
-        np.random.default_rng(0),
-        code_at=found.code_at,
-        locate=found.image.locate,
-    )
+    fault = to_draw_from(found).draw(strategy("instruction-uniform"), np.random.default_rng(0))
     wild = replace(fault, corruption=explicit_corruption("rip", 45, Role.DESTINATION))
     tracer = Tracer(attack, node.pid, wild, path=tmp_path / "fault.json")
     node.stdin.write("1 2 3\n")
@@ -231,14 +230,7 @@ def test_a_node_that_crashes_is_reported(node, tmp_path):
 
 def test_a_null_injection_leaves_the_answers(node, tmp_path):
     found = profiled(node)
-    profile = Profile(segments=(found.segment,), windows_in_run=1, cost_s=0.0)
-    fault = draw_fault(
-        profile,
-        strategy("instruction-uniform"),
-        np.random.default_rng(0),
-        code_at=found.code_at,
-        locate=found.image.locate,
-    )
+    fault = to_draw_from(found).draw(strategy("instruction-uniform"), np.random.default_rng(0))
     tracer = Tracer(attack, node.pid, replace(fault, corruption=None), path=tmp_path / "f.json")
     assert ask(node, 1, 2, 3) == 14.0
     assert tracer.result().reason == ""
@@ -263,7 +255,7 @@ def test_a_kernel_without_a_file_is_a_region(native_program, tmp_path):
         assert [ask(process, 1, 2, 3) for _ in range(3)] == [14.0] * 3
         found = tracer.result()
         assert len(found.segment.trace) > 6
-        first = decode(found.code_at(address), address)
+        first = decode(to_draw_from(found).code_at(address), address)
         fault = InstructionFault(
             trigger=(Stage(entry, 2),),
             execution=1,

@@ -83,7 +83,6 @@ class Campaign:
     def summary(self) -> dict[str, Any]:
         """Counts, shares and intervals, with everything that the numbers depend on."""
         profile, records = self.profiled, self.records
-        stepped = None if profile is None else profile.strata[0].profile
         windows = [] if profile is None else [profile.window_of(entry) for entry in records]
         return {
             **self.plan.context(),
@@ -92,9 +91,7 @@ class Campaign:
             "runs": len(records),
             "executed_in_scope": None if profile is None else profile.executed,
             "profile_complete": None if profile is None else profile.complete,
-            "windows": None
-            if stepped is None
-            else f"{len(stepped.segments)} of {stepped.windows_in_run}",
+            "windows": None if profile is None else profile.windows,
             "profile_s": None if profile is None else profile.cost_s,
             "golden_wall_s": self.golden.wall_s,
             "wall_s": self.wall_s,

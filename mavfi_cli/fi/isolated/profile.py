@@ -61,6 +61,13 @@ class TargetProfile:
         return all(stratum.profile.complete for stratum in self.strata)
 
     @property
+    def windows(self) -> str:
+        """How many windows of how many were stepped."""
+        profiles = [stratum.profile for stratum in self.strata]
+        stepped = sum(len(profile.segments) for profile in profiles)
+        return f"{stepped} of {sum(profile.windows_in_run for profile in profiles)}"
+
+    @property
     def executed(self) -> int:
         """Executed instructions in scope, over the stepped windows."""
         return sum(stratum.profile.executed for stratum in self.strata)
@@ -100,6 +107,7 @@ def profile_run(
     *,
     markers: Sequence[Location] = (),
     windows: int = 1,
+    enough: int | None = None,
     limit: int = STEPS,
 ) -> TargetProfile:
     """Step a fault-free run, or a sample of the windows that markers cut it into.
@@ -109,6 +117,7 @@ def profile_run(
         rng: draws the windows.
         markers: instructions in scope; none for the whole run.
         windows: how many of each marker are stepped at least.
+        enough: more of them where together they have no more instructions; default `ENOUGH`.
         limit: refuse longer windows, instructions.
 
     Raises:
@@ -123,7 +132,7 @@ def profile_run(
         if count := stepper.count():
             order = rng.permutation(count) + 1
             profile = stepper.profile(order[:windows], count)
-            fit = ENOUGH * windows // max(1, profile.executed)
+            fit = (ENOUGH if enough is None else enough) * windows // max(1, profile.executed)
             if windows < min(fit, count):
                 profile = stepper.profile(order[:fit], count)
             strata.append(Stratum(marker=marker, profile=profile))

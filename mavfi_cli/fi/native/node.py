@@ -37,14 +37,7 @@ class InvocationProfile:
 
     segment: Segment
     image: Image
-    code: tuple[tuple[int, bytes], ...]
-
-    def code_at(self, address: int) -> bytes:
-        """16 bytes of code in scope."""
-        for start, data in self.code:
-            if start <= address < start + len(data):
-                return data[address - start : address - start + 16]
-        return b""
+    code: tuple[tuple[int, bytes], ...]  # start address and bytes of the code in scope
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

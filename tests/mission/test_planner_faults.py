@@ -1,0 +1,148 @@
+"""Faults in the planner node: one request is one invocation, straight or searched."""
+
+import json
+import pickle
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mavfi_cli.fi import record as records
+from mavfi_cli.fi.isolated.profile import profile_run
+from mavfi_cli.fi.native.arch import SUPPORTED
+from mavfi_cli.fi.native.doctor import check_tracing
+from mavfi_cli.fi.native.tracer import TracerThread
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.instruction_plan import draw_invocation
+from mavfi_cli.mission.node_process import NodeProcess
+from mavfi_cli.mission.node_server import Setup
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.rehearsal import Rehearsal, profile_request
+from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
+
+traced = pytest.mark.skipif(
+    not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
+)
+SEGMENT, PIECES, OMPL = "numba:segment_free", "numba:path_free", "libompl.so"
+READER = "numba:decode_leaves"
+
+
+def flown(folder):
+    result = json.loads(folder.result.read_text())
+    del result["host"]
+    return folder.trace.read_bytes(), folder.tlog.read_bytes(), result
+
+
+@traced
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(fly_short, seed):
+    folder = fly_short(instruction=InstructionConfig(target="planner", seed=seed))
+    result = load_run(folder.path).result
+    fault = result["fault"]
+    assert (fault["state"], fault["node"], fault["kernel"]) == ("applied", "planner", "rrtstar")
+    assert fault["object"] in {SEGMENT, PIECES}
+    assert fault["trigger"][0]["object"] == READER
+    assert (fault["invocation"], fault["invocations"]) == (1, 1)
+    assert fault["windows"] == "1 of 1"
+    assert {SEGMENT, PIECES} < set(fault["scope"])
+    (event,) = [e for e in result["events"] if e["kind"] == "fault"]
+    assert f"{fault['object']}+{fault['offset']:#x}" in event["text"]
+
+
+@traced
+def test_a_replay_of_a_fault_in_a_straight_request_is_the_same_to_the_byte(fly_short, tmp_path):
+    first = fly_short(instruction=InstructionConfig(target="planner", seed=1))
+    config, recorded = config_of(load_run(first.path)), records.read(first.fault)
+    assert flown(fly_mission(config, tmp_path, Watcher(), repeat=recorded)) == flown(first)
+
+
+@traced
+def test_a_null_injection_in_a_straight_request_changes_nothing(fly_short, short_flight):
+    folder = fly_short(instruction=InstructionConfig(target="planner", seed=1, null=True))
+    assert folder.trace.read_bytes() == short_flight.trace.read_bytes()
+    assert folder.tlog.read_bytes() == short_flight.tlog.read_bytes()
+    assert load_run(folder.path).result["fault"]["state"] == "null"
+
+
+@pytest.fixture(scope="module")
+def searching(tmp_path_factory):
+    """Setup of a planner node before whose goal a box stands, and its orders of the flight."""
+    folder = tmp_path_factory.mktemp("box")
+    world = folder / "box.toml"
+    world.write_text(
+        'name = "box"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
+        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
+        "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
+    )
+    config = MissionConfig(world=str(world), seed=2, planner="rrtconnect")
+    attacked = replace(config, instruction=InstructionConfig(target="planner", seed=1))
+    fly_mission(attacked, folder, Watcher())
+    (kept,) = folder.glob(".profiles/*/orders.pickle")
+    briefing, orders = pickle.loads(kept.read_bytes())
+    return Setup(config=config, briefing=briefing, node="planner"), orders["planner"][:2]
+
+
+@traced
+def test_the_instructions_of_a_search_stay_in_scope_and_windows_are_parts_of_the_request(searching):
+    place = Rehearsal(*searching)
+    try:
+        whole = TracerThread(lambda _: profile_run(place, np.random.default_rng(1))).result()
+        entry = place.scope_of_node.inner[1]
+    finally:
+        place.close()
+    trace = whole.strata[0].profile.segments[0].trace
+    assert whole.image.locate(int(trace[0])) == entry  # a test of the start comes first
+    objects = Counter(whole.image.locate(int(address)).object for address in trace)
+    assert set(objects) == {OMPL, SEGMENT, PIECES}
+    assert objects[OMPL] > 1000
+
+    sampled = profile_request(*searching, 2, np.random.default_rng(1))
+    assert not sampled.complete
+    assert {stratum.marker.object for stratum in sampled.strata} == {OMPL, SEGMENT, PIECES}
+    for stratum in sampled.strata:
+        begins = np.flatnonzero(trace == whole.image.address(stratum.marker))
+        assert stratum.profile.windows_in_run == len(begins)
+        for segment in stratum.profile.segments:
+            request, window = segment.start
+            assert (request.location.object, request.count) == (READER, 2)
+            begin = begins[window.count - 1]
+            assert np.array_equal(segment.trace, trace[begin : begin + len(segment.trace)])
+
+
+def test_a_request_is_one_invocation_however_often_it_is_entered():
+    drawn = [
+        draw_invocation("planner", [1, 4, 4, 5], np.random.default_rng(seed)) for seed in range(60)
+    ]
+    assert {(each.number, each.order, each.entry) for each in drawn} == {
+        (1, 1, 1), (2, 2, 2), (3, 4, 5),
+    }  # fmt: skip
+    assert {each.of for each in drawn} == {3}
+
+
+def test_every_entry_is_an_invocation_of_another_kernel():
+    rngs = map(np.random.default_rng, range(60))
+    drawn = [draw_invocation("collision_check", [0, 3, 5], rng) for rng in rngs]
+    assert {(each.number, each.order) for each in drawn} == {(1, 2), (2, 2), (3, 2), (4, 3), (5, 3)}
+    assert all(each.entry == each.number and each.of == 5 for each in drawn)
+
+
+def test_a_rehearsal_leaves_the_node_as_it_was():
+    told = []
+
+    def remember(value, _stamp_s):
+        told.append(value)
+        return list(told)
+
+    process = NodeProcess.fork({"node": remember})
+    try:
+        assert process.take(process.order("node", 1, 0.0))[0] == [1]
+        for _ in range(2):
+            assert process.rehearse() != process.pid
+            process.order("node", 2, 0.0)
+        assert process.take(process.order("node", 3, 0.0))[0] == [1, 3]
+    finally:
+        process.close()
