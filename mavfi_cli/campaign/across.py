@@ -17,7 +17,7 @@ import numpy as np
 
 from mavfi_cli.campaign.groups import Group
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import canonical, label_text
+from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.statistics.layers import CrossLayer, cross_layer, failures_per_hour
 from mavfi_cli.campaign.statistics.proportions import rate
@@ -36,6 +36,7 @@ class Across:
     """One setting with faults.
 
     Attributes:
+        name: its labels in one phrase.
         failure: injected faults that fail a mission, of those whose golden flight succeeds.
         kernel: that all of its faults strike at instruction level; None where there are several.
         layers: its own corruption beside that; None without runs of the kernel by itself.
@@ -43,6 +44,7 @@ class Across:
     """
 
     labels: Mapping[str, Any]
+    name: str
     failure: Share
     kernel: str | None
     layers: CrossLayer | None
@@ -92,6 +94,7 @@ def across(
         rows.append(
             Across(
                 labels=group.labels,
+                name=group.name,
                 failure=failure,
                 kernel=kernel,
                 layers=layers,
@@ -150,7 +153,7 @@ class _Alone:
 
 def lines(rows: Sequence[Across]) -> list[str]:
     """What was found, a line a setting."""
-    return [f"  {label_text(each.labels)}: {', '.join(_parts(each))}" for each in rows]
+    return [f"  {each.name}: {', '.join(_parts(each))}" for each in rows]
 
 
 def _parts(each: Across) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from mavfi_cli.campaign.groups import METRICS, BoolArray, Group, IntArray, matched, untreated
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.paired import McNemar, holm, mcnemar
-from mavfi_cli.campaign.statistics.worst_case import WorstCase, worst_case
+from mavfi_cli.campaign.statistics.worst_case import WorstCase, worst_case, worst_over_own
 from mavfi_cli.core.types import FloatArray
 
 RESAMPLES = 1999
@@ -23,17 +23,23 @@ class Comparison:
 
     Attributes:
         first, second: their labels; the first is golden, or faulty where the second is protected.
+        name: of the second in one phrase.
         corrected_p: of the family of all comparisons of this kind, by Holm.
         differences: second minus first, over the pairs in which both succeeded.
-        worst: of the flight time; with what protection recovers of it.
+        over_own: the largest flight time over that of the golden flight of the same mission, both
+            successful; with what protection recovers of it.
+        over_mean: the longest of the same flights over the mean of the same golden ones, as the
+            paper has it.
     """
 
     first: Mapping[str, Any]
     second: Mapping[str, Any]
+    name: str
     success: McNemar
     corrected_p: float
     differences: Mapping[str, Interval]
-    worst: WorstCase
+    over_own: WorstCase
+    over_mean: WorstCase
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +64,43 @@ class _Match:
         change = (change - self.first.metrics[metric][self.at_first])[first & second]
         return change[~np.isnan(change)]
 
+    def worst(self) -> tuple[WorstCase, WorstCase]:
+        """The worst cases over own golden flights, and over the mean of these; of the pairs only.
+
+        A pair has a golden flight that succeeded, or it counts in neither.
+        """
+        if self.first.golden:
+            golden, sides = self.at_first, [(self.second, self.at_second)]
+        else:
+            golden = self._golden_of_first()
+            sides = [(self.first, self.at_first), (self.second, self.at_second)]
+        reference = self._times(self.golden, golden)
+        times = [self._times(group, places) for group, places in sides]
+        shown = [~np.isnan(reference) & ~np.isnan(each) for each in times]
+        used = np.logical_or.reduce(shown)
+        _, once = np.unique(golden[used], return_index=True)
+        golden_s = reference[used][once]
+        pairs = list(zip(times, shown, strict=True))
+        return (
+            worst_over_own(*((each[both] / reference[both]).tolist() for each, both in pairs)),
+            worst_case(golden_s.tolist(), *(each[both].tolist() for each, both in pairs)),
+        )
+
+    def _golden_of_first(self) -> IntArray:
+        """The place of the golden flight of each pair, (m,); -1 where there is none."""
+        own = np.full(len(self.first.number), -1)
+        at_golden, at_faulty = matched(self.golden, self.first)
+        own[at_faulty] = at_golden
+        return own[self.at_first]
+
+    @staticmethod
+    def _times(group: Group, places: IntArray) -> FloatArray:
+        """Flight times of successful flights, (m,); not a number of others, or at -1."""
+        found = np.full(len(places), np.nan)
+        there = (places >= 0) & group.succeeded[places]
+        found[there] = group.metrics["flight_time_s"][places[there]]
+        return found
+
 
 def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Comparison]:
     """Every setting with faults against the golden one with which it shares most pairs."""
@@ -66,7 +109,7 @@ def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Co
         golden = _golden_for(group, groups)
         if golden is not None:
             found.append(_Match(golden, group, golden, *matched(golden, group)))
-    return _compared(found, confidence, protected=False)
+    return _compared(found, confidence)
 
 
 def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[Comparison]:
@@ -81,7 +124,7 @@ def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[Compar
         faulty, golden = bare.get(untreated(group.labels)), _golden_for(group, groups)
         if faulty is not None and golden is not None:
             found.append(_Match(faulty, group, golden, *matched(faulty, group)))
-    return _compared(found, confidence, protected=True)
+    return _compared(found, confidence)
 
 
 def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
@@ -97,7 +140,7 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     return groups[-most[1]] if most[0] else None
 
 
-def _compared(matches: Sequence[_Match], confidence: float, *, protected: bool) -> list[Comparison]:
+def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
     matches = [each for each in matches if len(each.at_second)]
     tests = [
         mcnemar(zip(*(column.tolist() for column in each.success), strict=True)) for each in matches
@@ -105,14 +148,12 @@ def _compared(matches: Sequence[_Match], confidence: float, *, protected: bool) 
     corrected = holm([test.p_value for test in tests])
     found = []
     for each, test, p in zip(matches, tests, corrected, strict=True):
-        golden, first, second = (
-            group.successes("flight_time_s").tolist()
-            for group in (each.golden, each.first, each.second)
-        )
+        over_own, over_mean = each.worst()
         found.append(
             Comparison(
                 first=each.first.labels,
                 second=each.second.labels,
+                name=each.second.name,
                 success=test,
                 corrected_p=p,
                 differences={
@@ -121,9 +162,8 @@ def _compared(matches: Sequence[_Match], confidence: float, *, protected: bool) 
                     )
                     for name in METRICS
                 },
-                worst=worst_case(golden, first, second)
-                if protected
-                else worst_case(golden, second),
+                over_own=over_own,
+                over_mean=over_mean,
             )
         )
     return found

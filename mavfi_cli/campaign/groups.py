@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import canonical
+from mavfi_cli.campaign.missions import canonical, label_text
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.core.errors import UnknownName
@@ -61,6 +61,7 @@ class Group:
 
     Attributes:
         labels: what they have in common.
+        lacked: labels by which missions are gathered and that these have not.
         planned, errors: on the list; of them such that could not begin.
         outcome, injected: (n,) how each ended, and the fate of its fault.
         watched: whether a detector watches all of them.
@@ -71,6 +72,7 @@ class Group:
     """
 
     labels: Mapping[str, Any]
+    lacked: Sequence[str]
     planned: int
     errors: int
     watched: bool
@@ -80,6 +82,14 @@ class Group:
     pair: Words
     strike: IntArray
     metrics: Mapping[str, FloatArray]
+
+    @property
+    def name(self) -> str:
+        """What they are in one phrase: their labels, and what they lack of what was asked for."""
+        if not self.lacked or "setting" in self.labels:  # its name tells it apart
+            return label_text(self.labels)
+        less = "golden" if len(self.number) and self.golden else f"no {', '.join(self.lacked)}"
+        return f"{label_text(self.labels)} {less}" if self.labels else less
 
     @cached_property
     def succeeded(self) -> BoolArray:
@@ -180,6 +190,7 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
     return [
         Group(
             labels=kept[those[0]],
+            lacked=[name for name in by if name not in kept[those[0]]],
             planned=sum(planned[cell] for cell in those),
             errors=sum(errors.get(cell, 0) for cell in those),
             watched=all(labels[cell].get("detector") not in (None, "none") for cell in those),

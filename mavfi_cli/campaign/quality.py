@@ -10,7 +10,6 @@ import numpy as np
 
 from mavfi_cli.campaign.comparison import RESAMPLES, Comparison, against_golden
 from mavfi_cli.campaign.groups import METRICS, Group
-from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 
 _TITLES = {
@@ -26,6 +25,7 @@ class Quality:
     """One metric of one setting, over its successful missions.
 
     Attributes:
+        name: of the setting in one phrase.
         mean: with its bootstrap interval.
         least, median, most: of the flights; not a number where there are none.
         difference: to the golden flights of the same missions, with its bootstrap interval; None
@@ -33,6 +33,7 @@ class Quality:
     """
 
     labels: Mapping[str, Any]
+    name: str
     metric: str
     mean: Interval
     least: float
@@ -47,9 +48,9 @@ class Quality:
 
 def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[Quality]:
     """Every metric of every setting, metric by metric."""
-    beside = {label_text(each.second): each for each in against_golden(groups, confidence)}
+    beside = {each.name: each for each in against_golden(groups, confidence)}
     return [
-        _quality(group, metric, beside.get(label_text(group.labels)), confidence)
+        _quality(group, metric, beside.get(group.name), confidence)
         for metric in METRICS
         for group in groups
     ]
@@ -61,6 +62,7 @@ def _quality(group: Group, metric: str, compared: Comparison | None, confidence:
     least, median, most = quantiles.tolist()
     return Quality(
         labels=group.labels,
+        name=group.name,
         metric=metric,
         mean=interval(values, confidence=confidence, resamples=RESAMPLES),
         least=least,
@@ -72,7 +74,7 @@ def _quality(group: Group, metric: str, compared: Comparison | None, confidence:
 
 def lines(found: Sequence[Quality], confidence: float = 0.95) -> list[str]:
     """A table for each metric."""
-    width = max((len(label_text(each.labels)) for each in found), default=0)
+    width = max((len(each.name) for each in found), default=0)
     width = max(width, *(len(title) for title, _ in _TITLES.values()))
     sure = f"{100 * confidence:g} % interval"
     told = []
@@ -89,7 +91,7 @@ def _line(each: Quality, width: int, scale: float) -> str:
     cells += [_number(value, scale) for value in (each.least, each.median, each.most)]
     if difference is not None:
         cells += [f"{_number(difference.value, scale, '+'):>9}", _ends(difference, scale, "+")]
-    return "  ".join([f"{label_text(each.labels):<{width}}", *cells])
+    return "  ".join([f"{each.name:<{width}}", *cells])
 
 
 def _number(value: float, scale: float, sign: str = "") -> str:

@@ -10,9 +10,9 @@ from typing import Any
 from mavfi_cli.campaign.comparison import RESAMPLES, Comparison, against_golden, protection
 from mavfi_cli.campaign.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate
+from mavfi_cli.campaign.statistics.worst_case import WorstCase
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.fi.isolated.outcome import Share
 
@@ -22,6 +22,7 @@ class Cell:
     """One setting.
 
     Attributes:
+        name: its labels in one phrase.
         planned: missions on the list.
         errors: that could not begin.
         outcomes: how the flown ones ended.
@@ -34,6 +35,7 @@ class Cell:
     """
 
     labels: Mapping[str, Any]
+    name: str
     planned: int
     errors: int
     outcomes: Mapping[str, int]
@@ -94,6 +96,7 @@ def _cell(group: Group, confidence: float) -> Cell:
 
     return Cell(
         labels=group.labels,
+        name=group.name,
         planned=group.planned,
         errors=group.errors,
         outcomes=group.outcome.counts(),
@@ -107,11 +110,12 @@ def _cell(group: Group, confidence: float) -> Cell:
 
 def table(summary: Summary) -> list[str]:
     """The settings and the comparisons as lines of text."""
-    width = max(len("setting"), *(len(label_text(cell.labels)) for cell in summary.cells))
+    width = max(len("setting"), *(len(cell.name) for cell in summary.cells))
     interval_name = f"{100 * summary.confidence:g} % interval"
     lines = [
         f"{'setting':<{width}}  {'over':>11}  {'success':>9}  {interval_name:>16}  {'of all':>7}  "
-        f"{'time':>8}  {'distance':>8}  {'energy':>8}  {'replans':>7}  inactive"
+        f"{'mean time':>9}  {'mean distance':>13}  {'mean energy':>11}  {'mean replans':>12}  "
+        "inactive"
     ]
     lines += [_cell_line(cell, width) for cell in summary.cells]
     for title, comparisons in (
@@ -135,9 +139,9 @@ def _cell_line(cell: Cell, width: int) -> str:
              for name, count in cell.injected.items() if name in INACTIVE]  # fmt: skip
     told += [f"could not begin {cell.errors}"] if cell.errors else []
     return (
-        f"{label_text(cell.labels):<{width}}  {f'{over}/{cell.planned}':>11}  {success:>9}  "
-        f"{ends:>16}  {every:>7}  {_number(time, 's'):>8}  {_number(distance, 'm'):>8}  "
-        f"{_number(energy / 1e3, 'kJ'):>8}  {_number(replans, ''):>7}  {cell.inactive.total:>8}"
+        f"{cell.name:<{width}}  {f'{over}/{cell.planned}':>11}  {success:>9}  "
+        f"{ends:>16}  {every:>7}  {_number(time, 's'):>9}  {_number(distance, 'm'):>13}  "
+        f"{_number(energy / 1e3, 'kJ'):>11}  {_number(replans, ''):>12}  {cell.inactive.total:>8}"
         + (f"  ({', '.join(told)})" if told else "")
     )
 
@@ -147,18 +151,25 @@ def _number(value: float, unit: str) -> str:
 
 
 def _comparison_line(each: Comparison) -> str:
-    test, time, worst = each.success, each.differences["flight_time_s"], each.worst
+    test, time = each.success, each.differences["flight_time_s"]
     parts = [
-        f"  {label_text(each.second)}: {test.pairs} pairs",
+        f"  {each.name}: {test.pairs} pairs",
         f"success {100 * test.difference:+.1f} points",
         f"p = {each.corrected_p:.3g}",
     ]
     if not math.isnan(time.low):
         parts.append(f"time {time.value:+.2f} s ({time.low:+.2f} to {time.high:+.2f})")
-    if not math.isnan(worst.increase):
-        parts.append(f"worst {100 * worst.increase:+.1f} %")
-    if not math.isnan(worst.recovered_share):
+    if not math.isnan(each.over_own.increase):
+        parts.append(f"worst {100 * each.over_own.increase:+.1f} % over own golden")
+    if not math.isnan(each.over_own.recovered_share):
+        parts.append(_recovered(each.over_own))
+    if not math.isnan(each.over_mean.recovered_share):
         parts.append(
-            f"recovered {100 * worst.recovered:.1f} points, {100 * worst.recovered_share:.1f} %"
+            f"worst {100 * each.over_mean.increase:+.1f} % over mean golden, "
+            f"{_recovered(each.over_mean)}"
         )
     return ", ".join(parts)
+
+
+def _recovered(worst: WorstCase) -> str:
+    return f"recovered {100 * worst.recovered:.1f} points, {100 * worst.recovered_share:.1f} %"

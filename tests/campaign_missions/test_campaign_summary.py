@@ -75,8 +75,8 @@ def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
     assert faulty.differences["flight_time_s"].value == pytest.approx(10.0 + 1 / 7)
     assert faulty.differences["flight_time_s"].count == 7
     assert faulty.differences["replans"].value == 0.0
-    assert faulty.worst.increase == pytest.approx(11.0 / 20.0)
-    assert math.isnan(faulty.worst.recovered)
+    assert faulty.over_own.increase == pytest.approx(11.0 / 20.0)
+    assert math.isnan(faulty.over_own.recovered)
     assert saved.second == SAVED
 
 
@@ -86,9 +86,60 @@ def test_protection_is_held_against_the_same_faults_without_it(book):
     assert (saved.first, saved.second) == (FI, SAVED)
     assert (saved.success.only_second, saved.success.neither) == (2, 1)
     assert saved.differences["flight_time_s"].value == pytest.approx(-8.0)
-    assert saved.worst.golden == 20.0
-    assert saved.worst.recovered == pytest.approx((31.0 - 23.0) / 20.0)
-    assert saved.worst.recovered_share == pytest.approx(8.0 / 11.0)
+    for worst in (saved.over_own, saved.over_mean):
+        assert worst.recovered == pytest.approx((31.0 - 23.0) / 20.0)
+        assert worst.recovered_share == pytest.approx(8.0 / 11.0)
+    assert saved.over_mean.golden == 20.0
+
+
+def test_the_worst_case_is_no_missions_own_length(book):
+    """Missions of 10 and 30 s, and one that only the golden setting has flown so far."""
+    for seed, time_s in enumerate((10.0, 30.0)):
+        book.add({"setting": "golden"}, seed, time_s, injected=GOLDEN)
+        book.add(FI, seed, time_s)
+    book.add({"setting": "golden"}, 2, 100.0, injected=GOLDEN)
+    (faulty,) = against_golden(groups(book.ledger))
+    assert faulty.over_own.increase == 0.0
+    assert faulty.over_mean.golden == 20.0
+    assert "worst +0.0 % over own golden" in table(summarise(book.ledger))[-1]
+
+
+def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
+    """The short mission's fault costs most; the long mission is the longest flight throughout."""
+    for seed, (golden_s, faulty_s, saved_s) in enumerate([(10.0, 20.0, 12.0), (30.0, 33.0, 30.0)]):
+        book.add({"setting": "golden"}, seed, golden_s, injected=GOLDEN)
+        book.add(FI, seed, faulty_s)
+        book.add(SAVED, seed, saved_s)
+    book.add({"setting": "golden"}, 2, 20.0, injected=GOLDEN, outcome="timeout")
+    book.add(FI, 2, 99.0)  # without a golden flight to be held against
+    book.add(SAVED, 2, 98.0)
+    book.add({"setting": "golden"}, 3, 20.0, injected=GOLDEN)
+    book.add(FI, 3, 20.0, outcome="collision")  # a flight of its protection is still a pair
+    book.add(SAVED, 3, 26.0)
+    (saved,) = protection(groups(book.ledger))
+    assert saved.over_own.increase == pytest.approx(1.0)
+    assert saved.over_own.protected_worst == pytest.approx(1.3)
+    assert saved.over_own.recovered_share == pytest.approx(0.7)
+    assert (saved.over_mean.golden, saved.over_mean.golden_worst) == (20.0, 30.0)
+    assert (saved.over_mean.faulty_worst, saved.over_mean.protected_worst) == (33.0, 30.0)
+    assert saved.over_mean.recovered_share == pytest.approx(3.0 / 13.0)
+    line = table(summarise(book.ledger))[-1]
+    assert "worst +100.0 % over own golden, recovered 70.0 points, 70.0 %" in line
+    assert "worst +65.0 % over mean golden, recovered 15.0 points, 23.1 %" in line
+
+
+def test_a_group_without_what_it_is_gathered_by_is_named(book):
+    fill(book)
+    names = [cell.name for cell in summarise(book.ledger, ["stage"]).cells]
+    assert names == ["golden", "stage=control"]
+    assert summarise(book.ledger, ["detector"]).cells[0].name == "no detector"
+    assert summarise(book.ledger, ["setting", "stage"]).cells[0].name == "setting=golden"
+    assert "golden" in table(summarise(book.ledger, ["stage"]))[1]
+
+
+def test_means_are_called_means(book):
+    fill(book)
+    assert "mean time  mean distance  mean energy  mean replans" in table(summarise(book.ledger))[0]
 
 
 def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothing(book):

@@ -17,7 +17,7 @@ def group(missions, fates=FATES):
     counted, other = fates
     count = len(missions)
     return Group(
-        labels={}, planned=count, errors=0, watched=False, number=np.arange(count),
+        labels={}, lacked=(), planned=count, errors=0, watched=False, number=np.arange(count),
         outcome=Words(["success"], np.zeros(count, dtype=np.int64)),
         injected=Words(
             [counted, other], np.array([not counts for _, counts in missions], dtype=np.int64)

@@ -159,6 +159,9 @@ def test_no_worst_case_without_flights():
     assert math.isnan(worst_case([], [1.0], [1.0]).increase)
     assert math.isnan(worst_case([1.0], [2.0]).recovered)
     assert math.isnan(worst_case([2.0], [1.0], [1.0]).recovered_share)
+    longest_world = worst_case([10.0, 30.0], [10.0, 30.0], [10.0, 29.0])
+    assert longest_world.increase == 0.5
+    assert math.isnan(longest_world.recovered_share)
 
 
 def test_failure_given_corruption():

@@ -18,7 +18,7 @@ import numpy as np
 from mavfi_cli.campaign.compare.flights import Flown
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
-from mavfi_cli.campaign.statistics.worst_case import worst_case
+from mavfi_cli.campaign.statistics.worst_case import worst_case, worst_over_own
 from mavfi_cli.core.types import FloatArray
 
 LATE = 0.95  # the quantile beside the worst case, which has no interval
@@ -97,8 +97,8 @@ def cost_row(platform: str, setting: str, found: Struck, faults: Struck) -> dict
         "over_own": {
             "p95": asdict(_over_missions(len(table), lambda drawn: _late(table[drawn, :, 1]))),
             "largest": worst,
-            "recovered_share": (bare - worst) / (bare - 1.0)
-            if protected and bare > 1.0
+            "recovered_share": worst_over_own([bare], [worst]).recovered_share
+            if protected
             else math.nan,
         },
         "worst_flight": None
@@ -160,7 +160,6 @@ def worst_row(
     protected = setting not in (GOLDEN, NONE)
     found = worst_case(_times(golden), _times(flights))
     case = worst_case(_times(golden), _times(faulty), _times(flights) if protected else ())
-    beyond = case.faulty_worst > case.golden_worst
     return {
         "platform": platform,
         "setting": setting,
@@ -168,7 +167,7 @@ def worst_row(
         "golden_mean_s": found.golden,
         "worst_s": found.faulty_worst,
         "over_mean_ratio": 1.0 + found.increase,
-        "over_mean_recovered_share": case.recovered_share if beyond else math.nan,
+        "over_mean_recovered_share": case.recovered_share,
     }
 
 

@@ -27,7 +27,7 @@ from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval, median
 from mavfi_cli.campaign.statistics.paired import McNemar, mcnemar
 from mavfi_cli.campaign.statistics.proportions import rate
-from mavfi_cli.campaign.statistics.worst_case import worst_case
+from mavfi_cli.campaign.statistics.worst_case import worst_over_own
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.fi.isolated.outcome import Share
 from mavfi_cli.link.session import SessionSettings
@@ -299,7 +299,7 @@ def _worst(pairs: Sequence[FaultPair]) -> WorstFlight:
         worst = [np.maximum(each[rows].max(axis=-1), 0.0) for each in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])
 
-    worst = worst_case([1.0], (1.0 + faulty).tolist(), (1.0 + protected).tolist())
+    worst = worst_over_own((1.0 + faulty).tolist(), (1.0 + protected).tolist())
     return WorstFlight(
         faulty=worst.increase,
         protected=worst.protected_worst - 1.0,

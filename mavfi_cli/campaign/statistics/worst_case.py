@@ -21,7 +21,8 @@ class WorstCase:
         golden_worst, faulty_worst, protected_worst: the largest values.
         increase: of the faulty worst case over the reference, 0.738 in the example.
         recovered: of it by protection, in the same unit, 0.642.
-        recovered_share: the part of the increase, 0.87; not a number where nothing increased.
+        recovered_share: the part of the increase, 0.87; not a number where the faults' worst is
+            not beyond the worst golden one.
     """
 
     golden: float
@@ -52,6 +53,7 @@ def worst_case(
     worst = max(protected) if protected else math.nan
     increase = max(faulty) / reference - 1.0
     recovered = (max(faulty) - worst) / reference
+    beyond = max(faulty) > max(golden)
     return WorstCase(
         golden=reference,
         golden_worst=max(golden),
@@ -59,5 +61,15 @@ def worst_case(
         protected_worst=worst,
         increase=increase,
         recovered=recovered,
-        recovered_share=recovered / increase if increase > 0.0 else math.nan,
+        recovered_share=recovered / increase if beyond else math.nan,
     )
+
+
+def worst_over_own(faulty: Sequence[float], protected: Sequence[float] = ()) -> WorstCase:
+    """The same of flights over their own golden flights: the missions' lengths have no part in it.
+
+    Args:
+        faulty, protected: of each successful flight, its value over that of the successful golden
+            flight of the same mission.
+    """
+    return worst_case([1.0], faulty, protected)
