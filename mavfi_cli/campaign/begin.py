@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -45,14 +46,31 @@ def chosen(what: str, out: Path | None, scale: float | None) -> tuple[Spec, Path
         ConfigError: the specification, or the scale, cannot be used.
         UnknownName: neither of them exists.
     """
-    folder = Path(what)
-    if what not in presets() and (folder / LEDGER).is_file():
-        if scale is not None or out is not None:
-            raise ConfigError("goes without --scale and --out: it has both", path=folder)
+    folder = folder_of(what)
+    if folder == Path(what):
         with Ledger(folder) as ledger:
+            if scale is not None or out is not None:
+                raise ConfigError("goes without --scale and --out: it has both", path=folder)
             return _stored_spec(ledger), folder
     spec = load_spec(what)
-    return spec if scale is None else spec.scaled(scale), out or DEFAULT / spec.name
+    return spec if scale is None else spec.scaled(scale), out or folder
+
+
+def folder_of(what: str) -> Path:
+    """The folder that is named, or into which what is named is flown.
+
+    Args:
+        what: a preset, a TOML file, or the folder of a campaign. A preset's name is the preset,
+            also where a folder has the same; ./NAME is the folder.
+
+    Raises:
+        ConfigError: a file that is no specification.
+        UnknownName: a single word that is neither a preset nor a folder.
+    """
+    folder = Path(what)
+    if what not in presets() and (folder.is_dir() or (os.sep in what and folder.suffix != ".toml")):
+        return folder
+    return DEFAULT / load_spec(what).name
 
 
 def _stored_spec(ledger: Ledger) -> Spec:
@@ -84,20 +102,25 @@ def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool 
         raise ConfigError("no campaign was begun there", path=folder)
     text, missions = to_toml(spec), None
     if not (folder / LEDGER).is_file():
-        missions = _flyable(spec)  # before there is a folder
+        missions = flyable(spec)  # before there is a folder
     with contextlib.ExitStack() as undo:
         ledger = undo.enter_context(Ledger(folder, writing=True))
         if missions is None and ledger.meta("spec") == text:  # the list is what it would expand to
             require_versions(ledger)
         else:
-            store_plan(ledger, missions or _flyable(spec), append=append, remedy=_REMEDY)
+            store_plan(ledger, missions or flyable(spec), append=append, remedy=_REMEDY)
             ledger.set_meta({"spec": text, "name": spec.name})
             write_text(ledger.folder / SPEC, text)
         undo.pop_all()
     return ledger
 
 
-def _flyable(spec: Spec) -> list[PlannedMission]:
+def flyable(spec: Spec) -> list[PlannedMission]:
+    """The missions of a campaign, each of a kind that can be flown.
+
+    Raises:
+        MavfiError: a world, vehicle, planner, target ... that no mission could be flown with.
+    """
     missions = spec.missions()
     _check(missions)
     return missions

@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any
 
 from mavfi_cli.core.config import structure
-from mavfi_cli.core.errors import ConfigError, FaultSpecError
+from mavfi_cli.core.errors import ConfigError, FaultSpecError, nearest
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
@@ -85,19 +85,28 @@ class Point:
         asked = {name: value for name, value in self.values.items() if name not in elsewhere}
         level_name = asked.pop("level", Level.SOURCE.value)
         targets = [name for name in _ALIASES if name in asked]
+        level = _member(level_name)
         if not targets:
+            for name in asked:
+                if name not in _FAULT[level]:
+                    raise _no_factor(name, level)
             if asked or "level" in self.values:
                 named = sorted({*asked, *({"level"} & set(self.values))})
                 raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
             return None
         if len(targets) > 1:
             raise ConfigError("a fault strikes a stage or a site, not both")
-        level = _member(level_name)
         values = {_ALIASES.get(name, name): value for name, value in asked.items()}
         for name in values:
             if name not in _FAULT[level]:
-                raise ConfigError(f"no factor of faults at {level.value} level", key=name)
+                raise _no_factor(name, level)
         return level, {**values, "seed": seed}
+
+
+def _no_factor(name: str, level: Level) -> ConfigError:
+    match = nearest(name, (*_ALIASES, *_FAULT[level]))
+    hint = f"; did you mean {match!r}?" if match else ""
+    return ConfigError(f"no factor of faults at {level.value} level{hint}", key=name)
 
 
 def _member(name: Any) -> Level:

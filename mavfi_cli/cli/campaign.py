@@ -22,7 +22,8 @@ def campaign() -> None:
     """Thousands of missions: planned, paired, resumable, counted.
 
     WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16), a campaign.toml, or the
-    folder of a campaign that was begun.
+    folder of a campaign that was begun. Presets and files fly into campaigns/NAME, and that is
+    where status, draw and export look for them.
     """
 
 
@@ -84,7 +85,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 
 
 @campaign.command()
-@click.argument("folder", type=_FOLDER)
+@click.argument("what", metavar="WHAT")
 @click.option("--by", metavar="LABEL,LABEL", help="Gather settings by these labels  [all].")
 @click.option("--confidence", default=0.95, show_default=True,
               type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True))  # fmt: skip
@@ -102,31 +103,33 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
               help="With --failures: bit flips an hour that reach what is attacked, for failures "
                    "a flight hour.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-def status(folder: Path, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
+def status(what: str, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
     """What a campaign has found so far; also while it runs."""
+    from mavfi_cli.campaign.begin import folder_of
     from mavfi_cli.campaign.ledger import Ledger
 
     if not options["failures"] and (options["kernels"] or options["upsets"] is not None):
         raise click.UsageError("--kernels and --upsets go with --failures")
-    with Ledger(folder) as ledger:
+    with Ledger(folder_of(what)) as ledger:
         names = [name for name in (by or "").split(",") if name]
         _show(ledger, names, confidence, as_json=as_json, more=options)
 
 
 @campaign.command()
-@click.argument("folder", type=_FOLDER)
+@click.argument("what", metavar="WHAT")
 @click.argument("path", type=click.Path(path_type=Path, dir_okay=False))
-def export(folder: Path, path: Path) -> None:
+def export(what: str, path: Path) -> None:
     """Write one row a mission to PATH, a .parquet or .csv file."""
+    from mavfi_cli.campaign.begin import folder_of
     from mavfi_cli.campaign.export import export as write
     from mavfi_cli.campaign.ledger import Ledger
 
-    with Ledger(folder) as ledger:
+    with Ledger(folder_of(what)) as ledger:
         click.echo(f"{write(ledger, path)} missions in {path}")
 
 
 @campaign.command()
-@click.argument("folder", type=_FOLDER)
+@click.argument("what", metavar="WHAT")
 @click.option("--pair", "number", type=click.IntRange(min=0), metavar="NUMBER",
               help="The flights that share world, start and noise with this mission; its number is "
                    "the first part of its run folder's name  [the pair in which a fault costs most "
@@ -134,20 +137,21 @@ def export(folder: Path, path: Path) -> None:
 @click.option("--output", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
               required=True, help="The picture, an SVG.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
-def draw(folder: Path, number: int | None, output: Path, as_json: bool) -> None:
+def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     """Draw golden, faulty and protected flights of one pair over each other, from above.
 
     From the run folders that were kept, all settings of the pair; a panel for each fault.
     """
     from dataclasses import asdict
 
+    from mavfi_cli.campaign.begin import folder_of
     from mavfi_cli.campaign.ledger import Ledger
     from mavfi_cli.campaign.trajectories import pair
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report.trajectories import Panel, lines, write_trajectories
 
-    with Ledger(folder) as ledger:
+    with Ledger(folder_of(what)) as ledger:
         chosen = pair(ledger, number)
     panels = [
         Panel(
@@ -181,7 +185,10 @@ def draw(folder: Path, number: int | None, output: Path, as_json: bool) -> None:
 @click.option("--confidence", default=0.95, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -> None:
-    """What a campaign would fly, without flying; or how many missions a question needs."""
+    """What a campaign would fly, without flying; or how many missions a question needs.
+
+    What `run` would refuse is refused here too.
+    """
     from mavfi_cli.campaign.statistics.proportions import (
         missions_for_margin,
         pairs_for_difference,
@@ -208,12 +215,12 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
 def _planned(what: str, scale: float | None) -> dict[str, Any]:
     from collections import Counter
 
-    from mavfi_cli.campaign.begin import chosen
+    from mavfi_cli.campaign.begin import chosen, flyable
     from mavfi_cli.campaign.missions import label_text
 
     spec: Spec
     spec, _ = chosen(what, None, scale)
-    missions = spec.missions()
+    missions = flyable(spec)
     cells = Counter(label_text(mission.labels) for mission in missions)
     return {
         "name": spec.name,
@@ -235,7 +242,8 @@ def _plan_lines(told: dict[str, Any], options: dict[str, Any]) -> list[str]:
     if "pairs" in told:
         lines.append(
             f"{told['pairs']} pairs: a difference of {options['difference']:g} found with "
-            f"{100 * options['power']:g} % power, {sure}"
+            f"{100 * options['power']:g} % power, {sure}, where {100 * options['discordant']:g} % "
+            f"of the pairs end differently (--discordant {options['discordant']:g})"
         )
     if "campaign" in told:
         found = told["campaign"]

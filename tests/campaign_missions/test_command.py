@@ -77,6 +77,21 @@ def test_a_complete_campaign_flies_nothing_again(flown, mavfi):
 
 
 @pytest.mark.slow
+def test_a_campaign_is_read_by_the_name_that_ran_it(flown, mavfi, tmp_path):
+    folder, _ = flown
+    home = folder.parent.parent
+    status = mavfi("campaign", "status", "short.toml", cwd=home)
+    assert status.stdout == mavfi("campaign", "status", folder).stdout != ""
+    (tmp_path / "campaigns").mkdir()
+    (tmp_path / "campaigns" / "fig8").symlink_to(folder)
+    for arguments in (("status", "fig8"), ("export", "fig8", "table.csv"),
+                      ("draw", "fig8", "--output", "pair.svg")):  # fmt: skip
+        done = mavfi("campaign", *arguments, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["table.csv", "table.parquet"])
 def test_export_has_a_row_a_mission(flown, mavfi, tmp_path, name):
     folder, _ = flown
@@ -166,7 +181,9 @@ def refused(mavfi, tmp_path):
 )
 def test_a_bad_specification_gets_one_line_and_flies_nothing(refused, tmp_path, old, new, problem):
     assert old in SPEC
-    assert problem in refused("run", written(tmp_path, SPEC.replace(old, new)))
+    spec = written(tmp_path, SPEC.replace(old, new))
+    assert problem in refused("run", spec)
+    assert problem in refused("plan", spec)
 
 
 def test_a_refused_setting_is_named_among_many(refused, tmp_path):
@@ -179,7 +196,11 @@ def test_a_refused_setting_is_named_among_many(refused, tmp_path):
 
 
 def test_what_does_not_exist_gets_one_line(refused, tmp_path):
-    assert "did you mean 'table3'?" in refused("run", "table33")
+    for command_line in (("run",), ("status",), ("draw", "--output", "pair.svg"), ("export", "-")):
+        name, *rest = command_line
+        assert "did you mean 'table3'?" in refused(name, "table33", *rest)
+    assert "campaigns/table3: no campaign there" in refused("status", "table3")
+    assert "no campaign there" in refused("run", "./table3")
     assert "No such file" in refused("run", "none.toml")
     assert "no campaign there" in refused("status", tmp_path / "nowhere")
     assert "no campaign there" in refused("draw", tmp_path / "nowhere", "--output", "pair.svg")
@@ -215,7 +236,8 @@ def test_plan_answers_how_many_missions_a_question_takes(mavfi):
     done = mavfi("campaign", "plan", "--margin", "0.05", "--difference", "0.1")
     assert done.stdout.splitlines() == [
         "381 missions a setting: Wilson interval of +-0.05 at a rate of 0.5, 95 % confidence",
-        "155 pairs: a difference of 0.1 found with 80 % power, 95 % confidence",
+        "155 pairs: a difference of 0.1 found with 80 % power, 95 % confidence, where 20 % of the "
+        "pairs end differently (--discordant 0.2)",
     ]
 
 

@@ -183,6 +183,11 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
         ("level = 'source'", r"level: a fault needs a stage or a site"),
         ("stage = 'control'\nsite = 'command_yaw'", r"a stage or a site, not both"),
         ("stage = 'control'\nlevel = 'sauce'", r"level: expected source or instruction"),
+        (
+            "sites = ['waypoint_x']",
+            r"sites: no factor of faults at source level; did you mean 'site'",
+        ),
+        ("level = 'instruction'\nsites = ['flags']", r"sites: a fault needs a stage or a site"),
         ("stage = 'control'\nsampling = 'cpu-time'", r"sampling: no factor of faults at source"),
         ("stage = 'control'\nlevel = 'instruction'\nat = 'random'", r"at: no factor of faults at"),
         ("stage = 'control'\nbits = ['one']", r"bits: expected int"),
