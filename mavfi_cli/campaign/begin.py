@@ -22,6 +22,7 @@ from mavfi_cli.campaign.missions import (
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.run import require_versions, store_plan
 from mavfi_cli.campaign.spec import Spec, load_spec, parse_spec, presets
+from mavfi_cli.campaign.spec_difference import differences
 from mavfi_cli.campaign.spec_text import to_toml
 from mavfi_cli.campaign.stopping import Gate
 from mavfi_cli.core.errors import ConfigError
@@ -29,7 +30,7 @@ from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.config import MissionConfig
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
-_REMEDY = "--append adds what is new, another folder starts anew"
+_APPEND = "--append adds what is new"
 # Missions that differ in these only are checked once.
 _ALIKE = ("seed", "time_limit_s", "isolate")
 
@@ -80,6 +81,11 @@ def _stored_spec(ledger: Ledger) -> Spec:
     return parse_spec(text, ledger.folder / SPEC)
 
 
+def _differing(ledger: Ledger, spec: Spec) -> list[str]:
+    """In what a specification differs from the stored one; empty where a program made the list."""
+    return [] if ledger.meta("spec") is None else differences(_stored_spec(ledger), spec)
+
+
 def stopped(ledger: Ledger) -> list[str]:
     """The settings that the campaign's own rule has ended before all of their missions."""
     text = ledger.meta("spec")
@@ -108,7 +114,13 @@ def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool 
         if missions is None and ledger.meta("spec") == text:  # the list is what it would expand to
             require_versions(ledger)
         else:
-            store_plan(ledger, missions or flyable(spec), append=append, remedy=_REMEDY)
+            store_plan(
+                ledger,
+                missions or flyable(spec),
+                append=append,
+                differing=_differing(ledger, spec),
+                can_append=_APPEND,
+            )
             ledger.set_meta({"spec": text, "name": spec.name})
             write_text(ledger.folder / SPEC, text)
         undo.pop_all()

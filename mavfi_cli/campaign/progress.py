@@ -15,7 +15,8 @@ class Progress:
         total: missions of the list.
         before: of them over before this run began.
         over: over now, those of before included.
-        running: in flight.
+        running: in flight, or waiting to branch off a flight.
+        flights: that these make; fewer where missions fly as one up to their faults.
         again: attempts that something outside ended, so that they were begun again.
         elapsed_s: of this run, host time.
         inside_s: of it within missions, summed over the slots.
@@ -27,6 +28,7 @@ class Progress:
     before: int
     over: int
     running: int
+    flights: int
     again: int
     elapsed_s: float
     inside_s: float

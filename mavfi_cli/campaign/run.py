@@ -98,17 +98,19 @@ def store_plan(
     missions: Sequence[PlannedMission],
     *,
     append: bool = False,
-    remedy: str = "another folder starts anew",
+    differing: Sequence[str] = (),
+    can_append: str = "",
 ) -> None:
     """Write the list down before anything flies, or compare it with the one that is there.
 
     Args:
         append: missions that are not among the stored ones are added; those that are only there
             stay.
-        remedy: what to tell about another list.
+        differing: phrases that say in what another list differs; without, its first missions do.
+        can_append: how to have new missions added, told where no stored one is gone.
 
     Raises:
-        ConfigError: it is another list; says the first difference.
+        ConfigError: it is another list; says in what it differs.
     """
     require_versions(ledger)
     left = Counter(row[1:] for row in ledger.rows())
@@ -121,8 +123,16 @@ def store_plan(
         else:
             new.append(mission)
     if stored and not append and (new or left.total()):
-        found = _difference(stored, len(missions), new, +left)
-        raise ConfigError(f"{found}; {remedy}", path=ledger.folder)
+        found = [*differing] or _first_of(new, +left)
+        found.append(f"{stored} missions there, {len(missions)} here, of which {len(new)} are new")
+        if left.total():
+            found[-1] += f", and {left.total()} are gone"
+        elif can_append:
+            found.append(can_append)
+        remedy = "another folder starts anew"
+        raise ConfigError(
+            f"holds another campaign: {'; '.join([*found, remedy])}", path=ledger.folder
+        )
     ledger.plan(new)
 
 
@@ -130,17 +140,10 @@ def _row(mission: PlannedMission) -> tuple[str, str, str]:
     return canonical(dict(mission.labels)), mission.pair, canonical(changes_of(mission.config))
 
 
-def _difference(
-    stored: int, count: int, new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]
-) -> str:
-    parts = [f"holds another campaign: {stored} missions, now there are {count}"]
-    if new:
-        labels, _, changes = _row(new[0])
-        parts.append(f"{len(new)} are new, the first is {labels} {changes}")
-    if gone:
-        labels, _, changes = next(iter(gone))
-        parts.append(f"{gone.total()} are gone, the first is {labels} {changes}")
-    return "; ".join(parts)
+def _first_of(new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]) -> list[str]:
+    """The first mission that is new, and the first that is gone."""
+    firsts = {"new": _row(new[0]) if new else None, "gone": next(iter(gone), None)}
+    return [f"the first {how} one is {row[0]} {row[2]}" for how, row in firsts.items() if row]
 
 
 def require_versions(ledger: Ledger) -> None:
@@ -206,6 +209,7 @@ class _Run:
             self._queue = Together(queue, self._jobs)
         self._again: list[Entry] = []
         self._flying: dict[int, Entry] = {}
+        self._flight_of: dict[int, int] = {}  # by its first mission, of those that are flying
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
         self._setting_of, self._outcomes = _settings(ledger)
@@ -276,6 +280,7 @@ class _Run:
                 raise RecordError(f"{out}: {error.strerror or error}") from None
             missions.append(Assignment(number=number, changes=changes, out=str(out)))
             self._flying[number] = entry
+            self._flight_of[number] = entries[0][0]
         slots.start(missions, self._options.limit_s)
 
     def _out(self, number: int) -> Path:
@@ -285,6 +290,7 @@ class _Run:
         """Settle one attempt that is over."""
         number = ended.number
         entry = self._flying.pop(number)
+        del self._flight_of[number]
         self._inside_s += ended.wall_s
         config = config_from(entry[2]).to_dict()
         out = self._out(number)
@@ -339,6 +345,7 @@ class _Run:
             before=self._before,
             over=self._over,
             running=len(self._flying),
+            flights=len(set(self._flight_of.values())),
             again=self._repeated,
             elapsed_s=time.monotonic() - self._begun,
             inside_s=self._inside_s,

@@ -39,6 +39,10 @@ FAULTS = [
 class Notes(Spectator):
     def __init__(self):
         self.lines = []
+        self.flying = []
+
+    def on_progress(self, progress):
+        self.flying.append((progress.running, progress.flights))
 
     def on_note(self, text):
         self.lines.append(text)
@@ -73,6 +77,8 @@ def both(missions, tmp_path_factory):
     notes = Notes()
     branched = fly(missions, folder / "branched", notes)
     assert notes.lines == []
+    assert max(notes.flying) > (1, 1)  # one slot: however many missions fly, they are one flight
+    assert {flights for running, flights in notes.flying if running} == {1}
     return branched, fly(missions, folder / "whole", branch=False)
 
 

@@ -144,9 +144,24 @@ def test_a_changed_specification_shows_the_difference(flown, mavfi, tmp_path):
     run = mavfi("campaign", "run", changed, "--out", folder)
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
-    assert "holds another campaign: 4 missions, now there are 4; 2 are new" in line
-    assert '"field":"exponent"' in line
-    assert "--append adds" in line
+    assert line == (
+        f"error: {folder}: holds another campaign: field mantissa there, exponent here; 4 missions "
+        "there, 4 here, of which 2 are new, and 2 are gone; another folder starts anew"
+    )
+
+
+@pytest.mark.slow
+def test_append_is_recommended_where_it_is_enough(flown, mavfi, tmp_path):
+    folder, _ = flown
+    more = written(tmp_path, SPEC.replace("repetitions = 2", "repetitions = 3"))
+    line = mavfi("campaign", "run", more, "--out", folder).stderr
+    assert "another campaign: repetitions 2 there, 3 here; 4 missions there, 6 here" in line
+    assert line.endswith("of which 2 are new; --append adds what is new; another folder starts "
+                         "anew\n")  # fmt: skip
+    fewer = written(tmp_path, SPEC.replace("repetitions = 2", "repetitions = 1"))
+    line = mavfi("campaign", "run", fewer, "--out", folder).stderr
+    assert "4 missions there, 2 here, of which 0 are new, and 2 are gone" in line
+    assert "--append" not in line
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 from flown_twice import flight
 
 from mavfi_cli.campaign.compare.fly import timeline_seed
-from mavfi_cli.campaign.compare.plan import ComparePlan, differences, titles
+from mavfi_cli.campaign.compare.plan import ComparePlan, titles
 from mavfi_cli.campaign.spec import load_spec
 from mavfi_cli.core.errors import ConfigError
 
@@ -75,17 +75,6 @@ def test_a_plan_that_makes_no_sense_is_refused(changes, told):
     with pytest.raises(ConfigError) as refused:
         ComparePlan(**changes)
     assert str(refused.value) == told
-
-
-def test_differences_name_what_was_chosen_otherwise():
-    stored = ComparePlan(world="dense", inject=("planning",), missions=10).spec()
-    asked = ComparePlan(world="sparse", inject=("control",), missions=10, seed=2).spec()
-    assert differences(stored, asked) == [
-        "world dense there, sparse here",
-        "stage planning there, control here",
-        "fault seed 1 there, 2 here",
-    ]
-    assert differences(stored, stored) == []
 
 
 def test_files_are_called_by_their_stems_unless_two_have_the_same():

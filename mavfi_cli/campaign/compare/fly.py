@@ -14,7 +14,7 @@ from typing import Any
 from mavfi_cli.campaign.begin import begin
 from mavfi_cli.campaign.compare.figures import figures
 from mavfi_cli.campaign.compare.flights import Flown, flights_of
-from mavfi_cli.campaign.compare.plan import GOLDEN, ComparePlan, differences, titles
+from mavfi_cli.campaign.compare.plan import GOLDEN, ComparePlan, titles
 from mavfi_cli.campaign.compare.timeline import timelines
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
@@ -22,6 +22,7 @@ from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
 from mavfi_cli.campaign.spec import Spec, parse_spec
+from mavfi_cli.campaign.spec_difference import differences
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.platform import load_platform
@@ -76,7 +77,8 @@ def _campaign(asked: Spec, folder: Path) -> tuple[Spec, bool]:
     stored = parse_spec(text, folder / LEDGER)
     ours = replace(asked, name=stored.name, about=stored.about, keep=stored.keep)
     grows = asked.repetitions > stored.repetitions
-    found = differences(stored, replace(ours, repetitions=stored.repetitions) if grows else ours)
+    alike = replace(ours, repetitions=stored.repetitions) if grows else ours
+    found = differences(stored, alike, repetitions="missions")
     if found:
         raise ConfigError(
             f"holds another comparison: {'; '.join(found)}; choose another --out", path=folder

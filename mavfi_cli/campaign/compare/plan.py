@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,34 +111,3 @@ def titles(platforms: Sequence[str]) -> dict[str, str]:
         name: stem if short.count(stem) == 1 else name
         for name, stem in zip(platforms, short, strict=True)
     }
-
-
-def differences(stored: Spec, asked: Spec) -> list[str]:
-    """In what two campaigns differ that decides which missions are flown, a phrase each."""
-    there, here = _choices(stored), _choices(asked)
-    return [
-        f"{key} {_told(there.get(key))} there, {_told(here.get(key))} here"
-        for key in dict.fromkeys((*there, *here))
-        if there.get(key) != here.get(key)
-    ]
-
-
-def _choices(spec: Spec) -> Mapping[str, Any]:
-    """Factors with all their values, and the numbers."""
-    found: dict[str, list[Any]] = {}
-    for axes in (spec.axes, *(setting.axes for setting in spec.settings)):
-        for name, values in axes.items():
-            known = found.setdefault(name, [])
-            known += [value for value in values if value not in known]
-    found |= {f"mission.{name}": [value] for name, value in spec.fixed.items()}
-    numbers = {
-        "missions": [spec.repetitions],
-        "first seed": [spec.first_seed],
-        "fault seed": [spec.seed],
-        "settings": [setting.name for setting in spec.settings],
-    }
-    return {**found, **numbers}
-
-
-def _told(values: Sequence[Any] | None) -> str:
-    return ", ".join(map(str, values)) if values else "none"
