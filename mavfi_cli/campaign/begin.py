@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.run import require_versions, store_plan
 from mavfi_cli.campaign.spec import Spec, load_spec, parse_spec, presets
 from mavfi_cli.campaign.spec_difference import differences
+from mavfi_cli.campaign.spec_set import replaced
 from mavfi_cli.campaign.spec_text import to_toml
 from mavfi_cli.campaign.stopping import Gate
 from mavfi_cli.core.errors import ConfigError
@@ -35,13 +36,16 @@ _APPEND = "--append adds what is new"
 _ALIKE = ("seed", "time_limit_s", "isolate")
 
 
-def chosen(what: str, out: Path | None, scale: float | None) -> tuple[Spec, Path]:
+def chosen(
+    what: str, out: Path | None, scale: float | None, changes: Sequence[str] = ()
+) -> tuple[Spec, Path]:
     """The campaign that is named, and its folder.
 
     Args:
         what: a preset, a TOML file, or the folder of a campaign that was begun.
         out: the folder; None: campaigns/NAME, or the one that is named.
         scale: of the repetitions; of a folder, only what it was begun with.
+        changes: factors to replace, as `spec_set.replaced`; the default folder's name has them.
 
     Raises:
         ConfigError: the specification, or the scale, cannot be used.
@@ -50,11 +54,11 @@ def chosen(what: str, out: Path | None, scale: float | None) -> tuple[Spec, Path
     folder = folder_of(what)
     if folder == Path(what):
         with Ledger(folder) as ledger:
-            if scale is not None or out is not None:
-                raise ConfigError("goes without --scale and --out: it has both", path=folder)
+            if scale is not None or out is not None or changes:
+                raise ConfigError("goes without --scale, --set and --out: it has all", path=folder)
             return _stored_spec(ledger), folder
-    spec = load_spec(what)
-    return spec if scale is None else spec.scaled(scale), out or folder
+    spec = replaced(load_spec(what), changes)
+    return spec if scale is None else spec.scaled(scale), out or DEFAULT / spec.name
 
 
 def folder_of(what: str) -> Path:

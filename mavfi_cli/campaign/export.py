@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mavfi_cli.campaign import struck
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import MissionResult
@@ -33,15 +35,16 @@ def export(ledger: Ledger, path: Path) -> int:
         RecordError: it cannot be written.
     """
     if path.suffix not in FORMATS:
-        raise ConfigError(f"expected a name that ends in {' or '.join(FORMATS)}", path=path)
+        raise ConfigError(
+            f"expected a name that ends in {' or '.join(FORMATS)}, or - for CSV on stdout",
+            path=path,
+        )
     found = table(ledger)
 
     def write(file: Any) -> None:
         """Write the table in the format of the name."""
         if path.suffix == ".csv":
-            from pyarrow import csv
-
-            csv.write_csv(found, file)
+            file.write(_csv(found))
         else:
             import pyarrow.parquet as pq
 
@@ -49,6 +52,19 @@ def export(ledger: Ledger, path: Path) -> int:
 
     write_atomically(path, write)
     return int(found.num_rows)
+
+
+def export_csv(ledger: Ledger) -> bytes:
+    """The table as CSV."""
+    return _csv(table(ledger))
+
+
+def _csv(found: pa.Table) -> bytes:
+    from pyarrow import csv
+
+    text = io.BytesIO()
+    csv.write_csv(found, text)
+    return text.getvalue()
 
 
 def table(ledger: Ledger) -> pa.Table:
@@ -75,9 +91,9 @@ def _column(values: list[Any]) -> pa.Array:
 def _row_names(labels: list[str]) -> list[str]:
     return [
         "number", "pair", *(f"label_{name}" for name in labels), *_CONFIG, "level",
-        *(f"fault_{name}" for name in _FAULT), "detector", "protect", "state", "outcome",
-        "reason", "injected", *_QUALITY, *_PILOT, "simulated_s", "wall_s", "attempts", "path",
-        "changes",
+        *(f"fault_{name}" for name in _FAULT), *struck.COLUMNS, "detector", "protect", "state",
+        "outcome", "reason", "injected", *_QUALITY, *_PILOT, "simulated_s", "wall_s", "attempts",
+        "path", "changes",
     ]  # fmt: skip
 
 
@@ -98,6 +114,7 @@ def _row(result: MissionResult, labels: list[str]) -> dict[str, Any]:
         **{name: getattr(config, name) for name in _CONFIG},
         "level": level,
         **{f"fault_{name}": None if asked is None else getattr(asked, name) for name in _FAULT},
+        **struck.struck(record),
         "detector": None if detector is None else detector.name,
         "protect": None if detector is None else "+".join(detector.protect),
         "state": result.state.value,

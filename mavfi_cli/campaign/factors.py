@@ -31,7 +31,8 @@ _RECORDS = {Level.SOURCE: FaultConfig, Level.INSTRUCTION: InstructionConfig}
 _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
 _NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
-_MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NESTED | _NEVER)
+# What may differ without any fault.
+MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NESTED | _NEVER)
 _DETECTOR = {"detector": "name"} | {
     each.name: each.name for each in fields(DetectorConfig) if each.name != "name"
 }
@@ -43,7 +44,7 @@ _FAULT = {
 
 def _names() -> tuple[str, ...]:
     fault = dict.fromkeys((*_ALIASES, "level", *_FAULT[Level.SOURCE], *_FAULT[Level.INSTRUCTION]))
-    return (*_MISSION, *_DETECTOR, *(name for name in fault if name != "target"))
+    return (*MISSION, *_DETECTOR, *(name for name in fault if name != "target"))
 
 
 NAMES = _names()
@@ -66,7 +67,7 @@ class Point:
         Raises:
             ConfigError: factors that do not go together, values of the wrong type.
         """
-        mission = {name: self.values[name] for name in _MISSION if name in self.values}
+        mission = {name: self.values[name] for name in MISSION if name in self.values}
         mission["seed"] = self.values.get("seed", seed)
         fault = self._fault(fault_seed)
         if fault:
@@ -81,7 +82,7 @@ class Point:
         return structure(mission, MissionConfig)
 
     def _fault(self, seed: int) -> tuple[Level, dict[str, Any]] | None:
-        elsewhere = {*_MISSION, *_DETECTOR}
+        elsewhere = {*MISSION, *_DETECTOR}
         asked = {name: value for name, value in self.values.items() if name not in elsewhere}
         level_name = asked.pop("level", Level.SOURCE.value)
         targets = [name for name in _ALIASES if name in asked]

@@ -25,7 +25,7 @@ _TOP = ("name", "about", "seed", "first_seed", "repetitions", "keep", "mission",
 _SETTING = ("name", "repetitions")
 MOST = 1_000_000  # missions of one campaign
 # Factors whose value is a list already: a list of lists crosses several.
-_LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
+LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
 _NO_VALUES = (datetime.date, datetime.time)  # what TOML has and no factor
 
 
@@ -190,6 +190,11 @@ def parse_spec(text: str, path: Path) -> Spec:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise syntax_error(error, path) from None
+    return read_spec(data, path)
+
+
+def read_spec(data: Mapping[str, Any], path: Path) -> Spec:
+    """The specification that TOML's tables hold; `path` as for `parse_spec`."""
     return _Reader(path).spec(data)
 
 
@@ -239,14 +244,14 @@ class _Reader:
         return {name: self._values(name, value, prefix) for name, value in data.items()}
 
     def _values(self, name: str, value: Any, prefix: str) -> tuple[Any, ...]:
-        if name in _LISTS:
+        if name in LISTS:
             several = isinstance(value, list) and any(isinstance(each, list) for each in value)
             values = tuple(value) if several else (value,)
         else:
             values = tuple(value) if isinstance(value, list) else (value,)
         for each in values:
             self._usable(name, each, prefix)
-        if name in _LISTS:
+        if name in LISTS:
             return values
         if not values:
             raise ConfigError("an empty list of values", path=self._path, key=f"{prefix}{name}")
@@ -256,7 +261,7 @@ class _Reader:
 
     def _usable(self, name: str, value: Any, prefix: str) -> None:
         """Refuse one value that no mission can have, whatever the factor's own type is."""
-        if name in _LISTS and not isinstance(value, list):
+        if name in LISTS and not isinstance(value, list):
             problem = f"expected a list, got {value!r}"
         elif isinstance(value, _NO_VALUES):
             problem = f"no factor is a date or a time, got {value}"

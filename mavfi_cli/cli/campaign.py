@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from mavfi_cli.campaign.spec import Spec
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
+_SET = click.option("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
+                    help="Replace a factor of the preset or file, as world=dense; repeat it. "
+                         "The folder's name tells it.")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
 
 
@@ -31,6 +34,7 @@ def campaign() -> None:
 @click.argument("what", metavar="WHAT")
 @click.option("--out", type=_FOLDER, help="Folder of the campaign  [campaigns/NAME].")
 @click.option("--scale", type=float, help="So much of the repetitions: 0.1 runs a tenth.")
+@_SET
 @click.option("--jobs", type=click.IntRange(min=1),
               help="Missions at the same time  [one a core].")  # fmt: skip
 @click.option("--cluster", metavar="URL",
@@ -63,7 +67,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.campaign.run import Options, fly_missing
     from mavfi_cli.cli.missions_view import missions_view
 
-    spec, folder = chosen(what, options["out"], options["scale"])
+    spec, folder = chosen(what, options["out"], options["scale"], options["changes"])
     with (
         begin(
             spec, folder, append=options["append"], missing_only=options["missing_only"]
@@ -117,15 +121,19 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 
 @campaign.command()
 @click.argument("what", metavar="WHAT")
-@click.argument("path", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("path", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
 def export(what: str, path: Path) -> None:
-    """Write one row a mission to PATH, a .parquet or .csv file."""
+    """Write one row a mission to PATH, a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli.campaign.begin import folder_of
     from mavfi_cli.campaign.export import export as write
+    from mavfi_cli.campaign.export import export_csv
     from mavfi_cli.campaign.ledger import Ledger
 
     with Ledger(folder_of(what)) as ledger:
-        click.echo(f"{write(ledger, path)} missions in {path}")
+        if path == Path("-"):
+            click.echo(export_csv(ledger), nl=False)
+        else:
+            click.echo(f"{write(ledger, path)} missions in {path}")
 
 
 @campaign.command()
@@ -171,6 +179,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 @campaign.command()
 @click.argument("what", metavar="[WHAT]", required=False)
 @click.option("--scale", type=float, help="So much of the repetitions.")
+@_SET
 @click.option("--margin", type=float,
               help="How many missions a setting needs for an interval of so much to either "
                    "side.")  # fmt: skip
@@ -206,20 +215,20 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
             power=options["power"],
         )  # fmt: skip
     if what is not None:
-        told["campaign"] = _planned(what, scale)
+        told["campaign"] = _planned(what, scale, options["changes"])
     if not told:
         raise click.UsageError("name a campaign, --margin or --difference")
     click.echo(json.dumps(told, indent=2) if as_json else "\n".join(_plan_lines(told, options)))
 
 
-def _planned(what: str, scale: float | None) -> dict[str, Any]:
+def _planned(what: str, scale: float | None, changes: Sequence[str]) -> dict[str, Any]:
     from collections import Counter
 
     from mavfi_cli.campaign.begin import chosen, flyable
     from mavfi_cli.campaign.missions import label_text
 
     spec: Spec
-    spec, _ = chosen(what, None, scale)
+    spec, _ = chosen(what, None, scale, changes)
     missions = flyable(spec)
     cells = Counter(label_text(mission.labels) for mission in missions)
     return {

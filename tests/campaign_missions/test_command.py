@@ -105,6 +105,25 @@ def test_export_has_a_row_a_mission(flown, mavfi, tmp_path, name):
     assert [row["label_setting"] for row in rows] == ["golden", "FI"] * 2
     assert {row["outcome"] for row in rows[::2]} == {"success"}
     assert [int(row["seed"]) for row in rows] == [1, 1, 2, 2]
+    recorded = json.loads((folder / "runs" / "000001-farm-1" / "fault.json").read_text())
+    (strike,) = recorded["strikes"]
+    assert rows[1]["struck_state"] == "waypoint_x;waypoint_y;waypoint_z"
+    assert rows[1]["struck_before"] == ";".join(str(each["before"]) for each in strike["changes"])
+    assert float(rows[1]["strike_s"]) == strike["stamp_s"]
+    assert rows[1]["strike_phase"] == strike["phase"] == "flying"
+    assert rows[1]["activation"] == recorded["activation"]["activation"]
+    assert {row["struck_state"] or None for row in rows[::2]} == {None}  # golden
+
+
+@pytest.mark.slow
+def test_export_to_stdout_is_the_csv_file(flown, mavfi, tmp_path):
+    folder, _ = flown
+    mavfi("campaign", "export", folder, tmp_path / "table.csv")
+    run = mavfi("campaign", "export", folder, "-", cwd=tmp_path)
+    assert run.stdout == (tmp_path / "table.csv").read_text()
+    assert [each.name for each in tmp_path.iterdir()] == ["table.csv"]
+    refused = mavfi("campaign", "export", folder, tmp_path / "table.xls")
+    assert "ends in .parquet or .csv, or - for CSV on stdout" in refused.stderr
 
 
 @pytest.mark.slow
@@ -245,6 +264,29 @@ def test_plan_says_what_would_be_flown(mavfi, tmp_path):
     assert (told["missions"], told["pairs"]) == (40, 10)
     assert told["settings"]["setting=golden world=sparse"] == 10
     assert not list(tmp_path.iterdir())
+
+
+def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mavfi_cli.campaign.run.fly_missing", lambda *_: None)
+    line = ["run", str(written(tmp_path)), "--quiet"]
+    invoke = CliRunner().invoke
+    assert invoke(command.campaign, line).exit_code == 0
+    done = invoke(command.campaign, [*line, "--set", "field=sign,exponent", "--scale", "0.5"])
+    assert done.exit_code == 0, done.output
+    changed = tmp_path / "campaigns" / "short-field=sign-exponent"
+    assert sorted(changed.parent.iterdir()) == [changed.parent / "short", changed]
+    assert 'field = ["sign", "exponent"]' in (changed / "campaign.toml").read_text()
+    again = invoke(command.campaign, ["run", str(changed), "--quiet"])
+    assert again.stdout.startswith("short-field=sign-exponent: 0 of 3 missions\n")
+    both = invoke(command.campaign, ["run", str(changed), "--set", "world=dense"])
+    assert "goes without --scale, --set and --out" in str(both.exception)
+
+
+def test_set_names_the_nearest_factor(refused):
+    for name in ("run", "plan"):
+        assert "did you mean 'world'?" in refused(name, "fig8", "--set", "wrold=dense")
+        assert "did you mean 'dense'?" in refused(name, "fig8", "--set", "world=dens")
 
 
 def test_plan_answers_how_many_missions_a_question_takes(mavfi):

@@ -1,0 +1,101 @@
+"""Factors that the command line replaces in a specification."""
+
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.campaign.spec import load_spec, parse_spec
+from mavfi_cli.campaign.spec_set import replaced
+from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey
+
+SPEC = """
+name = "mine"
+repetitions = 2
+[mission]
+time_limit_s = 100.0
+planner = "rrt"
+[factors]
+world = ["farm", "dense"]
+[[setting]]
+name = "golden"
+[[setting]]
+name = "FI"
+stage = ["control", "planning"]
+bits = [1, 3]
+[[setting]]
+name = "D&R"
+stage = "control"
+detector = "gad"
+protect = ["control"]
+"""
+
+
+def changed(*changes):
+    return replaced(parse_spec(SPEC, Path("mine.toml")), changes)
+
+
+def test_nothing_to_replace_leaves_the_specification():
+    assert changed() == parse_spec(SPEC, Path("mine.toml"))
+
+
+@pytest.mark.parametrize(
+    ("change", "old", "new"),
+    [
+        ("world=sparse", '["farm", "dense"]', '["sparse"]'),
+        ("world=sparse,farm", '["farm", "dense"]', '["sparse", "farm"]'),
+        ("world=1979-05-27", '["farm", "dense"]', '"1979-05-27"'),
+        ("bits=5", "[1, 3]", "[5]"),
+        ("time_limit_s=60", "100.0", "60"),
+        ("time_limit_s=60.5", "100.0", "60.5"),
+        ("v_max_mps=4", "100.0", "100.0\nv_max_mps = 4"),
+        ("land=false", "100.0", "100.0\nland = false"),
+        ("start=1.0,2,0.0", "100.0", "100.0\nstart = [1.0, 2, 0.0]"),
+        ("start=[1.0, 2, 0.0]", "100.0", "100.0\nstart = [1.0, 2, 0.0]"),
+        ("protect=planning,control", 'protect = ["control"]', 'protect = ["planning", "control"]'),
+    ],
+)  # fmt: skip
+def test_a_factor_is_replaced_as_if_the_file_had_it(change, old, new):
+    assert SPEC.count(old) == 1
+    expected = parse_spec(SPEC.replace(old, new), Path("mine.toml"))
+    assert changed(change).missions() == expected.missions()
+
+
+def test_several_values_of_what_all_missions_have_are_crossed():
+    found = changed("planner=rrt,rrtstar")
+    assert found.axes["planner"] == ("rrt", "rrtstar")
+    assert "planner" not in found.fixed
+
+
+def test_all_settings_that_have_it_get_it_and_no_other():
+    golden, faulty, protected = changed("stage=perception").settings
+    assert "stage" not in golden.axes
+    assert faulty.axes["stage"] == protected.axes["stage"] == ("perception",)
+
+
+def test_the_name_tells_the_changes_and_is_a_folders():
+    found = changed("world=../my worlds/a.toml,dense", "bits=1,3")
+    assert found.name == "mine-world=..-my-worlds-a.toml-dense-bits=1-3"
+    assert replaced(load_spec("fig8"), ["world=dense"]).name == "fig8-world=dense"
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "problem"),
+    [
+        (("wrold=dense",), UnknownKey, r"wrold: unknown key; did you mean 'world'"),
+        (("mission.world=dense",), UnknownKey, r"mission.world: unknown key; did you mean 'world'"),
+        (("repetitions=3",), UnknownKey, r"repetitions: unknown key"),
+        (("world",), ConfigError, r"set: expected KEY=VALUE\[,VALUE\], got 'world'"),
+        (("world=",), ConfigError, r"set: expected KEY=VALUE"),
+        (("world=farm,farm",), ConfigError, r"factors.world: a value is listed twice"),
+        (("bits=1", "bits=3"), ConfigError, r"set: bits is set twice"),
+        (("field=sign",), ConfigError,
+         r"field: the campaign has no such factor to replace; it has bits, detector, planner, "),
+        (("seed=3",), ConfigError, r"seed: the campaign has no such factor"),
+        (("bits=one",), ConfigError, r"bits: expected int"),
+        (("time_limit_s=long",), ConfigError, r"time_limit_s: expected float"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_replaced_is_refused(changes, error, problem):
+    with pytest.raises(MavfiError, match=problem) as refused:
+        changed(*changes).missions()
+    assert isinstance(refused.value, error)
