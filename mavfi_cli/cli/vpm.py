@@ -99,15 +99,17 @@ def vpm(
         raise click.UsageError("--models or --train, not both")
     chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
     require_distinct([vehicle.name for vehicle in chosen], "vehicle")
-    known = overheads(options["overheads"])
+    choices = _choices(options)
+    platform = choices.platform
+    known = overheads(options["overheads"], None if platform is None else platform.name)
     schemes = schemes_with(
         {name: percent for name, (percent, _) in known.items()},
         {name: source for name, (_, source) in known.items()},
     )
-    told = report(chosen, _choices(options), schemes)
+    told = report(chosen, choices, schemes)
     if fly:
         out = out or Path("vpm")
-        told = _flown(chosen, known, out, options)
+        told = _flown(chosen, known, choices, out, options)
     if out is not None:
         _save(told, out)
     if as_json:
@@ -128,7 +130,11 @@ def _refuse_unused() -> None:
 
 
 def _flown(
-    vehicles: list[Any], known: dict[str, tuple[float, str]], out: Path, options: dict[str, Any]
+    vehicles: list[Any],
+    known: dict[str, tuple[float, str]],
+    choices: Any,
+    out: Path,
+    options: dict[str, Any],
 ) -> dict[str, Any]:
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
@@ -136,7 +142,7 @@ def _flown(
 
     ask = Ask(
         vehicles=vehicles,
-        choices=_choices(options),
+        choices=choices,
         worlds=options["worlds"] or WORLDS,
         missions=options["missions"],
         first_seed=options["first_seed"],

@@ -19,6 +19,16 @@ def test_the_table_is_the_paper_s_figure(command_line):
     assert "rotor_pull_n = 8.331 N (calibrated); TMR x 1.9100, paper x 1.91; DMR x 1.2959" in out
 
 
+def test_notes_stand_above_the_tables(command_line):
+    _, out, _ = command_line("vpm", "--vehicle", "spark", "--board", "raspi3b", "--overhead",
+                             "aad=0.1")  # fmt: skip
+    notes = [line for line in out.splitlines() if line.startswith("Note: ")]
+    assert len(notes) == 3
+    assert notes[0].startswith("Note: the overhead of gad is the paper's")
+    assert notes[1].startswith("Note: the board is raspi3b, and the response time is still")
+    assert out.index(notes[2]) < out.index("scheme  boards")
+
+
 def test_csv_and_json_say_the_same(command_line, tmp_path):
     _, out, _ = command_line("vpm", "--csv")
     rows = list(csv.DictReader(out.splitlines()))
