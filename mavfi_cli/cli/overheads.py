@@ -61,7 +61,7 @@ def measured(text: str, platform: str | None = None) -> dict[str, tuple[float, s
         if flown:
             raise RecordError(
                 f"{path}: its flights with a detector flew on {' and '.join(flown)}, not on "
-                f"{platform} (--platform): recomputations and kernels would be those of another computer; "
+                f"{platform} (--platform): its kernels would be those of another computer; "
                 f"mavfi fly --platform {platform} --detector {DETECTORS[-1]} records one"
             )
     if not known:

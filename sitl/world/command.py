@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import click
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.files import write_atomically, write_text
+from mavfi_cli.core.files import require_svg, write_atomically, write_text
 from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
 from sitl.world.generate import Pair
 from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, world_names
@@ -169,6 +169,7 @@ def draw(
 
     made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
     file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
+    require_svg(file)
     path = check_world(made).path_enu_m if with_path else None
     picture = world_svg(made, path)
     write_atomically(file, lambda opened: opened.write(picture))
