@@ -110,14 +110,16 @@ def vpm(
     if fly:
         out = out or Path("vpm")
         told = _flown(chosen, known, choices, out, options)
-    if out is not None:
-        _save(told, out)
+    files = [] if out is None else _save(told, out)
     if as_json:
         click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
         click.echo(flight_rows_csv(told["flights"]) if fly else scheme_rows_csv(told), nl=False)
     else:
-        click.echo("\n".join([*table(told), *(flight_table(told["flights"]) if fly else [])]))
+        lines = [*table(told), *(flight_table(told["flights"]) if fly else [])]
+        if files:
+            lines += ["", f"Files  {out}: {', '.join(files)}"]
+        click.echo("\n".join(lines))
 
 
 def _refuse_unused() -> None:
@@ -170,7 +172,8 @@ def _choices(options: dict[str, Any]) -> Any:
     )
 
 
-def _save(told: dict[str, Any], out: Path) -> None:
+def _save(told: dict[str, Any], out: Path) -> list[str]:
+    """Write everything; the names of the files."""
     from mavfi_cli.core.errors import RecordError
     from mavfi_cli.core.files import write_json, write_text
     from mavfi_cli.report.flight_plot import write_flight_plot
@@ -187,6 +190,9 @@ def _save(told: dict[str, Any], out: Path) -> None:
     write_text(out / "vpm.csv", scheme_rows_csv(told))
     write_roofline_plot(told, out / "roofline.svg")
     write_redundancy_plot(told, out / "redundancy.svg")
+    names = ["vpm.json", "vpm.csv", "roofline.svg", "redundancy.svg"]
     if "flights" in told:
         write_text(out / "flights.csv", flight_rows_csv(told["flights"]))
         write_flight_plot(told, out / "flights.svg")
+        names += ["flights.csv", "flights.svg"]
+    return names

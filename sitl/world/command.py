@@ -46,8 +46,13 @@ def _world_options(command: F) -> F:
     decorators = [
         click.argument("name", metavar="WORLD"),
         click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True),
-        click.option("--start", type=_Place(), help="Where flights start, ENU m."),
-        click.option("--goal", type=_Place(), help="Where they go, ENU m."),
+        click.option("--start", type=_Place(), help="Where flights start, ENU m. See --goal."),
+        click.option(
+            "--goal",
+            type=_Place(),
+            help="Where they go, ENU m. A generated world is made round start and goal: another "
+            "place moves its bounds, and towers within 3 m of it are left out.",
+        ),
         click.option("--json", "as_json", is_flag=True, help="The result as JSON."),
     ]
     for decorate in reversed(decorators):

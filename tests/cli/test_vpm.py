@@ -84,7 +84,10 @@ def test_every_number_of_the_table_has_its_unit(command_line):
 
 def test_files_and_pictures(command_line, tmp_path):
     line = ("vpm", "--vehicle", "spark", "--board", "xavier", "--out", "report")
-    assert command_line(*line)[0] == 0
+    code, out, _ = command_line(*line)
+    assert code == 0
+    files = "vpm.json, vpm.csv, roofline.svg, redundancy.svg"
+    assert out.splitlines()[-1] == f"Files  report: {files}"
     folder = tmp_path / "report"
     first = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(first) == {"roofline.svg", "redundancy.svg", "vpm.json", "vpm.csv"}
