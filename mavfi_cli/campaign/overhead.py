@@ -17,7 +17,7 @@ from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.detection_cost import DetectionCost, detection_cost
+from mavfi_cli.mission.detection_cost import HOST_CHECKS, DetectionCost, detection_cost
 
 _STAGES = tuple(stage.value for stage in Stage)
 
@@ -107,6 +107,7 @@ def lines(found: Sequence[Overhead], confidence: float = 0.95) -> list[str]:
     told = ["", f"{detection:<{width}}  {'flights':>7}  {'a second':>8}  {'us each':>8}  "
             f"{sure:>20}  {'% of time':>9}  {sure:>20}"]  # fmt: skip
     told += [_detection_line(each, width) for each in found]
+    told += [f"({HOST_CHECKS})"]
     told += ["", f"{recovery:<{width}}  {'times':>7}{stages}  {'in all':>8}  {sure:>20}  "
              f"{'+ checks':>9}  {sure:>20}"]  # fmt: skip
     return told + [_recovery_line(each, width) for each in found]

@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.autonomy.planner_names import canonical
 from mavfi_cli.campaign.factors import NAMES, Point
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import Label, PlannedMission, naming
@@ -251,6 +252,8 @@ class _Reader:
             values = tuple(value) if isinstance(value, list) else (value,)
         for each in values:
             self._usable(name, each, prefix)
+        if name == "planner":  # one planner is one setting, however it is written
+            values = tuple(canonical(each) if isinstance(each, str) else each for each in values)
         if name in LISTS:
             return values
         if not values:

@@ -95,7 +95,8 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     elif as_csv:
         click.echo((out / "evaluation.csv").read_text(encoding="utf-8"), nl=False)
     else:
-        click.echo("\n".join(table(evaluation)))
+        files = "evaluation.json, evaluation.csv, roc.svg, recovery.svg"
+        click.echo("\n".join([*table(evaluation), "", f"Files  {out}: {files}"]))
 
 
 def _plan(options: dict[str, Any]) -> Any:

@@ -68,8 +68,12 @@ class _Size(click.ParamType[Any]):
                    "host's own kernel times, times the factor, with --realtime.")  # fmt: skip
 @click.option("--vehicle", default="solo", show_default=True, metavar="NAME|FILE",
               help="solo, spark, or a TOML profile.")  # fmt: skip
-@click.option("--start", type=_Place(), help="Where to take off, ENU, m  [the world's own].")
-@click.option("--goal", type=_Place(), help="Where to fly, ENU, m  [the world's own].")
+@click.option("--start", type=_Place(),
+              help="Where to take off, ENU, m  [the world's own]. See --goal.")  # fmt: skip
+@click.option("--goal", type=_Place(),
+              help="Where to fly, ENU, m  [the world's own]. A generated world is made round start "
+                   "and goal: another place moves its bounds, and towers within 3 m of it are left "
+                   "out.")  # fmt: skip
 @click.option("--height", "takeoff_height_m", default=5.0, show_default=True,
               help="Take-off height, m.")  # fmt: skip
 @click.option("--v-max", "v_max_mps", default=3.0, show_default=True, help="Speed limit, m/s.")
@@ -183,7 +187,12 @@ def fly(
 
 def _config(options: dict[str, Any]) -> MissionConfig:
     from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.mission.platform import measured_factor
 
+    if options["link"] is not None and options["goal"] is None:
+        raise click.UsageError("--link needs --goal X,Y,Z (ENU, m, from its local origin)")
+    if measured_factor(options["platform"]) is not None and not options["realtime"]:
+        raise click.UsageError(f"--platform {options['platform']} needs --realtime")
     fault, instruction = _fault(options)
     detector = _detector(options)
     columns, rows = options.pop("camera")
@@ -201,7 +210,6 @@ def _config(options: dict[str, Any]) -> MissionConfig:
 
 def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConfig | None]:
     """The fault that is asked for, taken out of the options; says now what is wrong with it."""
-    from mavfi_cli.core.errors import FaultSpecError
     from mavfi_cli.mission.fault_config import FaultConfig
     from mavfi_cli.mission.instruction_config import InstructionConfig
 
@@ -211,14 +219,14 @@ def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConf
     _refuse_unused(target, level)
     if target is None:
         if level == "instruction":
-            raise FaultSpecError("--level instruction needs --inject NODE")
+            raise click.UsageError("--level instruction needs --inject NODE")
         return None, None
     exact = asked.pop("exact_bits") or None
     if level == "source":
         fault = FaultConfig(target=target, seed=seed, exact_bits=exact, **asked)
         fault.check()
-        if fault.attacks_detector and options["detector"] is None:
-            raise FaultSpecError("a fault in the detector needs one: --detector NAME")
+        if fault.attacks_detector and options["detector"] in (None, "none"):
+            raise click.UsageError(f"--inject {target} needs --detector NAME")
         return fault, None
     instruction = InstructionConfig(
         target=target, seed=seed, field=asked["field"], bits=asked["bits"], **native

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,15 +90,16 @@ def _refuse(options: dict[str, Any], names: tuple[str, ...], why: str) -> None:
 
 
 def _attack_program(options: dict[str, Any]) -> None:
+    from mavfi_cli.cli.runs_view import runs_view
     from mavfi_cli.fi.isolated.campaign import run_campaign
 
     as_json, out = options["as_json"], options["out"]
     plan = _plan(options)
-    progress_bar: Any = click.progressbar
     name = Path(options["program"]).name
-    with progress_bar(length=plan.runs, label=name, file=sys.stderr) as bar:
+    with runs_view([name], plan.runs) as show:
+        show(name, 0)
         campaign = run_campaign(
-            plan, jobs=options["jobs"], folder=out, progress=lambda _done: bar.update(1)
+            plan, jobs=options["jobs"], folder=out, progress=lambda done: show(name, done)
         )
     if out is not None:
         _save(campaign, out)

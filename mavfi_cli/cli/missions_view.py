@@ -14,7 +14,7 @@ from mavfi_cli.campaign.progress import Progress, Spectator
 if TYPE_CHECKING:
     from rich.live import Live
 
-_PLAIN_EVERY_S = 10.0
+PLAIN_EVERY_S = 10.0
 _MOST_SETTINGS = 6  # whose success rates are told one by one; `campaign status` tells all
 
 
@@ -30,7 +30,7 @@ class _Plain(Spectator):
             self._next_s = 0.0
         self._last_s = progress.elapsed_s
         if progress.elapsed_s >= self._next_s or progress.over == progress.total:
-            self._next_s = progress.elapsed_s + _PLAIN_EVERY_S
+            self._next_s = progress.elapsed_s + PLAIN_EVERY_S
             click.echo(progress_line(progress), err=True)
 
     def on_end(self, progress: Progress) -> None:

@@ -17,18 +17,21 @@ _LEDGER, _RESULT = "ledger.sqlite", "result.json"
 _LEDGERS = (_LEDGER, f"protected/*/{_LEDGER}", f"flights/{_LEDGER}")
 
 
-def overheads(texts: tuple[str, ...]) -> dict[str, tuple[float, str]]:
+def overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
     """Per cent and source of each detector; the last word counts.
+
+    Args:
+        platform: that is modelled; flights on others do not count. None: all count.
 
     Raises:
         click.UsageError: neither DETECTOR=PERCENT nor a path.
-        RecordError: a path without flights with a detector.
+        RecordError: a path without flights with a detector on the platform.
     """
     found: dict[str, tuple[float, str]] = {}
     for text in texts:
         name, _, number = text.partition("=")
         if Path(text).exists():
-            found |= measured(text)
+            found |= measured(text, platform)
             continue
         try:
             found[name.strip()] = float(number), "--overhead"
@@ -39,15 +42,28 @@ def overheads(texts: tuple[str, ...]) -> dict[str, tuple[float, str]]:
     return found
 
 
-def measured(text: str) -> dict[str, tuple[float, str]]:
+def measured(text: str, platform: str | None = None) -> dict[str, tuple[float, str]]:
     """The overheads of the error-free flights with a detector that lie at a path.
+
+    Args:
+        platform: only flights on this one count; None: all.
 
     Raises:
         RecordError: there are none; says what is there.
     """
     path = Path(text)
-    of_each = overheads_of(_results(path))
+    of_each = overheads_of(_results(path), platform)
     known = {name: each for name, each in of_each.items() if name in DETECTORS}
+    if not known and platform is not None:
+        elsewhere = overheads_of(_results(path))
+        flown = sorted({on for name in DETECTORS if name in elsewhere
+                        for on in elsewhere[name].platforms})  # fmt: skip
+        if flown:
+            raise RecordError(
+                f"{path}: its flights with a detector flew on {' and '.join(flown)}, not on "
+                f"{platform} (--platform): its kernels would be those of another computer; "
+                f"mavfi fly --platform {platform} --detector {DETECTORS[-1]} records one"
+            )
     if not known:
         others = f", only with {', '.join(of_each)}" if of_each else ""
         raise RecordError(

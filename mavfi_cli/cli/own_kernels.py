@@ -6,7 +6,6 @@ import contextlib
 import csv
 import io
 import json
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,13 +23,14 @@ def run_own_kernels(options: dict[str, Any], model: FaultModel) -> None:
     from mavfi_cli.campaign.kernels.catalogue import select
     from mavfi_cli.campaign.kernels.runs import run_kernels
     from mavfi_cli.campaign.kernels.summary import summarise, table
+    from mavfi_cli.cli.runs_view import runs_view
     from mavfi_cli.fi.sampling import strategy
 
     strategy(options["sampling"], model, compat=options["compat"])  # says now what is wrong
     kernels = select(options["kernel"])
     with _folder(options["out"]) as folder:
         plan = _plan(options, tuple(kernel.name for kernel in kernels), model, folder)
-        with _progress(plan) as show:
+        with runs_view(plan.kernels, plan.runs) as show:
             campaign = run_kernels(plan, jobs=options["jobs"], folder=folder, progress=show)
         summary = summarise(plan, campaign)
         if options["out"] is not None:
@@ -71,23 +71,6 @@ def _plan(
         tolerance=options["tolerance"],
         null=options["null"],
     )
-
-
-@contextlib.contextmanager
-def _progress(plan: Plan) -> Iterator[Any]:
-    make: Any = click.progressbar
-    length = plan.runs * len(plan.kernels)
-    with make(length=length, file=sys.stderr, item_show_func=lambda name: name) as bar:
-        reached = 0
-
-        def show(kernel: str, done: int) -> None:
-            """Move the bar to a kernel's so many runs."""
-            nonlocal reached
-            position = plan.kernels.index(kernel) * plan.runs + done
-            bar.update(position - reached, kernel)
-            reached = position
-
-        yield show
 
 
 def _save(folder: Path, summary: dict[str, Any], campaign: list[KernelRuns]) -> None:

@@ -34,6 +34,10 @@ class _Plain(Watcher):
             self._next_s = progress.stamp_s + _PLAIN_EVERY_S
             click.echo(_line(progress), err=True)
 
+    def on_note(self, text: str) -> None:
+        """A line."""
+        click.echo(text, err=True)
+
     def on_event(self, event: Event) -> None:
         """A line, where people want to hear of it."""
         if self._title:  # only now, so that a mission that cannot begin gets one line
@@ -53,6 +57,12 @@ class _Live(Watcher):
     def on_progress(self, progress: Progress) -> None:
         """Rewrite the line."""
         self._live.update(_line(progress), refresh=True)
+
+    def on_note(self, text: str) -> None:
+        """Print above the line."""
+        from rich.text import Text
+
+        self._live.console.print(Text(text))
 
     def on_event(self, event: Event) -> None:
         """Print above the line, where people want to hear of it."""

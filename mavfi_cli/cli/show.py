@@ -37,3 +37,5 @@ def show(run: Path, as_json: bool, golden: bool, events: bool, picture: Path | N
         lines += ["", "Events", *event_lines(record.result)]
     click.echo("\n".join(lines))
     click.echo(f"\nRun folder  {record.folder.path}")
+    if picture is not None:
+        click.echo(f"Picture     {picture}")

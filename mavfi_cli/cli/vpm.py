@@ -99,23 +99,27 @@ def vpm(
         raise click.UsageError("--models or --train, not both")
     chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
     require_distinct([vehicle.name for vehicle in chosen], "vehicle")
-    known = overheads(options["overheads"])
+    choices = _choices(options)
+    platform = choices.platform
+    known = overheads(options["overheads"], None if platform is None else platform.name)
     schemes = schemes_with(
         {name: percent for name, (percent, _) in known.items()},
         {name: source for name, (_, source) in known.items()},
     )
-    told = report(chosen, _choices(options), schemes)
+    told = report(chosen, choices, schemes)
     if fly:
         out = out or Path("vpm")
-        told = _flown(chosen, known, out, options)
-    if out is not None:
-        _save(told, out)
+        told = _flown(chosen, known, choices, out, options)
+    files = [] if out is None else _save(told, out)
     if as_json:
         click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
         click.echo(flight_rows_csv(told["flights"]) if fly else scheme_rows_csv(told), nl=False)
     else:
-        click.echo("\n".join([*table(told), *(flight_table(told["flights"]) if fly else [])]))
+        lines = [*table(told), *(flight_table(told["flights"]) if fly else [])]
+        if files:
+            lines += ["", f"Files  {out}: {', '.join(files)}"]
+        click.echo("\n".join(lines))
 
 
 def _refuse_unused() -> None:
@@ -128,7 +132,11 @@ def _refuse_unused() -> None:
 
 
 def _flown(
-    vehicles: list[Any], known: dict[str, tuple[float, str]], out: Path, options: dict[str, Any]
+    vehicles: list[Any],
+    known: dict[str, tuple[float, str]],
+    choices: Any,
+    out: Path,
+    options: dict[str, Any],
 ) -> dict[str, Any]:
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
@@ -136,7 +144,7 @@ def _flown(
 
     ask = Ask(
         vehicles=vehicles,
-        choices=_choices(options),
+        choices=choices,
         worlds=options["worlds"] or WORLDS,
         missions=options["missions"],
         first_seed=options["first_seed"],
@@ -164,7 +172,8 @@ def _choices(options: dict[str, Any]) -> Any:
     )
 
 
-def _save(told: dict[str, Any], out: Path) -> None:
+def _save(told: dict[str, Any], out: Path) -> list[str]:
+    """Write everything; the names of the files."""
     from mavfi_cli.core.errors import RecordError
     from mavfi_cli.core.files import write_json, write_text
     from mavfi_cli.report.flight_plot import write_flight_plot
@@ -181,6 +190,9 @@ def _save(told: dict[str, Any], out: Path) -> None:
     write_text(out / "vpm.csv", scheme_rows_csv(told))
     write_roofline_plot(told, out / "roofline.svg")
     write_redundancy_plot(told, out / "redundancy.svg")
+    names = ["vpm.json", "vpm.csv", "roofline.svg", "redundancy.svg"]
     if "flights" in told:
         write_text(out / "flights.csv", flight_rows_csv(told["flights"]))
         write_flight_plot(told, out / "flights.svg")
+        names += ["flights.csv", "flights.svg"]
+    return names

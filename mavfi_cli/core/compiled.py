@@ -33,6 +33,15 @@ def compiled(function: F) -> F:
     return kernel
 
 
+def in_cache(kernel: Callable[..., Any]) -> bool:
+    """Whether a compiled function has machine code on disk that a call would load.
+
+    True as well where it is not compiled at all (NUMBA_DISABLE_JIT), for then no call takes long.
+    """
+    cache_file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    return cache_file is None or bool(cache_file._load_index())
+
+
 def _numba() -> Any:
     """numba, without BLAS: it would import all of scipy.linalg to look for it.
 

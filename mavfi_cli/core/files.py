@@ -34,6 +34,16 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         raise RecordError(f"{path}: {error.strerror or error}") from None
 
 
+def require_svg(path: Path) -> None:
+    """Refuse a name for a picture that promises another format.
+
+    Raises:
+        RecordError: it does not end in .svg.
+    """
+    if path.suffix.lower() != ".svg":
+        raise RecordError(f"{path}: pictures are SVG: name a file that ends in .svg")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically."""
     write_atomically(path, lambda file: file.write(text.encode()))

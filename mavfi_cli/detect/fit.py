@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.errors import ModelError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import DType
 from mavfi_cli.core.types import FloatArray, Stage
@@ -72,7 +72,8 @@ def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) ->
         flights: how many there will be at most.
 
     Raises:
-        ModelError: too few flights, an unknown kind, or torch is missing for aad.
+        UnknownName: an unknown kind.
+        ModelError: too few flights, or torch is missing for aad.
         ConfigError: n sigma out of range.
     """
     for kind in kinds:
@@ -90,8 +91,8 @@ def _refuse_few(flights: int) -> None:
         raise ModelError(f"{flights} flights are too few to fit to: {FLIGHTS_MIN} at least")
 
 
-def _unknown(kind: str) -> ModelError:
-    return ModelError(f"no way to fit a detector {kind!r}; known: {', '.join(KINDS)}")
+def _unknown(kind: str) -> UnknownName:
+    return UnknownName("detector", kind, KINDS)
 
 
 def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = None) -> Model:
@@ -104,7 +105,8 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
             flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
 
     Raises:
-        ModelError: too few flights, an unknown kind, or torch is missing for aad.
+        UnknownName: an unknown kind.
+        ModelError: too few flights, or torch is missing for aad.
         ConfigError: n sigma out of range.
     """
     parts = split(dataset, seed)

@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from mavfi_cli.autonomy.planner_names import canonical
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
@@ -34,6 +35,7 @@ class MissionConfig:
 
     Attributes:
         world: name of a world, or the path of a TOML file of boxes.
+        planner: its name; of our own any spelling is taken, and the one name kept.
         seed: the root seed; world, planner, latency and sensor streams derive from it.
         start, goal: None leaves the world's own.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
@@ -75,6 +77,7 @@ class MissionConfig:
     isolate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "planner", canonical(self.planner))
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):

@@ -21,6 +21,8 @@ RECOMPUTED = {
     Stage.CONTROL.value: ("control",),
 }
 KERNELS = tuple(kernel for kernels in RECOMPUTED.values() for kernel in kernels)
+# Said wherever the checks stand beside simulated time: no factor between hosts is known.
+HOST_CHECKS = "checks take the time of the host that flew, not scaled to the platform"
 _AGAIN = ("recompute", "hold")  # responses to an alarm after which something is computed again
 
 

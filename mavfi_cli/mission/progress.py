@@ -24,5 +24,8 @@ class Watcher:
     def on_progress(self, progress: Progress) -> None:
         """Called once a simulated second."""
 
+    def on_note(self, text: str) -> None:
+        """Called before something that takes long and is no part of the flight."""
+
     def on_event(self, event: Event) -> None:
         """Called for every event as it happens."""

@@ -80,7 +80,7 @@ def fly_mission(
     with (
         _injection(config, out, repeat, for_debugger, vehicles) as injection,
         interruptible() as interrupt,
-        other_end(config, vehicles, patient=branching is not None) as end,
+        other_end(config, vehicles, watcher, patient=branching is not None) as end,
     ):
         flight = Flight(config, end.transport, platform, planner, watcher, interrupt)
         sortie = Sortie(config, out, end, flight, branching, begun_s=begun_s)

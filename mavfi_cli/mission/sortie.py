@@ -12,15 +12,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.autonomy import warm_up
+from mavfi_cli.autonomy import is_compiled, warm_up
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.mission.branching import Branching, Trunk
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
+from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run_folder import RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.vehicle_process import VehicleProcess
 from mavfi_cli.mission.vehicle_template import VehicleTemplate
+
+COMPILING = "compiling the kernels, once on this machine: this takes a while"
 
 
 @dataclass(slots=True, eq=False)
@@ -65,17 +68,22 @@ class OtherEnd:
 
 @contextlib.contextmanager
 def other_end(
-    config: MissionConfig, vehicles: VehicleTemplate | None, *, patient: bool = False
+    config: MissionConfig,
+    vehicles: VehicleTemplate | None,
+    watcher: Watcher,
+    *,
+    patient: bool = False,
 ) -> Iterator[OtherEnd]:
     """A foreign autopilot where the mission names one, else a simulated vehicle that starts.
 
     Args:
         config: the mission.
         vehicles: forks the simulated vehicle; None: it is started as a program.
+        watcher: is told where the kernels must be compiled first.
         patient: it may have to wait long for an answer.
     """
     if config.link is not None:
-        warm_up()  # first: what comes meanwhile would be stale, and the link full of it
+        _warm_up(watcher)  # first: what comes meanwhile would be stale, and the link full of it
         with contextlib.closing(OtherEnd(open_transport(config.link))) as foreign:
             yield foreign
         return
@@ -87,8 +95,14 @@ def other_end(
         shutil.rmtree(folder, ignore_errors=True)
         raise
     with contextlib.closing(OtherEnd(transport, folder, process)) as ours:
-        warm_up()  # while the vehicle starts
+        _warm_up(watcher)  # while the vehicle starts
         yield ours
+
+
+def _warm_up(watcher: Watcher) -> None:
+    if not is_compiled():
+        watcher.on_note(COMPILING)
+    warm_up()
 
 
 @dataclass(slots=True, eq=False)

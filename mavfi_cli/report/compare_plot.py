@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, write_svg
+from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, PLATFORMS, write_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = ("#3f74bd", "#e4572e", "#2a9d8f", "#f2b134", "#8e5aa3", "#7f5539")
 _WAIT = "#dfe3e9"
 _CHAIN = ("point_cloud", "octomap", "collision_check", "control")
 _NAMES = {"golden": "golden", "none": "faults"}
@@ -41,7 +40,7 @@ def draw_compare_plot(told: Row) -> Figure:
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     panels = figure.subplot_mosaic("TTTTSS;RRMMWW")
     colours = {
-        row["platform"]: _COLOURS[place % len(_COLOURS)]
+        row["platform"]: PLATFORMS[place % len(PLATFORMS)]
         for place, row in enumerate(told["plan"]["platforms"])
     }
     _times(panels["T"], told, colours)

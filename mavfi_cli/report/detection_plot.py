@@ -8,17 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.report.drawing import NOTE, write_svg
+from mavfi_cli.report.drawing import GRID, INK, NOTE, detector_colours, write_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = {
-    "none": "#9aa5b1", "range": "#f2b134", "l2": "#8e5aa3", "gad": "#1b4965", "aad": "#e4572e",
-}  # fmt: skip
-_OTHERS = ("#2a9d8f", "#7f5539", "#c9184a", "#606c38")  # plug-ins
-_GRID = "#edf0f4"
 Evaluation = Mapping[str, Any]
 
 
@@ -41,7 +36,7 @@ def draw_roc_plot(evaluation: Evaluation) -> Figure:
 
     figure = Figure(figsize=(8.4, 4.4), layout="constrained")
     roc, precision = figure.subplots(1, 2)
-    colours = _colours(list(evaluation["curves"]))
+    colours = detector_colours(list(evaluation["curves"]))
     drawn = [(name, c) for name, c in evaluation["curves"].items() if c["thresholds"]]
     for name, curve in drawn:
         colour = colours[name]
@@ -83,7 +78,7 @@ def _square(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x, fontsize=8.5)
     axes.set_ylabel(y, fontsize=8.5)
     axes.tick_params(labelsize=8)
-    axes.grid(visible=True, color=_GRID, linewidth=0.6)
+    axes.grid(visible=True, color=GRID, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
 
 
@@ -93,21 +88,21 @@ def draw_recovery_plot(evaluation: Evaluation) -> Figure:
 
     rows = evaluation["faults"]
     names = list(dict.fromkeys(row["detector"] for row in rows))
-    colours = _colours(names)
+    colours = detector_colours(names)
     figure = Figure(figsize=(9.6, 4.2), layout="constrained")
     shares, times = figure.subplots(1, 2)
     stages = [row for row in rows if row["by"] in ("all", "stage") and row["detector"] != "none"]
     _bars(
         shares, stages, [name for name in names if name != "none"], colours,
         lambda row: (row["undone"]["share"], row["undone"]["low"], row["undone"]["high"]),
-        lambda row: f"{row['value']}\nn = {row['undone']['total']}",
+        lambda row: row["undone"]["total"],
     )  # fmt: skip
     shares.set_ylim(0.0, 105.0)
     shares.set_ylabel("harmful faults whose harm is undone, %", fontsize=8.5)
     _bars(
         times, [row for row in rows if row["by"] == "world"], names, colours,
         lambda row: (row["worst"]["protected"], None, None),
-        lambda row: f"{row['value']}\nn = {row['active']}",
+        lambda row: row["active"],
     )  # fmt: skip
     times.set_ylabel("worst flight time over the golden flight's, %", fontsize=8.5)
     handles = [shares.bar(0, 0, color=colours[name], label=name) for name in names]
@@ -127,38 +122,39 @@ def _bars(
     names: Sequence[str],
     colours: Mapping[str, str],
     measure: Any,
-    tick: Any,
+    count: Any,
 ) -> None:
-    """Bars side by side: a group a value of the rows, a bar a detector; shares become per cent."""
+    """Bars side by side: a group a value of the rows, a bar a detector; shares become per cent.
+
+    Args:
+        measure: of a row its value and interval; not a number where there is none.
+        count: how many cases a row is of; a row of none has no bar.
+    """
     values = list(dict.fromkeys(row["value"] for row in rows))
     width = 0.8 / max(1, len(names))
     ticks = {}
     for row in rows:
-        ticks[row["value"]] = tick(row)
+        ticks[row["value"]] = f"{row['value']}\nn = {count(row)}"
         place = values.index(row["value"]) + width * (
             names.index(row["detector"]) - (len(names) - 1) / 2
         )
         value, low, high = measure(row)
         if not np.isfinite(value):
-            axes.text(place, 1.0, "-", ha="center", fontsize=8, color=NOTE)
+            if count(row):
+                axes.annotate(
+                    "no success", (place, 0.0), xytext=(0, 2), textcoords="offset points",
+                    ha="center", va="bottom", fontsize=7, color=NOTE, rotation=90.0,
+                )  # fmt: skip
             continue
         axes.bar(place, 100.0 * value, width=0.9 * width, color=colours[row["detector"]])
         if low is not None:
             axes.errorbar(
                 place, 100.0 * value, [[100.0 * (value - low)], [100.0 * (high - value)]],
-                color="#1d232b", elinewidth=0.9, capsize=2.0,
+                color=INK, elinewidth=0.9, capsize=2.0,
             )  # fmt: skip
     axes.set_xticks(range(len(values)), [ticks[value] for value in values], fontsize=8)
     axes.set_xlim(-0.6, max(0.6, len(values) - 0.4))
     axes.tick_params(labelsize=8)
-    axes.grid(visible=True, axis="y", color=_GRID, linewidth=0.6)
+    axes.grid(visible=True, axis="y", color=GRID, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour a detector; those of others take turns."""
-    others = [name for name in names if name not in _COLOURS]
-    return {
-        name: _COLOURS.get(name) or _OTHERS[others.index(name) % len(_OTHERS)] for name in names
-    }

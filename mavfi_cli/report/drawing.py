@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.files import require_svg, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -14,13 +15,13 @@ if TYPE_CHECKING:
 INK = "#1d232b"
 NOTE = "#5b6573"
 GRID = "#edf0f4"
-SCHEMES = {
-    "none": "#8b93a1",
-    "dmr": "#f2b134",
-    "tmr": "#e4572e",
-    "gad": "#5b8def",
-    "aad": "#1b7f4b",
-}
+# One thing, one colour in all pictures: detectors, redundancy and platforms share none.
+NONE = "#8b93a1"  # no protection
+DETECTORS = {"gad": "#6a4fb3", "aad": "#1b7f4b", "range": "#a3a032", "l2": "#c77fae"}
+_PLUG_INS = ("#7f5539", "#4a6d8c", "#5d7052", "#a67c52")  # detectors of others, in turn
+REDUNDANCY = {"dmr": "#f2b134", "tmr": "#e4572e"}
+SCHEMES = {"none": NONE, **REDUNDANCY, **DETECTORS}
+PLATFORMS = ("#00838f", "#c2185b", "#2b4c7e", "#7b2d26", "#5c6b1f", "#5aa9e6")  # in their order
 KERNELS = {  # what they are called, and their colours
     "point_cloud": ("point cloud", "#2f7fb8"),
     "octomap": ("OctoMap", "#1b4965"),
@@ -30,13 +31,24 @@ KERNELS = {  # what they are called, and their colours
 }
 
 
+def detector_colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour a detector, `none` among them; those of others take turns."""
+    known = {"none": NONE, **DETECTORS}
+    others = [name for name in names if name not in known]
+    return {
+        name: known.get(name) or _PLUG_INS[others.index(name) % len(_PLUG_INS)] for name in names
+    }
+
+
 def write_svg(figure: Figure, path: Path) -> None:
     """Write a figure as SVG, atomically; equal figures give equal bytes.
 
     Raises:
-        RecordError: the file could not be written.
+        RecordError: the file could not be written, or its name does not end in .svg.
     """
     import matplotlib as mpl
+
+    require_svg(path)
 
     with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
         buffer = io.BytesIO()

@@ -142,7 +142,8 @@ def draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> No
         axes.scatter([goal[0]], [goal[1]], marker="*", s=120, color=_GOOD, zorder=5, label="goal")
     if len(positions):
         axes.scatter(
-            [positions[0, 0]], [positions[0, 1]], marker="^", s=55, color="#222831", zorder=5,
+            [positions[0, 0]], [positions[0, 1]], marker="^", s=55, color="#222831",
+            edgecolors="white", linewidths=0.8, zorder=6.5,  # above a fault that strikes there
             label="start",
         )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mavfi_cli.mission.run_folder import Run
-from mavfi_cli.report.drawing import INK, write_svg
+from mavfi_cli.report.drawing import DETECTORS, INK, write_svg
 from mavfi_cli.report.top_view import (
     draw_end,
     draw_marks,
@@ -26,11 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# By the order of the names: golden, faulty and protected flights are blue, orange and green, as in
-# the paper's figure.
-_COLOURS = (
-    "#3a7bd5", "#e8751a", "#1b7f4b", "#8e44ad", "#b8860b", "#00838f", "#c2185b", "#5d4037",
-)  # fmt: skip
+# By the order of the names: golden and faulty flights are blue and orange, as in the paper's;
+# protected ones have their detector's colour, which for AAD is the paper's green.
+_COLOURS = ("#3a7bd5", "#e8751a", "#b8860b", "#00838f", "#c2185b", "#5d4037")
 _WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # points: flights of one way are seen through each other
 _COLUMNS = 3
 _MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # points: so far beside its place
@@ -68,8 +67,7 @@ def draw_trajectories(panels: Sequence[Panel]) -> Figure:
     most = max(len(panel.flights) for panel in panels)
     figure = Figure(figsize=(5.2 * columns, (5.3 + 0.19 * most) * rows), layout="constrained")
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
-    names = dict.fromkeys(name for panel in panels for name, _ in panel.flights)
-    colours = {name: _COLOURS[n % len(_COLOURS)] for n, name in enumerate(names)}
+    colours = _colours(panels)
     grid = figure.subplots(rows, columns, squeeze=False)
     for number, axes in enumerate(grid.flat):
         if number < len(panels):
@@ -79,6 +77,18 @@ def draw_trajectories(panels: Sequence[Panel]) -> Figure:
     _explain_marks(figure)
     figure.suptitle(place_of(panels[0].flights[0][1].result), fontsize=11)
     return figure
+
+
+def _colours(panels: Sequence[Panel]) -> dict[str, str]:
+    """A colour a name: its detector's, where no name before it has that; else the next in turn."""
+    colours: dict[str, str] = {}
+    turn = itertools.cycle(_COLOURS)
+    for name, run in (flight for panel in panels for flight in panel.flights):
+        if name not in colours:
+            detector = (run.result.get("detection") or {}).get("detector")
+            own = DETECTORS.get(detector) if detector else None
+            colours[name] = own if own and own not in colours.values() else next(turn)
+    return colours
 
 
 def lines(panels: Sequence[Panel]) -> list[str]:

@@ -18,6 +18,7 @@ from mavfi_cli.mission.config import LIMITS, MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.vpm.model import safe_velocity_mps
+from mavfi_cli.vpm.overhead import TIMES
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
 from mavfi_cli.vpm.setting import Setting, outcome
 
@@ -152,7 +153,7 @@ def vehicle_text(setting: Setting, scheme: Scheme, acceleration_mps2: float) -> 
 def platform_text(platform: PlatformProfile, factor: float) -> str:
     """TOML of a platform with all latencies of another times a factor."""
     lines = [
-        f"name = {_quoted(f'{platform.name} x {factor:.6g}')}",
+        f"name = {_quoted(f'{platform.name}{TIMES}{factor:.6g}')}",
         f"cores = {platform.cores}",
         f"carried = {str(platform.carried).lower()}",
     ]
@@ -161,7 +162,7 @@ def platform_text(platform: PlatformProfile, factor: float) -> str:
             f"[kernels.{name}]",
             f"latency_s = {factor * kernel.latency_s!r}",
             f"spread = {kernel.spread!r}",
-            f"source = {_quoted(f'{platform.name} x {factor:.6g}')}",
+            f"source = {_quoted(f'{platform.name}{TIMES}{factor:.6g}')}",
         ]
     return "\n".join([*lines, ""])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from mavfi_cli.mission.detection_cost import HOST_CHECKS
 from mavfi_cli.vpm.table import columns, csv_of
 
 MANY_ALARMS = 10.0  # of an error-free flight: more is not the detector's usual rate
@@ -177,3 +178,4 @@ def _overheads(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
           f"{row['checks_of_host_kernels_percent']:.4g} %"]
          for row in rows],
     )  # fmt: skip
+    yield f"({HOST_CHECKS})"

@@ -9,10 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from mavfi_cli.mission.detection_cost import KERNELS, detection_cost
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.mission.detection_cost import HOST_CHECKS, KERNELS, detection_cost
+from mavfi_cli.mission.platform import load_platform
+
+MEASURED = "measured"  # how the source of a measured overhead begins
+TIMES = " x "  # between a platform's name and the one factor on its latencies, in a file's name
+NEAR = 0.1  # a factor of the flights' latencies that far from 1 is still the platform
+UNKNOWN = "an unknown platform"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +33,8 @@ class Overhead:
         compute_s: all kernels, recomputations included, simulated.
         host_compute_s: all kernels, host time.
         alarms: after which something was computed again.
+        platforms: names of those on which the flights flew, in alphabetical order.
+        left_out: flights on other platforms, which do not count.
     """
 
     detector: str
@@ -34,6 +44,8 @@ class Overhead:
     compute_s: float
     host_compute_s: float
     alarms: int
+    platforms: tuple[str, ...]
+    left_out: int = 0
 
     @property
     def share(self) -> float:
@@ -53,31 +65,67 @@ class Overhead:
     def told(self, where: str) -> str:
         """Where the number comes from, for the table."""
         again = self.share - self.checks_share
+        left = f" ({self.left_out} on other platforms left out)" if self.left_out else ""
         return (
-            f"measured in {self.flights} {'flight' if self.flights == 1 else 'flights'} of "
-            f"{where}: checks {100.0 * self.checks_share:.4g} %, {self.alarms} "
-            f"{'recomputation' if self.alarms == 1 else 'recomputations'} {100.0 * again:.4g} %"
+            f"{MEASURED} in {self.flights} {'flight' if self.flights == 1 else 'flights'} of "
+            f"{where} on {' and '.join(self.platforms)}{left}: checks "
+            f"{100.0 * self.checks_share:.4g} %, {self.alarms} "
+            f"{'recomputation' if self.alarms == 1 else 'recomputations'} {100.0 * again:.4g} %; "
+            f"{HOST_CHECKS}"
         )
 
 
-def overheads_of(results: Iterable[Mapping[str, Any]]) -> dict[str, Overhead]:
+def overheads_of(
+    results: Iterable[Mapping[str, Any]], platform: str | None = None
+) -> dict[str, Overhead]:
     """The overhead of every detector in these records, over all of its flights together.
 
     Flights with a fault do not count: their alarms are the fault's.
 
     Args:
         results: result.json of flights.
+        platform: only flights on this one count; None: all.
     """
     found: dict[str, Overhead] = {}
+    left_out: dict[str, int] = {}
+    names: dict[str, str] = {}  # of platforms, by what missions call them
     for result in results:
-        flown = _of_flight(result)
-        if flown is not None:
-            known = found.get(flown.detector)
-            found[flown.detector] = flown if known is None else _sum(known, flown)
-    return found
+        called = str(result.get("config", {}).get("platform", UNKNOWN))
+        if called not in names:
+            names[called] = _platform_name(called)
+        flown = _of_flight(result, names[called])
+        if flown is None:
+            continue
+        if platform is not None and not _same(names[called], platform):
+            left_out[flown.detector] = left_out.get(flown.detector, 0) + 1
+            continue
+        known = found.get(flown.detector)
+        found[flown.detector] = flown if known is None else _sum(known, flown)
+    return {name: replace(each, left_out=left_out.get(name, 0)) for name, each in found.items()}
 
 
-def _of_flight(result: Mapping[str, Any]) -> Overhead | None:
+def _platform_name(called: str) -> str:
+    """The name in a platform's file where that is still there; without it, what it was called."""
+    if not called.endswith(".toml"):
+        return called
+    try:
+        return load_platform(called).name
+    except MavfiError:
+        return Path(called).stem
+
+
+def _same(name: str, platform: str) -> bool:
+    """Whether it is this platform, or what `mavfi vpm --fly` makes of it for a detector's share."""
+    base, times, factor = name.rpartition(TIMES)
+    if name == platform or not times or base != platform:
+        return name == platform
+    try:
+        return abs(float(factor) - 1.0) <= NEAR
+    except ValueError:  # a name of the user's own
+        return False
+
+
+def _of_flight(result: Mapping[str, Any], platform: str) -> Overhead | None:
     cost = None if result.get("fault") else detection_cost(result)
     if cost is None:
         return None
@@ -94,6 +142,7 @@ def _of_flight(result: Mapping[str, Any]) -> Overhead | None:
         compute_s=compute_s,
         host_compute_s=host_compute_s,
         alarms=round(math.fsum(cost.recomputations.values())),
+        platforms=(platform,),
     )
 
 
@@ -106,4 +155,5 @@ def _sum(first: Overhead, second: Overhead) -> Overhead:
         compute_s=first.compute_s + second.compute_s,
         host_compute_s=first.host_compute_s + second.host_compute_s,
         alarms=first.alarms + second.alarms,
+        platforms=tuple(sorted({*first.platforms, *second.platforms})),
     )

@@ -13,7 +13,7 @@ from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.vpm.board import Board, load_board
 from mavfi_cli.vpm.calibrate import Calibrated, calibrated
 from mavfi_cli.vpm.model import KNEE_SHARE, safe_velocity_mps
-from mavfi_cli.vpm.schemes import REFERENCE, Scheme, named
+from mavfi_cli.vpm.schemes import REFERENCE, Scheme, named, unlike_sources
 from mavfi_cli.vpm.sensitivity import sensitivity
 from mavfi_cli.vpm.setting import Outcome, Setting, outcome
 from mavfi_cli.vpm.vehicle import Vehicle
@@ -27,6 +27,7 @@ OTHER_BOARD = "tx2"  # calibrations are repeated with it: what a heavier copy wo
 RATIOS = ("velocity", "flight_time", "energy", "missions")
 _CURVE_HZ = np.logspace(-1.0, 3.0, 161)
 _COMMAND = "command line"
+_FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # of what a calibration sets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +56,7 @@ def report(
         "knee_velocity_over_roof_ratio": KNEE_SHARE,
         "distance_m": choices.distance_m,
         "ratios_over": REFERENCE,
+        "notes": [note for note in (unlike_sources(schemes),) if note],
         "vehicles": [_one(vehicle, choices, schemes) for vehicle in vehicles],
     }
 
@@ -67,6 +69,7 @@ def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dic
         "vehicle": vehicle.name,
         "description": vehicle.description,
         "board": setting.board.name,
+        "notes": _notes(vehicle, choices, setting, found),
         "parameters": parameters,
         "schemes": [_row(setting, scheme, reference) for scheme in schemes],
         "sensitivity": sensitivity(setting, schemes),
@@ -132,6 +135,40 @@ def _setting(
     return setting, _parameters(setting, sources, free)
 
 
+def _notes(
+    vehicle: Vehicle, choices: Choices, setting: Setting, found: Calibrated | None
+) -> list[str]:
+    """What a user who changed the computer might take for changed with it."""
+    notes, board = [], setting.board.name
+    own_time = choices.platform is None and choices.response_s is None
+    if own_time and board != vehicle.board:
+        source = vehicle.sources.get("response_s", "not given")
+        if found is not None and found.parameter == "response_s":
+            source = f"calibrated with board {found.board.name}"
+        notes.append(
+            f"the board is {board}, and the response time is still the vehicle's own ({source}): "
+            "give --response or --platform"
+        )
+    in_use = own_time or (found is not None and found.parameter != "response_s")
+    if found is not None and in_use and board != found.board.name:
+        notes.append(_other_calibration(vehicle, setting.board, found))
+    return notes
+
+
+def _other_calibration(vehicle: Vehicle, board: Board, found: Calibrated) -> str:
+    unit = _FREE_UNITS[found.parameter]
+    told = (
+        f"{found.parameter} = {found.value:.4g} {unit} is calibrated with board {found.board.name}"
+    )
+    if board.total_kg <= 0.0:
+        return f"{told}; board {board.name} has no mass, so nothing can be calibrated with it"
+    try:
+        other = calibrated(vehicle, board)
+    except ConfigError as error:
+        return f"{told}; it cannot be with board {board.name}: {error}"
+    return f"{told}; with board {board.name} it would be {other.value:.4g} {unit}"
+
+
 def _board(vehicle: Vehicle, choices: Choices) -> Board:
     if choices.board is not None:
         return choices.board
@@ -195,14 +232,13 @@ def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, 
     both = [found]
     if found.board.name != OTHER_BOARD:
         both.append(calibrated(vehicle, load_board(OTHER_BOARD)))
-    units = {"rotor_pull_n": "N", "response_s": "s"}
     return [
         {
             "board": each.board.name,
             "board_kg": each.board.total_kg,
             "parameter": each.parameter,
             "value": each.value,
-            "unit": units[each.parameter],
+            "unit": _FREE_UNITS[each.parameter],
             "published_tmr_ratio": each.published_ratio,
             "tmr_ratio": each.tmr_ratio,
             "predicted_dmr_ratio": each.dmr_ratio,

@@ -66,6 +66,19 @@ def schemes_with(
     )
 
 
+def unlike_sources(schemes: tuple[Scheme, ...]) -> str | None:
+    """What is to be said where one detector's overhead is the paper's and another's is not."""
+    detectors = [scheme for scheme in schemes if scheme.name in DETECTORS]
+    papers = [scheme.name for scheme in detectors if scheme.source == _TABLE_V]
+    others = [scheme.name for scheme in detectors if scheme.source != _TABLE_V]
+    if not papers or not others:
+        return None
+    return (
+        f"the overhead of {' and '.join(papers)} is the paper's and that of {' and '.join(others)} "
+        "is not: different sources, so these rows are not to be ranked"
+    )
+
+
 def named(schemes: tuple[Scheme, ...], name: str) -> Scheme:
     """The scheme of this name, which must be there."""
     return next(scheme for scheme in schemes if scheme.name == name)

@@ -18,6 +18,7 @@ def table(told: Mapping[str, Any]) -> list[str]:
         f"Flights of {told['distance_m']:g} m at the safe velocity and hovering power; ratios "
         f"are over {told['ratios_over']}",
     ]
+    lines += [f"Note: {note}" for note in told["notes"]]
     for one in told["vehicles"]:
         lines += ["", *_vehicle(one, told["ratios_over"])]
     return lines
@@ -41,6 +42,7 @@ def csv_of(rows: Sequence[Mapping[str, Any]]) -> str:
 def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
     title = f": {one['description']}" if one["description"] else ""
     yield f"== {one['vehicle']}{title}; board {one['board']} =="
+    yield from (f"Note: {note}" for note in one["notes"])
     flying = [row for row in one["schemes"] if row["problem"] is None]
     yield from columns(
         ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof", "knee"],

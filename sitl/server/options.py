@@ -68,7 +68,7 @@ def parse(arguments: Sequence[str]) -> Options:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="sitl",
+        prog="mavfi sitl",
         description="A simulated quadrotor that speaks MAVLink as a PX4 does.",
         allow_abbrev=False,
     )
@@ -76,8 +76,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--world", default="dense", help="name, gen:density,size or TOML file (default: dense)")
     add("--seed", type=int, default=3, help="of the world (default: 3)")
     add("--vehicle", default="solo", help="profile name or TOML file (default: solo)")
-    add("--start", type=_triple, metavar="X,Y,Z", help="start, east,north,up in m")
-    add("--goal", type=_triple, metavar="X,Y,Z", help="goal, east,north,up in m")
+    add("--start", type=_triple, metavar="X,Y,Z", help="start, east,north,up in m; see --goal")
+    add(
+        "--goal", type=_triple, metavar="X,Y,Z",
+        help="goal, east,north,up in m; a generated world is made round start and goal: another "
+        "place moves its bounds, and towers within 3 m of it are left out",
+    )  # fmt: skip
     add(
         "--link", type=_link, action="append", metavar="[PRESET=]URL",
         help="endpoint, repeatable; presets: onboard, gcs, lockstep "

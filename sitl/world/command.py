@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import click
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.files import write_atomically, write_text
+from mavfi_cli.core.files import require_svg, write_atomically, write_text
 from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
 from sitl.world.generate import Pair
 from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, world_names
@@ -46,8 +46,13 @@ def _world_options(command: F) -> F:
     decorators = [
         click.argument("name", metavar="WORLD"),
         click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True),
-        click.option("--start", type=_Place(), help="Where flights start, ENU m."),
-        click.option("--goal", type=_Place(), help="Where they go, ENU m."),
+        click.option("--start", type=_Place(), help="Where flights start, ENU m. See --goal."),
+        click.option(
+            "--goal",
+            type=_Place(),
+            help="Where they go, ENU m. A generated world is made round start and goal: another "
+            "place moves its bounds, and towers within 3 m of it are left out.",
+        ),
         click.option("--json", "as_json", is_flag=True, help="The result as JSON."),
     ]
     for decorate in reversed(decorators):
@@ -169,6 +174,7 @@ def draw(
 
     made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
     file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
+    require_svg(file)
     path = check_world(made).path_enu_m if with_path else None
     picture = world_svg(made, path)
     write_atomically(file, lambda opened: opened.write(picture))

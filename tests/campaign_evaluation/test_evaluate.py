@@ -153,5 +153,8 @@ def test_real_flights_end_to_end(mavfi, tmp_path):
     assert before == 2 + 11
     again = mavfi(*line, "--detector", "none,range")
     assert again.stdout == first.stdout
+    text = mavfi(*line[:-1], "--detector", "none,range").stdout
+    files = "evaluation.json, evaluation.csv, roc.svg, recovery.svg"
+    assert text.splitlines()[-1] == f"Files  {tmp_path / 'out'}: {files}"
     with Ledger(folder) as ledger:
         assert ledger.over() == before

@@ -99,7 +99,8 @@ def test_the_tables_say_what_the_host_measured_and_what_was_simulated(filled):
     told = lines(found, 0.9)
     assert told[1].startswith("detection: checks, host time ")
     assert "90 % interval" in told[1]
-    assert told[5].startswith("recovery: % of flight time, simulated ")
+    assert told[4] == "(checks take the time of the host that flew, not scaled to the platform)"
+    assert told[6].startswith("recovery: % of flight time, simulated ")
     name = "setting=D&R(G) world=dense detector=gad"
     first, second = (row.removeprefix(name).split() for row in told if row.startswith(name))
     assert first[:3] == ["3", "41.7", "8.00"]

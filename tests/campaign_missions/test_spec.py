@@ -111,6 +111,14 @@ def test_detectors_and_what_they_protect():
     assert {m.config.fault for m in protected} == {faulty.config.fault}
 
 
+def test_a_planner_is_one_setting_however_it_is_written():
+    missions = spec_of('[factors]\nplanner = ["RRT*", "rrt-connect"]').missions()
+    assert [m.config.planner for m in missions] == ["rrtstar", "rrtconnect"]
+    assert [m.labels["planner"] for m in missions] == ["rrtstar", "rrtconnect"]
+    with pytest.raises(ConfigError, match="a value is listed twice"):
+        spec_of('[factors]\nplanner = ["rrtstar", "rrt-star"]')
+
+
 def test_scale_leaves_at_least_one_of_each():
     spec = spec_of(CROSSED)
     assert len(spec.scaled(2.0).missions()) == 2 * len(spec.missions())

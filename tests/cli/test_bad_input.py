@@ -9,12 +9,13 @@ import pytest
 from fake_autopilot import FakePX4
 
 from mavfi_cli.link import session
-from mavfi_cli.mission import flight
+from mavfi_cli.mission import flight, sortie
 
 
 @pytest.fixture
-def refused(command_line, tmp_path):
+def refused(command_line, tmp_path, monkeypatch):
     """Run `mavfi fly`, which must end with one line; the line. Also without --quiet."""
+    monkeypatch.setattr(sortie, "is_compiled", lambda: True)  # else there is a line about that
 
     def run(*arguments):
         code, out, err = command_line("fly", *arguments)
@@ -208,6 +209,11 @@ def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
     ("arguments", "said"),
     [
         (["--bits", "3"], "--bits needs --inject"),
+        (["--field", "sign"], "--field needs --inject"),
+        (["--level", "instruction"], "--level instruction needs --inject NODE"),
+        (["--inject", "detector"], "--inject detector needs --detector NAME"),
+        (["--link", "udpin:127.0.0.1:14540"], "--link needs --goal X,Y,Z"),
+        (["--platform", "measured:2"], "--platform measured:2 needs --realtime"),
         (["--inject", "planning", "--sampling", "cpu-time"], "--sampling needs --level"),
         (["--level", "instruction", "--inject", "octomap", "--at", "tick=3"], "--at needs --level"),
     ],

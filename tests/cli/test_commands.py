@@ -10,6 +10,7 @@ import pytest
 
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.report.summary import event_lines, summary_lines
+from sitl.world.generate import CLEAR_RADIUS_M
 
 HEAVY = ("numba", "numpy", "torch", "matplotlib", "scipy", "pyarrow", "ompl", "fcl", "pymavlink")
 
@@ -35,6 +36,16 @@ def test_help_names_every_command(command_line):
         assert f"\n  {name} " in out
         sub_code, _, _ = command_line(name, "--help")
         assert sub_code == 0
+
+
+def test_the_vehicle_s_help_has_the_command_s_name(command_line):
+    assert command_line("sitl", "--help")[1].startswith("usage: mavfi sitl ")
+
+
+@pytest.mark.parametrize("command", [("fly",), ("world", "make"), ("sitl",)])
+def test_help_says_what_another_goal_does_to_a_generated_world(command_line, command):
+    told = " ".join(command_line(*command, "--help")[1].split())
+    assert f"towers within {CLEAR_RADIUS_M:g} m of it are left out" in told
 
 
 def test_who_interrupts_is_told_how_to_go_on(command_line, monkeypatch):
@@ -63,7 +74,14 @@ def test_show_draws_a_run_that_has_no_picture(command_line, short_flight, tmp_pa
     code, out, err = command_line("show", short_flight.path, "--picture", path)
     assert (code, err) == (0, "")
     assert path.read_text().startswith("<?xml")
-    assert f"Run folder  {short_flight.path}" in out
+    assert out.endswith(f"Run folder  {short_flight.path}\nPicture     {path}\n")
+
+
+def test_show_refuses_a_picture_that_is_no_svg(command_line, short_flight, tmp_path):
+    code, out, err = command_line("show", short_flight.path, "--picture", "above.png")
+    said = "error: above.png: pictures are SVG: name a file that ends in .svg\n"
+    assert (code, out, err) == (1, "", said)
+    assert not (tmp_path / "above.png").exists()
 
 
 def test_show_events_and_json(command_line, troubled_flight):

@@ -40,6 +40,12 @@ def test_plain_lines_come_every_ten_simulated_seconds(capsys):
     ]
 
 
+def test_a_note_comes_at_once(capsys, terminal):
+    with progress_view(MissionConfig(), quiet=False) as watcher:
+        watcher.on_note("compiling [once]")
+    assert "compiling [once]" in capsys.readouterr().err
+
+
 def test_before_anything_happened_nothing_is_said(capsys):
     with progress_view(MissionConfig(), quiet=False):
         pass

@@ -19,6 +19,16 @@ def test_the_table_is_the_paper_s_figure(command_line):
     assert "rotor_pull_n = 8.331 N (calibrated); TMR x 1.9100, paper x 1.91; DMR x 1.2959" in out
 
 
+def test_notes_stand_above_the_tables(command_line):
+    _, out, _ = command_line("vpm", "--vehicle", "spark", "--board", "raspi3b", "--overhead",
+                             "aad=0.1")  # fmt: skip
+    notes = [line for line in out.splitlines() if line.startswith("Note: ")]
+    assert len(notes) == 3
+    assert notes[0].startswith("Note: the overhead of gad is the paper's")
+    assert notes[1].startswith("Note: the board is raspi3b, and the response time is still")
+    assert out.index(notes[2]) < out.index("scheme  boards")
+
+
 def test_csv_and_json_say_the_same(command_line, tmp_path):
     _, out, _ = command_line("vpm", "--csv")
     rows = list(csv.DictReader(out.splitlines()))
@@ -74,7 +84,10 @@ def test_every_number_of_the_table_has_its_unit(command_line):
 
 def test_files_and_pictures(command_line, tmp_path):
     line = ("vpm", "--vehicle", "spark", "--board", "xavier", "--out", "report")
-    assert command_line(*line)[0] == 0
+    code, out, _ = command_line(*line)
+    assert code == 0
+    files = "vpm.json, vpm.csv, roofline.svg, redundancy.svg"
+    assert out.splitlines()[-1] == f"Files  report: {files}"
     folder = tmp_path / "report"
     first = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(first) == {"roofline.svg", "redundancy.svg", "vpm.json", "vpm.csv"}

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import xml.etree.ElementTree as ET
 
 import pytest
@@ -53,7 +54,8 @@ def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     assert (code, again, err) == (0, out, "")
     assert {path: path.read_bytes() for path in folder.glob("*.*")} == before
     overhead = command_line("vpm", "--vehicle", "spark", "--overhead", "out")[1]
-    assert "measured in 1 flight of out: checks " in overhead
+    assert re.search(r"measured in 1 flight of out on x86 x [\d.]+: checks ", overhead)
+    assert "not scaled to the platform" in out
 
 
 def _like_beside_like(rows):
@@ -75,7 +77,7 @@ def _flown_as_planned(told, rows):
     assert set(used) == {"gad", "aad"}
     for name, percent in used.items():
         assert model[name]["overhead_percent"] == pytest.approx(percent)
-        assert model[name]["source"].startswith("measured in 1 flight of --fly: checks ")
+        assert model[name]["source"].startswith("measured in 1 flight of --fly on x86 x ")
 
 
 def _units(told):

@@ -12,7 +12,9 @@ CALLER = (
     "@compiled\n"
     "def outer(x):\n"
     "    return inner(x)\n"
-    "print(outer(1.0), sum(outer.stats.cache_hits.values()))\n"
+    "from mavfi_cli.core.compiled import in_cache\n"
+    "known = in_cache(outer)\n"
+    "print(outer(1.0), sum(outer.stats.cache_hits.values()), known)\n"
 )
 
 
@@ -26,7 +28,7 @@ def test_an_edited_callee_is_compiled_anew(tmp_path, monkeypatch):
         return result.stdout.split()
 
     (tmp_path / "callee_module.py").write_text(CALLEE.format(1.0))
-    assert run() == ["2.0", "0"]
-    assert run() == ["2.0", "1"]
+    assert run() == ["2.0", "0", "False"]
+    assert run() == ["2.0", "1", "True"]
     (tmp_path / "callee_module.py").write_text(CALLEE.format(5.0))
-    assert run() == ["6.0", "0"]
+    assert run() == ["6.0", "0", "False"]

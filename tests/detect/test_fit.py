@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from mavfi_cli.core.errors import ConfigError, ModelError
+from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import fit, model, registry, train_autoencoder
 from mavfi_cli.detect.dataset import Dataset, Flight
@@ -67,7 +67,7 @@ def test_too_few_flights_are_refused(dataset):
 
 
 def test_bad_requests(dataset):
-    with pytest.raises(ModelError, match="no way to fit a detector 'x'; known: gad, aad"):
+    with pytest.raises(UnknownName, match="unknown detector 'x': Known: aad, gad, l2, range"):
         fit.fit("x", dataset)
     with pytest.raises(ConfigError, match="n sigma"):
         fit.fit("gad", dataset, n_sigma=-1.0)

@@ -100,6 +100,17 @@ def test_every_plan_and_every_mark_is_drawn(run, axes):
     assert goal.get_radius() == run.result["config"]["goal_tolerance_m"]
 
 
+def test_a_fault_at_the_start_does_not_hide_where_the_flight_began(run):
+    places = run.trace.slice(0, 1).to_pylist()[0]
+    there = [places[f"truth_{axis}_m"] for axis in "xyz"]
+    event = {"kind": "fault", "stamp_s": 0.0, "text": "", "position_enu_m": there}
+    axes = draw_top_view(changed(run, events=[event])).axes[0]
+    marks = {each.get_label(): each for each in axes.collections}
+    np.testing.assert_array_equal(marks["start"].get_offsets(), marks["fault"].get_offsets())
+    assert marks["start"].get_zorder() > marks["fault"].get_zorder()
+    assert marks["start"].get_sizes()[0] < marks["fault"].get_sizes()[0]  # and both are seen
+
+
 def test_scales_are_equal_and_everything_of_the_flight_is_inside(run, axes):
     assert axes.get_aspect() == 1.0
     (low_x, high_x), (low_y, high_y) = axes.get_xlim(), axes.get_ylim()

@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.report.drawing import DETECTORS
 from mavfi_cli.report.trajectories import Panel, draw_trajectories, lines, write_trajectories
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -90,6 +91,18 @@ def test_every_way_is_the_truth_of_its_flight(panels, figure):
         assert widths == sorted(widths, reverse=True)  # those of one way are seen over each other
         boxes = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
         assert len(boxes) == len(panel.flights[0][1].result["world"]["boxes"])
+
+
+def test_a_protected_flight_has_the_colour_of_its_detector(golden):
+    """Whatever its place; a second name with the same detector takes its turn."""
+    guarded = {name: faulty(golden, detection={"detector": name, "alarms": []})
+               for name in ("gad", "aad")}  # fmt: skip
+    flights = [("golden", golden), ("FI", faulty(golden)), ("D&R(G)", guarded["gad"]),
+               ("D&R(A)", guarded["aad"]), ("D&R(A), 2", guarded["aad"])]  # fmt: skip
+    axes = draw_trajectories([Panel(title="", flights=flights)]).axes[0]
+    colours = [line.get_color() for line in axes.lines]
+    assert colours[2:4] == [DETECTORS["gad"], DETECTORS["aad"]]
+    assert len(set(colours)) == 5
 
 
 def test_faults_and_alarms_have_the_colour_of_their_flight(figure):

@@ -10,7 +10,7 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.vpm.overhead import overheads_of
 
 
-def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None):
+def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None, platform="x86"):
     listed = [{"stage": stage, "response": response} for stage, response in alarms]
     counts = {"recompute": 0, "hold": 0, "accept": 0}
     for _, response in alarms:
@@ -25,6 +25,7 @@ def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None):
         },
         "quality_of_flight": {"flight_time_s": 20.0},
         "fault": fault,
+        "config": {"platform": platform},
         "kernels": {
             "point_cloud": {"invocations": 100, "busy_s": 1.0},
             "octomap": {"invocations": 20, "busy_s": 6.0},
@@ -71,8 +72,37 @@ def test_flights_are_taken_together_and_faulty_ones_left_out():
     assert set(found) == {"gad", "aad"}
     assert found["gad"].flights == 2
     assert found["gad"].share == pytest.approx(0.06 / 18.0)
-    assert found["gad"].told("here").startswith("measured in 2 flights of here: checks 0.3333 %")
-    assert found["aad"].told("here").startswith("measured in 1 flight of here: ")
+    assert (
+        found["gad"]
+        .told("here")
+        .startswith("measured in 2 flights of here on x86: checks 0.3333 %")
+    )
+    assert found["aad"].told("here").startswith("measured in 1 flight of here on x86: ")
+
+
+def test_flights_on_another_platform_do_not_count():
+    """Recomputations and kernels are those of the flight's platform; the checks are not scaled."""
+    flights = [flight(), flight(gate_s=0.04, platform="tx2"), flight("aad")]
+    assert overheads_of(flights)["gad"].platforms == ("tx2", "x86")
+    found = overheads_of(flights, "tx2")
+    assert set(found) == {"gad"}
+    assert found["gad"].share == pytest.approx(0.04 / 9.0)
+    told = found["gad"].told("here")
+    assert told.startswith("measured in 1 flight of here on tx2 (1 on other platforms left out): ")
+    assert told.endswith("; checks take the time of the host that flew, not scaled to the platform")
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [("tx2 x 1.0222", True), ("tx2 x 2.1", False), ("tx2 x heavy", False), ("tx2-2c", False)],
+)
+def test_a_platform_scaled_for_a_detector_s_share_is_the_platform(tmp_path, name, counts):
+    """`mavfi vpm --fly` flies with such files; a file that is gone leaves its own name."""
+    path = tmp_path / "flown.toml"
+    path.write_text(f'name = "{name}"\nbase = "tx2"\ncores = 4\nscale = 1.0222\n')
+    assert ("gad" in overheads_of([flight(platform=str(path))], "tx2")) is counts
+    path.unlink()
+    assert overheads_of([flight(platform=str(path))])["gad"].platforms == ("flown",)
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +125,11 @@ def test_the_command_takes_a_run_folder(guarded, tmp_path):
     assert measured(str(guarded.path.parent))["gad"][0] > 0.0  # the folder of runs
     assert measured(str(guarded.result))["gad"] == (percent, told.replace(
         str(guarded.path), str(guarded.result)))  # fmt: skip
-    assert told.startswith(f"measured in 1 flight of {guarded.path}: checks ")
+    assert told.startswith(f"measured in 1 flight of {guarded.path} on x86: checks ")
     assert overheads((str(guarded.path), "aad=0.5"))["aad"] == (0.5, "--overhead")
+    assert measured(str(guarded.path), "x86")["gad"] == (percent, told)
+    with pytest.raises(RecordError, match="flew on x86, not on tx2"):
+        measured(str(guarded.path), "tx2")
     with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
         measured(str(tmp_path))
     with pytest.raises(UsageError, match=r"no such file or folder; for per cent write aad=0\.0062"):

@@ -253,3 +253,52 @@ def test_names_and_boards_that_do_not_exist(tmp_path):
     )
     with pytest.raises(ConfigError, match=r"b\.toml.*power_w: must not be negative, is -2"):
         load_board(str(tmp_path / "b.toml"))
+
+
+def test_only_one_measured_overhead_is_said():
+    """Rows from two sources are not to be ranked; the paper's two, or two measured ones, may be."""
+    chosen, vehicle = Choices(), [load_vehicle("spark")]
+    assert report(vehicle, chosen, SCHEMES)["notes"] == []
+    assert report(vehicle, chosen, schemes_with({"gad": 0.3, "aad": 0.1}))["notes"] == []
+    (note,) = report(vehicle, chosen, schemes_with({"aad": 0.1}))["notes"]
+    assert note.startswith("the overhead of gad is the paper's and that of aad is not: ")
+
+
+OWN_TIME = "and the response time is still the vehicle's own ({}): give --response or --platform"
+SPARK_TIME = "paper, section VII-D: 289 ms + 83 ms + 0.46 ms, one after the other"
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "choices", "notes"),
+    [
+        ("spark", {}, []),
+        ("spark", {"board": "a57"}, []),
+        ("airsim", {"platform": "tx2"}, []),  # its calibrated response time is not used
+        ("cal20", {"board": "ncs", "response_s": 0.1}, []),
+        ("spark", {"platform": "tx2"},
+         ["rotor_pull_n = 8.331 N is calibrated with board a57; with board tx2 it would be "
+          "9.433 N"]),
+        ("spark", {"board": "raspi3b"},
+         [f"the board is raspi3b, {OWN_TIME.format(SPARK_TIME)}",
+          "rotor_pull_n = 8.331 N is calibrated with board a57; with board raspi3b it would be "
+          "3.903 N"]),
+        ("spark", {"platform": "x86"},
+         ["rotor_pull_n = 8.331 N is calibrated with board a57; board x86 has no mass, so nothing "
+          "can be calibrated with it"]),
+        ("airsim", {"board": "raspi3b"},
+         [f"the board is raspi3b, {OWN_TIME.format('calibrated with board a57')}",
+          "response_s = 0.8175 s is calibrated with board a57; it cannot be with board raspi3b: "
+          "calibration.tmr_time_ratio: no response_s gives 'airsim' a ratio of 1.06; it can be "
+          "1.000 to 1.027"]),
+    ],
+)  # fmt: skip
+def test_what_another_computer_leaves_as_it_was_is_said(vehicle, choices, notes):
+    loads = {"board": load_board, "platform": load_platform, "response_s": float}
+    chosen = Choices(**{key: loads[key](value) for key, value in choices.items()})
+    assert told(vehicle, chosen)["notes"] == notes
+
+
+def test_the_calibration_that_a_note_names_is_the_table_s():
+    """Found independently: the footer's second calibration is with the TX2 board."""
+    one = told("spark", Choices(platform=load_platform("tx2")))
+    assert f"{one['calibrations'][1]['value']:.4g} N" in one["notes"][0]

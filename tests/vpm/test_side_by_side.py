@@ -69,7 +69,7 @@ def spark(tmp_path):
         chosen = {**plans, **{("spark", name): "too heavy to fly" for name in refused}}
         overhead = Overhead(
             detector="aad", flights=3, detection_s=0.01, recompute_s=0.0, compute_s=10.0,
-            host_compute_s=0.2, alarms=9,
+            host_compute_s=0.2, alarms=9, platforms=("x86",),
         )  # fmt: skip
         compared = side_by_side(told, chosen, flown, paired_ratio, {"aad": overhead})
         flights = {"worlds": ["w"], "missions_each": count, "first_seed": 1, "detectors": "mine",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib.metadata import entry_points
 
+from mavfi_cli.autonomy.planner_names import OURS, canonical
 from mavfi_cli.autonomy.planners.base import Planner
 from mavfi_cli.autonomy.planners.rrt import RRT
 from mavfi_cli.autonomy.planners.rrt_connect import RRTConnect
@@ -13,11 +14,7 @@ from mavfi_cli.core.errors import UnknownName
 
 ENTRY_POINT_GROUP = "mavfi.planners"
 
-_OURS: dict[str, Callable[[], Planner]] = {
-    "rrtstar": RRTStar,
-    "rrt": RRT,
-    "rrtconnect": RRTConnect,
-}
+_OURS: dict[str, Callable[[], Planner]] = dict(zip(OURS, (RRTStar, RRT, RRTConnect), strict=True))
 
 
 def names() -> list[str]:
@@ -29,12 +26,12 @@ def names() -> list[str]:
 def find(name: str) -> Planner:
     """The planner of that name with its default settings.
 
-    Case, hyphens, underscores and the star of RRT* do not matter for our own.
+    Spellings of our own do not matter: `planner_names.canonical`.
 
     Raises:
         UnknownName: there is none; names the nearest.
     """
-    plain = name.lower().replace("*", "star").replace("-", "").replace("_", "")
+    plain = canonical(name)
     if plain in _OURS:
         return _OURS[plain]()
     for entry in entry_points(group=ENTRY_POINT_GROUP):

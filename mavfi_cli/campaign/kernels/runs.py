@@ -111,7 +111,8 @@ def run_kernels(
         plan: what to do.
         jobs: worker processes.
         folder: where records go; the runs that it has already are not repeated.
-        progress: called with the kernel and the number of its runs that are there.
+        progress: called with the kernel and the number of its runs that are there; with 0 before
+            its golden run and profile.
 
     Raises:
         TracingForbidden: the operating system refuses.
@@ -127,6 +128,8 @@ def _run_kernel(
     plan: Plan, name: str, workers: Workers, journal: Journal | None, progress: Progress | None
 ) -> KernelRuns:
     begun = time.perf_counter()
+    if progress is not None:
+        progress(name, 0)
     with one_processor():
         prepared, place = _prepare(plan, name)
     bench = _Bench(plan=plan, kernel=name, layout=prepared.layout, golden=prepared.golden)

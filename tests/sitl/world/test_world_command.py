@@ -83,6 +83,7 @@ def test_draw_writes_a_whole_svg_and_the_same_one_again(
         (["check", "dnse"], "did you mean 'dense'"),
         (["check", "factory", "--goal", "30,50,5"], "inside an obstacle"),
         (["draw", "dense", "-o", "/nonexistent/x.svg"], "No such file"),
+        (["draw", "dense", "-o", "x.png"], "x.png: pictures are SVG"),
         (["make", "/nonexistent/x.toml"], "No such file"),
     ],
 )
