@@ -153,7 +153,8 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
         "random": f"at a random moment ({trigger['drawn_time_s']:.2f} s into the flight)",
         "time": f"{trigger['number']:g} s into the flight",
         "tick": f"at control tick {trigger['number']:g}",
-        "phase": f"in the phase {trigger['phase']}",
+        "phase": f"once the pilot is in the phase {trigger['phase']}",
+        "foreseen": "once a collision is foreseen",
         "invocation": f"at invocation {trigger['number']:g} of the kernel",
     }[trigger["when"]]
     request = fault["request"]
