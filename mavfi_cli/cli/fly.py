@@ -95,7 +95,7 @@ class _Size(click.ParamType[Any]):
                    "or name a state or group, as `mavfi states` lists them; or detector, "
                    "detector.threshold ...: what the detector itself keeps.")  # fmt: skip
 @click.option("--at", default="random", show_default=True,
-              metavar="random|time=S|tick=N|phase=NAME|invocation=N",
+              metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
               help="When the fault strikes, counted from the companion's taking over.")  # fmt: skip
 @click.option("--bits", default=1, show_default=True, help="How many bits are flipped.")
 @click.option("--field", default="any", show_default=True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import click
@@ -23,14 +24,16 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     """Repeat RUN, a run folder, and say whether the record is the same to the byte.
 
     Exits with 1 where a repetition differs. With --without-fault a difference is the point: it is
-    what the fault did.
+    what the fault did. Interrupted, it leaves nothing behind.
     """
+    from mavfi_cli.core.errors import Interrupted
     from mavfi_cli.fi.record import read
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.replay import (
         config_of,
         differing_results,
         first_difference,
+        interrupted,
         same_file,
         version_differences,
     )
@@ -48,6 +51,9 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
             config, out, Watcher(), repeat=repeat, for_debugger=_say_where if gdb else None
         ).path
     )
+    if interrupted(again):
+        shutil.rmtree(again.folder.path)
+        raise Interrupted("interrupted: the repetition was not flown to its end")
     differing = [
         section
         for section in differing_results(recorded.result, again.result)

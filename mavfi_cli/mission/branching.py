@@ -120,6 +120,11 @@ class Trunk(NoInjection):
         self.follower = own.follower
         self._waiting = {}
 
+    def watch(self, moment: Moment) -> None:
+        """Let the triggers of all see where the flight stands."""
+        for fault in (self._own, *self._waiting.values()):
+            fault.watch(moment)
+
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
         """A message as its receiver gets it in this process's mission."""
         return self._offer(message, lambda fault, given: fault.pass_on(given, moment, index))

@@ -136,7 +136,9 @@ class Companion:
 
     def _take_report(self, checked: tuple[CollisionReport, float], stamp_s: float) -> None:
         report, self._fresh_frame_s = checked
-        report = self._injection.pass_on(report, self._moment(stamp_s))
+        moment = self._moment(stamp_s, foresees=report.collision)
+        self._injection.watch(moment)
+        report = self._injection.pass_on(report, moment)
         if not self._recovery.admit_report(report, stamp_s):
             return
         self.report = report
@@ -210,6 +212,7 @@ class Companion:
         if self._injection.follower is not None:
             self._follow(self._injection.follower, stamp_s)
         directive = self.directive = self.pilot.update(stamp_s, state)
+        self._injection.watch(self._moment(stamp_s))
         if directive.plan is not None:
             assert self._snapshot is not None
             self.executor.submit("planner", (directive.plan, self._snapshot))
@@ -310,13 +313,14 @@ class Companion:
         else:
             self._commands.append(renewed)
 
-    def _moment(self, stamp_s: float) -> Moment:
+    def _moment(self, stamp_s: float, *, foresees: bool = False) -> Moment:
         takeover_s = stamp_s if self._takeover_s is None else self._takeover_s
         return Moment(
             stamp_s=stamp_s,
             flight_s=stamp_s - takeover_s,
             tick=self._ticks,
             phase=self.pilot.mode.value,
+            foresees=foresees,
         )
 
     @property

@@ -29,7 +29,7 @@ class FaultConfig:
         target: a stage, a state, or a group of states; or `detector`, `detector.PART`: its own
             memory, such as `detector.threshold`.
         seed: root of the fault's own random streams.
-        at: "random", "time=SECONDS", "tick=N", "phase=NAME" or "invocation=N".
+        at: "random", "time=SECONDS", "tick=N", "phase=NAME", "foreseen" or "invocation=N".
         together: strike all components of the group at once.
         exact_bits: these bits instead of drawn ones.
     """
@@ -111,8 +111,8 @@ def parse_trigger(text: str) -> Trigger:
 
     kind, _, value = text.partition("=")
     when: When = _member(When, "trigger", kind)
-    if when is When.RANDOM:
-        return Trigger()
+    if when in (When.RANDOM, When.FORESEEN):
+        return Trigger(when=when)
     if when is When.PHASE:
         return Trigger(when=when, phase=_member(Mode, "phase", value).value)
     try:

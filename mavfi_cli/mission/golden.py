@@ -6,9 +6,9 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.errors import Interrupted, RecordError
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.replay import config_of, interrupted
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.run_folder import Run, load_run
 
@@ -20,14 +20,22 @@ def paired_golden(run: Run) -> Run:
 
     Raises:
         RecordError: the run does not repeat, or its folder cannot be written.
+        Interrupted: the user ended the golden flight; nothing of it is kept.
     """
+    config = config_of(run, with_fault=False)
     kept = run.folder.path / FOLDER
-    if not kept.is_dir():
-        config = config_of(run, with_fault=False)
+    if kept.is_dir():
+        golden = load_run(kept)
+        if not interrupted(golden):
+            return golden
+    try:
         with tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent:
             flown = fly_mission(config, Path(parent), Watcher())
-            try:
-                shutil.move(flown.path, kept)
-            except OSError as error:
-                raise RecordError(f"{kept}: {error.strerror or error}") from None
+            if interrupted(load_run(flown.path)):
+                raise Interrupted("interrupted: the golden pair was not flown to its end")
+            if kept.is_dir():
+                shutil.rmtree(kept)
+            shutil.move(flown.path, kept)
+    except OSError as error:
+        raise RecordError(f"{kept}: {error.strerror or error}") from None
     return load_run(kept)

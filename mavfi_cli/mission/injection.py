@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,6 +31,9 @@ class NoInjection:
 
     follower: Follower | None = None
 
+    def watch(self, moment: Moment) -> None:
+        """Where the mission stands: said once a control tick, and before every report goes on."""
+
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
         """The message itself."""
         return message
@@ -53,7 +57,7 @@ class NoInjection:
         return None
 
 
-class _Recorded(NoInjection):
+class _Recorded(NoInjection, ABC):
     """The record of a fault: on the disk before the flight, at the first strike, at the end."""
 
     def __init__(self, config: FaultConfig) -> None:
@@ -78,6 +82,10 @@ class _Recorded(NoInjection):
         told, self._news = self._news, []
         return told
 
+    @abstractmethod
+    def _missed(self) -> str:
+        """Why nothing was struck."""
+
     def _on_strike(self, strike: Strike) -> None:
         """The first strike reaches the disk before its message goes on."""
         self._strike = strike
@@ -97,7 +105,7 @@ class _Recorded(NoInjection):
 
     def record(self) -> dict[str, Any]:
         """What was asked for, what was drawn, what was hit."""
-        reason = "the mission ended before the trigger" if self._state == "not_injected" else ""
+        reason = self._missed() if self._state == "not_injected" else ""
         return {
             "schema": SCHEMA,
             "level": "source",
@@ -125,6 +133,13 @@ class Injection(_Recorded):
             listener=self._on_strike,
         )
         self.follower: Follower = Follower()
+
+    def watch(self, moment: Moment) -> None:
+        """Let the trigger see where the mission stands."""
+        self._injector.watch(moment)
+
+    def _missed(self) -> str:
+        return self._injector.missed
 
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
         """A message as its receiver gets it."""
@@ -182,6 +197,13 @@ class DetectorInjection(_Recorded):
             shortest_flight_s=shortest_flight_s,
             listener=self._on_strike,
         )
+
+    def watch(self, moment: Moment) -> None:
+        """Let the trigger see where the mission stands."""
+        self._injector.watch(moment)
+
+    def _missed(self) -> str:
+        return self._injector.missed
 
     def strike_memory(self, moment: Moment) -> None:
         """Act on the detector's memory if the moment has come."""

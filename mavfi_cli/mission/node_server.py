@@ -7,6 +7,7 @@ repetition. A fork of the companion would carry the traces of everything that ra
 
 from __future__ import annotations
 
+import os
 import socket
 import sys
 from dataclasses import dataclass
@@ -25,11 +26,23 @@ from mavfi_cli.mission.protection import NoProtection
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """The first message to the program; it answers with its `KernelScope`."""
+    """The first message to the program; it answers with its `KernelScope` and a stamp.
+
+    The stamp says when something was last added to a cache of the code that it has loaded, ns since
+    the epoch.
+    """
 
     config: MissionConfig
     briefing: Briefing
     node: str
+
+
+def _newest_cache_ns() -> int:
+    """When a file of bytecode, or of compiled kernels beside it, was last added, ns."""
+    specs = [getattr(module, "__spec__", None) for module in sys.modules.values()]
+    files = [spec.cached for spec in specs if spec is not None and spec.cached is not None]
+    folders = sorted({os.path.dirname(file) for file in files})
+    return max((os.stat(each).st_mtime_ns for each in folders if os.path.isdir(each)), default=0)
 
 
 def main() -> None:
@@ -50,7 +63,7 @@ def main() -> None:
         NoInjection(),
         NoProtection(),
     )
-    send(connection, node_scope(setup.node, config.planner))
+    send(connection, (node_scope(setup.node, config.planner), _newest_cache_ns()))
     serve(connection, {setup.node: companion.executor.nodes[setup.node].run})
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.platform import measured_factor
 from mavfi_cli.mission.run_folder import Run
@@ -35,9 +36,12 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
     against.
 
     Raises:
-        RecordError: it flew a foreign autopilot, or on measured times: nothing can repeat that.
+        RecordError: it flew a foreign autopilot, on measured times, or until a person ended it:
+            nothing can repeat that.
     """
     values = dict(run.result["config"])
+    if interrupted(run):
+        raise RecordError(f"{run.folder.path}: an interrupted flight does not repeat")
     if values.get("link") is not None:
         raise RecordError(f"{run.folder.path}: a flight of a foreign autopilot does not repeat")
     if measured_factor(values.get("platform", "")) is not None:
@@ -45,6 +49,11 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
     if not with_fault:
         values["fault"] = values["instruction"] = values["detector"] = None
     return structure(values, MissionConfig, path=run.folder.result)
+
+
+def interrupted(run: Run) -> bool:
+    """Whether a person ended the flight, so that its record says nothing about the mission."""
+    return bool(run.result["outcome"] == Outcome.INTERRUPTED.value)
 
 
 def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]) -> list[str]:

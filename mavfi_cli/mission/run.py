@@ -21,7 +21,7 @@ import numpy as np
 
 from mavfi_cli import __version__
 from mavfi_cli.autonomy import planners
-from mavfi_cli.core.errors import MavfiError, VehicleProcessError
+from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission import briefing, quality
 from mavfi_cli.mission.branching import Branching
@@ -185,7 +185,10 @@ def _plan(
     def fly_golden(golden: MissionConfig, folder: Path, recorder: Recorder) -> None:
         """The flight whose invocations a fault is drawn from."""
         flown = fly_mission(golden, folder, Watcher(), recorder=recorder, vehicles=vehicles)
-        if json.loads(flown.result.read_text())["referee"] is None:  # nothing to draw from
+        result = json.loads(flown.result.read_text())
+        if result["outcome"] == Outcome.INTERRUPTED.value:  # cut off: others would be drawn
+            raise Interrupted("interrupted")
+        if result["referee"] is None:  # nothing to draw from
             raise VehicleProcessError("the vehicle process of the golden flight died")
 
     return plan_fault(config, asked, out, installed_versions(), fly_golden)

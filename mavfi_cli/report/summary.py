@@ -34,8 +34,7 @@ def outcome_line(result: dict[str, Any]) -> str:
 
 def summary_lines(result: dict[str, Any]) -> list[str]:
     """Outcome, quality of flight, perception-planning-control figures, cost on this machine."""
-    config, qof = result["config"], result["quality_of_flight"]
-    counters, host = result["pilot"], result["host"]
+    config, host = result["config"], result["host"]
     flown = f"{config['vehicle']} in {config['world']}, seed {config['seed']}"
     if config["link"] is not None:
         flown = f"foreign autopilot at {config['link']}, seed {config['seed']}"
@@ -43,15 +42,7 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
         outcome_line(result),
         "",
         f"Mission     {flown}; planner {config['planner']}, platform {config['platform']}",
-        f"Flight      {_number(qof['flight_time_s'], 's')}, "
-        f"{_number(qof['distance_m'], 'm')} flown, "
-        f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
-        f"Clearance   {_number(qof['min_clearance_m'], 'm', 2)} at the closest",
-        f"Energy      {_number(_kilo(qof['energy_regression_j']), 'kJ')} (paper's regression), "
-        f"{_number(_kilo(qof['energy_propeller_j']), 'kJ')} (propeller shafts)",
-        f"Plans       {counters['plans_requested']} asked for, {counters['replans']} replans, "
-        f"{counters['plans_failed']} failed; {counters['collisions_foreseen']} collisions "
-        f"foreseen, {counters['slowdowns']} slow-downs, {counters['stops']} stops",
+        *_flight_lines(result),
     ]
     lines += fault_lines(result)
     lines += node_lines(result)
@@ -70,6 +61,27 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
             f"seconds: {factor:.0f} times real time, after {host['startup_s']:.1f} s of start-up"
         )
     return lines
+
+
+def _flight_lines(result: dict[str, Any]) -> list[str]:
+    """Quality of flight, and what became of the plans; of no flight that it was none."""
+    qof, counters = result["quality_of_flight"], result["pilot"]
+    if qof["flight_time_s"] is None:
+        return ["Flight      none: the mission ended before the companion took over"]
+    flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in result["events"])
+    asked, failed = counters["plans_requested"], counters["plans_failed"]
+    return [
+        f"Flight      {_number(qof['flight_time_s'], 's')}, "
+        f"{_number(qof['distance_m'], 'm')} flown, "
+        f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
+        f"Clearance   {_number(qof['min_clearance_m'], 'm', 2)} at the closest",
+        f"Energy      {_number(_kilo(qof['energy_regression_j']), 'kJ')} (paper's regression), "
+        f"{_number(_kilo(qof['energy_propeller_j']), 'kJ')} (propeller shafts)",
+        f"Plans       {asked} asked for: {flown} flown ({counters['replans']} replans), "
+        f"{failed} failed, {asked - flown - failed} not used",
+        f"Obstacles   {counters['collisions_foreseen']} collisions foreseen, "
+        f"{counters['slowdowns']} slow-downs, {counters['stops']} stops",
+    ]
 
 
 def measured_lines(result: dict[str, Any]) -> list[str]:
@@ -153,7 +165,8 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
         "random": f"at a random moment ({trigger['drawn_time_s']:.2f} s into the flight)",
         "time": f"{trigger['number']:g} s into the flight",
         "tick": f"at control tick {trigger['number']:g}",
-        "phase": f"in the phase {trigger['phase']}",
+        "phase": f"once the pilot is in the phase {trigger['phase']}",
+        "foreseen": "once a collision is foreseen",
         "invocation": f"at invocation {trigger['number']:g} of the kernel",
     }[trigger["when"]]
     request = fault["request"]

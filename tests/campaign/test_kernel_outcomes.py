@@ -9,7 +9,7 @@ import pytest
 
 from mavfi_cli.campaign.kernels.attack import attacker_of, golden_run
 from mavfi_cli.campaign.kernels.catalogue import Kernel
-from mavfi_cli.campaign.kernels.place import Place, Template
+from mavfi_cli.campaign.kernels.place import Place, Template, load
 from mavfi_cli.campaign.kernels.profile import profile_kernel
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.isolated.outcome import Outcome
@@ -106,3 +106,28 @@ def test_a_run_that_is_given_up_disturbs_no_other(known):
         tracee = place.start()
         tracee.kill()
         assert golden_run(place).output == golden.output
+
+
+IMPORTING = """
+import os
+import beside
+from mavfi_cli.campaign.kernels import template
+template.receive_inputs()
+os.write(template.CONTROL, template.RUN)
+os.read(template.CONTROL, 1)
+"""
+
+
+def test_the_bytecode_that_an_attacked_process_finds_is_always_there(tmp_path, monkeypatch):
+    """Else its memory would depend on what else has run here, and on the user's settings."""
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    (tmp_path / "beside.py").write_text("")
+    script = tmp_path / "importing.py"
+    script.write_text(IMPORTING)
+    template = Template(arguments=(str(script),), data=b"")
+    Place("importing", template, look_up=False).close()
+    assert not (tmp_path / "__pycache__").exists()
+    load("importing", template)
+    assert [path.name.partition(".")[0] for path in (tmp_path / "__pycache__").iterdir()] == [
+        "beside"
+    ]

@@ -73,6 +73,27 @@ def test_another_campaign_is_not_mixed_in(attack, control_copy):
         attack("control", runs=1, folder=control_copy, tolerance=0.5)
 
 
+@pytest.mark.parametrize(
+    ("kernels", "runs", "problem"),
+    [
+        (("control",), 29, "holds 30 runs already, 29 are asked for: ask for at least as many"),
+        (("point_cloud",), 30, "holds runs of control as well: name every kernel that it has"),
+    ],
+)
+def test_what_was_measured_is_never_left_out(attack, control_copy, kernels, runs, problem):
+    before = {path.name: path.read_bytes() for path in control_copy.iterdir()}
+    with pytest.raises(ConfigError, match=problem):
+        attack(*kernels, runs=runs, folder=control_copy)
+    assert {path.name: path.read_bytes() for path in control_copy.iterdir()} == before
+
+
+def test_more_runs_and_kernels_go_on_from_fewer(attack, control_campaign, control_copy):
+    _, (first,) = control_campaign
+    _, (control, cloud) = attack("control", "point_cloud", runs=31, folder=control_copy)
+    assert list(control.records[:30]) == list(first.records)
+    assert (len(control.records), len(cloud.records)) == (31, 31)
+
+
 def test_recorded_runs_repeat(control_copy):
     replays = list(replay_runs(control_copy, ("control",)))
     assert [replay.differs for replay in replays] == [()] * 30

@@ -281,6 +281,8 @@ def test_a_campaign_that_was_cut_off_goes_on(target, tmp_path):
     assert [entry["run"] for entry in second] == list(range(8))
     assert second[:3] == first[:3]
     assert [entry["outcome"] for entry in second[:6]] == [entry["outcome"] for entry in first]
+    with pytest.raises(ConfigError, match="holds 8 runs already, 7 are asked for"):
+        run_campaign(replace(plan, runs=7), folder=tmp_path)
     with pytest.raises(ConfigError, match=r"another campaign; it differs in \['seed'\]"):
         run_campaign(replace(plan, seed=10), folder=tmp_path)
 

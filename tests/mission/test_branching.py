@@ -1,5 +1,6 @@
 """The faults of missions that fly together: each acts in its own flight only, as it would alone."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,14 @@ def test_a_fault_that_never_acts_has_the_record_of_one_that_waited_alone():
     together.trunk.become(4)
     assert together.trunk.finish() == alone.finish()
     assert together.trunk.finish()["state"] == "not_injected"
+
+
+def test_every_trigger_sees_a_phase_that_is_over_before_the_next_message():
+    together = Together(FaultConfig(target="command_vx", at="phase=evading"))
+    together.trunk.watch(replace(moment(1), phase="evading"))
+    message = command(2)
+    assert together.trunk.pass_on(message, moment(2)) is message
+    assert together.forked == [1]
 
 
 def test_an_error_in_one_mission_is_not_the_others(monkeypatch):

@@ -11,16 +11,20 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.replay import replay
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi import record as records
 from mavfi_cli.fi.native.arch import SUPPORTED
 from mavfi_cli.fi.native.doctor import check_tracing
+from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.spawned_node import SpawnedNode
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
@@ -209,3 +213,23 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "runs").glob("farm-5-*")
     assert flown(load_run(folder).folder) == flown(attacked)
+
+
+def test_a_node_that_has_filled_a_cache_is_started_again(short_config):
+    """A program that compiles its modules has another memory than one that finds bytecode."""
+    setup = Setup(config=short_config, briefing=of_config(short_config), node="control")
+    restarted = []
+    for compiles in (True, False, False, False):
+        spawned = SpawnedNode()
+        first = spawned.pid
+        if compiles:
+            cache = Path(tracking.__spec__.cached).parent
+            (cache / "added").touch()
+            (cache / "added").unlink()
+        try:
+            assert spawned.begin(setup).kernel == "control"
+            restarted.append(spawned.pid != first)
+        finally:
+            spawned.kill()
+    assert restarted[0]
+    assert not all(restarted)  # tests that run beside this one may fill caches too

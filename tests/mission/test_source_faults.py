@@ -1,9 +1,15 @@
 """Source-level faults in whole missions: equal up to the strike, recorded, read, repeatable."""
 
 import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
@@ -27,6 +33,20 @@ def struck(fly_short):
 def sideways(struck):
     """A velocity command with its sign flipped, 3 s into the flight."""
     return struck("command_vx", at="time=3", exact_bits=(63,))
+
+
+@pytest.fixture(scope="module")
+def troubled(troubled_flight):
+    """A mission that foresees collisions."""
+    return config_of(load_run(troubled_flight.path))
+
+
+@pytest.fixture(scope="module")
+def evaded(tmp_path_factory):
+    fault = FaultConfig(target="time_to_collision", field="exponent", at="phase=evading")
+    out = tmp_path_factory.mktemp("evaded")
+    mission = MissionConfig(world="dense", seed=3, fault=fault)
+    return load_run(fly_mission(mission, out, Watcher()).path)
 
 
 def test_golden_and_faulty_flight_part_at_the_strike(sideways):
@@ -78,6 +98,31 @@ def test_a_flip_in_a_flown_plan_causes_no_check_by_itself(struck):
     assert run.result["nodes"] == golden.result["nodes"]
     assert run.result["kernels"] == golden.result["kernels"]
     assert run.result["response_time_s"] == golden.result["response_time_s"]
+
+
+def test_a_phase_between_two_reports_is_not_missed(evaded):
+    """In this flight every report comes before the pilot is evading, or after it."""
+    evading = next(
+        row["stamp_s"] for row in evaded.trace.to_pylist() if row["phase"] == Mode.EVADING.value
+    )
+    (strike,) = evaded.result["fault"]["strikes"]
+    assert evading < strike["stamp_s"] < evading + 0.5
+    assert strike["phase"] != Mode.EVADING.value
+
+
+def test_a_time_to_a_collision_that_is_foreseen_is_read(troubled, tmp_path):
+    fault = FaultConfig(target="time_to_collision", field="exponent", at="foreseen", seed=2)
+    run = load_run(fly_mission(replace(troubled, fault=fault), tmp_path, Watcher()).path)
+    recorded = run.result["fault"]
+    assert len(recorded["strikes"]) == 1
+    assert math.isfinite(recorded["strikes"][0]["changes"][0]["before"])
+    assert recorded["activation"]["first_reader"]["state"] == "time_to_collision"
+
+
+def test_the_document_lists_the_phases():
+    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
+    (listed,) = re.findall(r"`phase=slowing` \|.*?: (.*?) \(", text)
+    assert listed.split(", ") == [mode.value for mode in Mode]
 
 
 def test_a_trigger_that_never_comes_is_not_injected(struck):

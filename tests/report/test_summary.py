@@ -1,6 +1,7 @@
 """A run in words, for every way in which it can end."""
 
 import json
+import re
 
 import pytest
 
@@ -41,12 +42,33 @@ def test_the_figures_are_those_of_the_record(result):
         assert figure in text
 
 
-def test_what_is_not_known_is_said_so(result):
+def test_a_mission_that_ended_before_its_flight_says_so(result):
     result["quality_of_flight"] = dict.fromkeys(result["quality_of_flight"])
+    lines = summary_lines(result | {"outcome": "interrupted"})
+    assert "Flight      none: the mission ended before the companion took over" in lines
+    assert "not known" not in "\n".join(lines)
+
+
+def test_the_plans_add_up(result, troubled_flight):
+    for run in (result, json.loads(troubled_flight.result.read_text())):
+        text = "\n".join(summary_lines(run))
+        found = re.search(
+            r"(\d+) asked for: (\d+) flown \((\d+) replans\), (\d+) failed, (\d+) not used", text
+        )
+        asked, flown, replans, failed, unused = map(int, found.groups())
+        assert asked == flown + failed + unused == run["pilot"]["plans_requested"]
+        assert flown == replans + 1
+        assert failed == run["pilot"]["plans_failed"]
+        assert unused >= run["pilot"]["plans_ignored"] + run["pilot"]["plans_rejected"]
+
+
+def test_what_is_not_known_is_said_so(result):
+    quality = dict.fromkeys(result["quality_of_flight"])
+    result["quality_of_flight"] = quality | {"flight_time_s": 12.0, "distance_m": 30.0}
     result["response_time_s"] = {"median": None, "p95": None, "count": 0}
     result["host"]["flight_wall_s"] = 0.0
     text = "\n".join(summary_lines(result))
-    assert "Flight      not known, not known flown, not known from the goal" in text
+    assert "Flight      12.0 s, 30.0 m flown, not known from the goal" in text
     assert "Clearance   not known at the closest" in text
     assert "None" not in text
     assert "nan" not in text

@@ -26,11 +26,14 @@ from mavfi_cli.mission.kernel_scope import KernelScope
 _KEPT = ("HOME", "PATH", "LANG", "NUMBA_CACHE_DIR", "VIRTUAL_ENV")
 _FIXED = {
     "PYTHONHASHSEED": "0",
-    "PYTHONDONTWRITEBYTECODE": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "MALLOC_ARENA_MAX": "1",
 }
+
+
+# Only `load` leaves bytecode behind, whatever the user's own setting is.
+_NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +79,7 @@ class Place:
         layout: Layout | None = None,
         mechanism: Mechanism | None = None,
         look_up: bool = True,
+        fill_caches: bool = False,
     ) -> None:
         """Start the template.
 
@@ -85,6 +89,7 @@ class Place:
             layout: of another template of the same kernel; looking it up takes seconds.
             mechanism: how executions are counted.
             look_up: find the layout; without it nothing can be attacked.
+            fill_caches: keep the bytecode of what it imports.
 
         Raises:
             TargetError: the kernel cannot be loaded.
@@ -94,14 +99,16 @@ class Place:
         self._output = os.memfd_create("mavfi-kernel-output", 0)
         self._control, theirs = socket.socketpair()
         self._errors = os.memfd_create("mavfi-kernel-errors", 0)
-        environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
+        environment = {name: os.environ[name] for name in _KEPT if name in os.environ} | _FIXED
+        if not fill_caches:
+            environment |= _NO_BYTECODE
         with theirs, linux.fixed_addresses():
             self._process = subprocess.Popen(
                 [sys.executable, *template.arguments],
                 stdin=theirs.fileno(),
                 stdout=self._output,
                 stderr=self._errors,
-                env=environment | _FIXED,
+                env=environment,
                 cwd="/",
                 start_new_session=True,
             )
@@ -193,8 +200,12 @@ def template_of(kernel: str, inputs: Path) -> Template:
 
 @functools.cache
 def load(kernel: str, template: Template) -> None:
-    """Load a kernel once, so that all its compiled code is in the cache from now on."""
-    Place(kernel, template, look_up=False).close()
+    """Load a kernel once, so that all its compiled code is in the cache from now on.
+
+    So is the bytecode of all that it imports: a process that compiles modules has another memory
+    than one that finds them compiled.
+    """
+    Place(kernel, template, look_up=False, fill_caches=True).close()
 
 
 def _digest(pid: int) -> str:

@@ -117,9 +117,11 @@ def run_kernels(
     Raises:
         TracingForbidden: the operating system refuses.
         TargetError: a kernel cannot be attacked; says why.
-        ConfigError: the folder holds another campaign.
+        ConfigError: the folder holds another campaign, or runs that this one leaves out.
     """
-    journal = None if folder is None else Journal(folder, plan.to_json())
+    journal = None
+    if folder is not None:
+        journal = Journal(folder, plan.to_json(), runs=plan.runs, kernels=plan.kernels)
     with Workers(jobs) as workers:
         return [_run_kernel(plan, name, workers, journal, progress) for name in plan.kernels]
 

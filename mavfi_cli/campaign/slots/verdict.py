@@ -13,7 +13,7 @@ from typing import Any
 from mavfi_cli.campaign.outcome import State
 from mavfi_cli.campaign.slots.desk import ERRORS, SCRATCH
 from mavfi_cli.campaign.slots.seats import Ended
-from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.run_folder import RunFolder
 
@@ -114,6 +114,8 @@ def _refused(kind: str, text: str) -> Verdict:
     """A mission that could not begin, or not write its record."""
     if kind in _OF_THE_MACHINE:
         raise CampaignStopped(text)
+    if kind == Interrupted.__name__:
+        return Verdict(state=None, result={}, reason="interrupted")
     if kind in _BY_CHANCE and text.endswith(_OUTSIDE_WORDS):
         return Verdict(state=None, result={}, reason=text)
     return Verdict(state=State.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)

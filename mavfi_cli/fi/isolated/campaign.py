@@ -129,10 +129,10 @@ def run_campaign(
     Raises:
         TracingForbidden: the operating system refuses.
         TargetError: the program cannot be attacked; says why.
-        ConfigError: the folder holds another campaign.
+        ConfigError: the folder holds another campaign, or runs that this one leaves out.
     """
     start = time.perf_counter()
-    journal = None if folder is None else Journal(folder, plan.to_json())
+    journal = None if folder is None else Journal(folder, plan.to_json(), runs=plan.runs)
     with one_processor():
         golden, profiled = _prepare(plan)
     bench = _Bench(plan=plan, golden=golden)

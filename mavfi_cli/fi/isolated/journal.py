@@ -23,15 +23,24 @@ _DRAWN = ("object", "offset", "trigger", "k", "instruction_bytes", "corruption",
 class Journal:
     """Reads and grows the folder of one campaign."""
 
-    def __init__(self, folder: Path, known: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        known: Mapping[str, Any],
+        *,
+        runs: int,
+        kernels: Sequence[str] | None = None,
+    ) -> None:
         """Open the folder, or begin it.
 
         Args:
             folder: of the campaign.
             known: what its results depend on, as plain values.
+            runs: how many of each kernel there shall be in the end.
+            kernels: which ones; None of a program.
 
         Raises:
-            ConfigError: it holds another campaign.
+            ConfigError: it holds another campaign, or runs that this one would leave out.
             RecordError: it cannot be written.
         """
         self._folder = folder
@@ -45,7 +54,29 @@ class Journal:
             differs = sorted(key for key in {*known, *stored} if stored.get(key) != known.get(key))
             if differs:
                 raise ConfigError(f"holds another campaign; it differs in {differs}", path=folder)
+        self._require_all(runs, kernels)
         write_json(path, known)
+
+    def _require_all(self, runs: int, kernels: Sequence[str] | None) -> None:
+        """Refuse to leave out runs that are there: the summary is of the whole folder."""
+        counts: dict[str, int] = {}
+        for entry in read_runs(self._folder):
+            kernel = entry.get("kernel", "")
+            counts[kernel] = max(counts.get(kernel, 0), entry["run"] + 1)
+        others = sorted(counts.keys() - set(kernels)) if kernels is not None else []
+        if others:
+            raise ConfigError(
+                f"holds runs of {' and '.join(others)} as well: name every kernel that it has, "
+                "or another folder",
+                path=self._folder,
+            )
+        most = max(counts.values(), default=0)
+        if most > runs:
+            raise ConfigError(
+                f"holds {most} runs already, {runs} are asked for: ask for at least as many, or "
+                "name another folder",
+                path=self._folder,
+            )
 
     def runs_of(self, planned: Sequence[Mapping[str, Any]]) -> dict[int, dict[str, Any]]:
         """The runs that are there, by number, of the faults that are planned now."""

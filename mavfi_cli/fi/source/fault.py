@@ -21,6 +21,7 @@ class When(Enum):
     TIME = "time"  # seconds after the companion took over
     TICK = "tick"  # control ticks after it took over
     PHASE = "phase"  # the pilot's mode
+    FORESEEN = "foreseen"  # the first report of a foreseen collision
     INVOCATION = "invocation"  # the n-th output of the kernel
     RANDOM = "random"  # a time drawn over the flight from the fault's own stream
 
@@ -43,7 +44,7 @@ class Persistence(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger:
-    """When the fault strikes. For RANDOM neither number is used, for PHASE the name."""
+    """When the fault strikes. RANDOM and FORESEEN use neither number nor name, PHASE the name."""
 
     when: When = When.RANDOM
     number: float = 0.0  # seconds, ticks, or the count of the invocation (from 1)

@@ -24,6 +24,7 @@ from mavfi_cli.fi.source.schedule import Moment, Pattern, Schedule
 M = TypeVar("M", CollisionReport, Trajectory, Command)
 
 MAX_LISTED_STRIKES = 100
+_WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Command: "command"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +89,15 @@ class SourceInjector:
             for place in range(len(fault.states))
         ]
         self._struck: Message | None = None
+
+    def watch(self, moment: Moment) -> None:
+        """Note where the mission stands; once a control tick, and for every report."""
+        self._schedule.watch(moment)
+
+    @property
+    def missed(self) -> str:
+        """Why nothing was struck, where nothing was."""
+        return self._schedule.missed(_WORDS[self._kind])
 
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
         """A message as its receiver gets it.

@@ -80,6 +80,15 @@ class MemoryInjector:
         self.strikes: list[Strike] = []
         self.count = 0
 
+    def watch(self, moment: Moment) -> None:
+        """Note where the mission stands; once a control tick, and for every report."""
+        self._schedule.watch(moment)
+
+    @property
+    def missed(self) -> str:
+        """Why nothing was struck, where nothing was."""
+        return self._schedule.missed("control tick")
+
     def strike(self, moment: Moment) -> None:
         """Act on the memory if the moment has come."""
         if not self._schedule.due(moment, moment.tick):

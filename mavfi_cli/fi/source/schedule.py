@@ -19,6 +19,7 @@ class Moment:
     flight_s: float  # since the companion took over
     tick: int  # control ticks since then
     phase: str  # the pilot's mode
+    foresees: bool = False  # a report of a foreseen collision is being handed on
 
 
 class Schedule:
@@ -29,14 +30,35 @@ class Schedule:
     """
 
     def __init__(self, trigger: Trigger, corruption: Corruption, drawn_time_s: float) -> None:
+        self._came = False  # the trigger, whether or not there was anything to strike
         self._trigger = trigger
         self._corruption = corruption
         self._drawn_time_s = drawn_time_s
         self._begun_s: float | None = None
         self._last_s = -math.inf
 
+    def watch(self, moment: Moment) -> None:
+        """Note where the mission stands, also where there is nothing to strike.
+
+        A phase may be over before the next message of the struck state; it has begun all the same.
+        """
+        self._came = self._came or self._comes(moment)
+
+    def missed(self, what: str) -> str:
+        """Why it never acted, where it did not; `what` it waited for, as "report"."""
+        trigger = self._trigger
+        never, since = {
+            When.PHASE: (
+                f"the pilot was never in phase {trigger.phase}",
+                f"phase {trigger.phase} had begun",
+            ),
+            When.FORESEEN: ("no collision was ever foreseen", "a collision was first foreseen"),
+        }.get(trigger.when, ("the mission ended before the trigger", "the trigger"))
+        return f"no {what} came after {since}" if self._came else never
+
     def due(self, moment: Moment, invocations: int = 0) -> bool:
         """Whether it acts now; `invocations` counts the outputs of the kernel so far."""
+        self.watch(moment)
         corruption = self._corruption
         if self._begun_s is None:
             return self._reached(moment, invocations)
@@ -56,14 +78,25 @@ class Schedule:
 
     def _reached(self, moment: Moment, invocations: int) -> bool:
         trigger = self._trigger
+        if trigger.when in (When.PHASE, When.FORESEEN):
+            return self._came
+        if trigger.when is When.INVOCATION:
+            return invocations >= trigger.number
+        return self._comes(moment)
+
+    def _comes(self, moment: Moment) -> bool:
+        """Whether the trigger is there, or has been; an invocation is the messages' own."""
+        trigger = self._trigger
         if trigger.when is When.TIME:
             return moment.flight_s >= trigger.number - 1e-9
         if trigger.when is When.TICK:
             return moment.tick >= trigger.number
         if trigger.when is When.PHASE:
             return moment.phase == trigger.phase
+        if trigger.when is When.FORESEEN:
+            return moment.foresees
         if trigger.when is When.INVOCATION:
-            return invocations >= trigger.number
+            return False
         return moment.flight_s >= self._drawn_time_s
 
 

@@ -148,6 +148,58 @@ def test_triggers_strike_once_at_their_moment(trigger, moments, expected):
     assert len(told) == 1
 
 
+@pytest.mark.parametrize(
+    ("trigger", "moments"),
+    [
+        (Trigger(when=When.PHASE, phase="evading"), [moment(), moment(phase="evading")]),
+        (
+            Trigger(when=When.FORESEEN),
+            [moment(), replace(moment(), foresees=True), moment(phase="flying")],
+        ),
+    ],
+)
+def test_the_first_message_after_a_trigger_that_is_over_is_struck(trigger, moments):
+    """A phase lasts less than the time between two reports."""
+    told: list[Strike] = []
+    injector = make("time_to_collision", told=told, trigger=trigger)
+    assert send(injector, REPORT, moment()) is REPORT
+    for seen in moments:
+        injector.watch(seen)
+    later = moment(flight_s=0.3, tick=15)
+    assert send(injector, REPORT, later) is not REPORT
+    assert [(strike.tick, strike.phase) for strike in told] == [(15, "flying")]
+    assert send(injector, REPORT, later) is REPORT
+
+
+@pytest.mark.parametrize(
+    ("trigger", "seen", "reason"),
+    [
+        (
+            Trigger(when=When.PHASE, phase="evading"),
+            moment(),
+            "the pilot was never in phase evading",
+        ),
+        (
+            Trigger(when=When.PHASE, phase="evading"),
+            moment(phase="evading"),
+            "no report came after phase evading had begun",
+        ),
+        (Trigger(when=When.FORESEEN), moment(), "no collision was ever foreseen"),
+        (Trigger(when=When.TIME, number=2.0), moment(1.0), "the mission ended before the trigger"),
+        (Trigger(when=When.TIME, number=2.0), moment(2.0), "no report came after the trigger"),
+        (
+            Trigger(when=When.INVOCATION, number=2),
+            moment(9.0),
+            "the mission ended before the trigger",
+        ),
+    ],
+)
+def test_why_nothing_was_struck_is_true(trigger, seen, reason):
+    injector = make("time_to_collision", trigger=trigger)
+    injector.watch(seen)
+    assert injector.missed == reason
+
+
 def test_a_random_moment_is_uniform_over_the_flight():
     drawn = [make("command_vx", s, trigger=Trigger()).drawn_time_s for s in range(2000)]
     assert min(drawn) >= 0.0

@@ -1,0 +1,94 @@
+"""Ctrl-C while a run is repeated: nothing cut off is kept, compared, or drawn from."""
+
+import json
+import signal
+
+import pytest
+
+from mavfi_cli.core.errors import Interrupted
+from mavfi_cli.fi.native.arch import SUPPORTED
+from mavfi_cli.fi.native.doctor import check_tracing
+from mavfi_cli.mission import run as run_module
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.golden import paired_golden
+from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.run_folder import load_run
+
+traced = pytest.mark.skipif(
+    not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
+)
+
+
+class CtrlC(Watcher):
+    """Presses it once, in flight."""
+
+    def on_event(self, event):
+        if event.text == "flies a plan":
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture
+def cut_once(monkeypatch):
+    """Ctrl-C in the next flight that a module starts, and in no later one."""
+
+    def cut(module):
+        real, waiting = run_module.fly_mission, [CtrlC()]
+
+        def fly(config, out, watcher, **options):
+            return real(config, out, waiting.pop() if waiting else watcher, **options)
+
+        monkeypatch.setattr(f"{module}.fly_mission", fly)
+
+    return cut
+
+
+@pytest.fixture(scope="module")
+def sideways(fly_short):
+    return fly_short(fault=FaultConfig(target="command_vx", at="time=3", exact_bits=(63,)))
+
+
+def test_an_interrupted_golden_pair_is_not_kept(command_line, sideways, cut_once):
+    before = {path.name for path in sideways.path.iterdir()}
+    cut_once("mavfi_cli.mission.golden")
+    code, out, err = command_line("show", sideways.path)
+    assert (code, out) == (130, "")
+    assert err == "interrupted: the golden pair was not flown to its end\n"
+    assert {path.name for path in sideways.path.iterdir()} == before
+    code, out, _ = command_line("show", sideways.path)
+    assert (code, "Effect      first at" in out) == (0, True)
+
+
+def test_an_interrupted_golden_pair_of_an_older_version_is_flown_anew(sideways):
+    run = load_run(sideways.path)
+    kept = paired_golden(run).folder.result
+    result = json.loads(kept.read_text())
+    kept.write_text(json.dumps(result | {"outcome": "interrupted"}))
+    assert paired_golden(run).result["outcome"] == result["outcome"] == "success"
+
+
+@pytest.mark.parametrize("options", [[], ["--without-fault"], ["--json"]])
+def test_an_interrupted_repetition_is_neither_equal_nor_different(
+    command_line, sideways, cut_once, tmp_path, options
+):
+    cut_once("mavfi_cli.mission.run")
+    code, out, err = command_line("replay", sideways.path, "--out", "again", *options)
+    assert (code, out) == (130, "")
+    assert err == "interrupted: the repetition was not flown to its end\n"
+    assert not list((tmp_path / "again").iterdir())
+
+
+@pytest.mark.parametrize("command", ["show", "replay"])
+def test_an_interrupted_flight_does_not_repeat(command_line, fly_short, command):
+    folder = fly_short(CtrlC(), fault=FaultConfig(target="command_vx", at="time=9"))
+    code, out, err = command_line(command, folder.path)
+    assert (code, out) == (1, "")
+    assert err == f"error: {folder.path}: an interrupted flight does not repeat\n"
+    assert command_line("show", "--no-golden", folder.path)[0] == 0
+
+
+@traced
+def test_no_fault_is_drawn_from_an_interrupted_golden_flight(fly_short, cut_once):
+    cut_once("mavfi_cli.mission.run")
+    with pytest.raises(Interrupted):
+        fly_short(seed=6, instruction=InstructionConfig(target="control", seed=2))
