@@ -16,6 +16,7 @@ from mavfi_cli.mission.node_process import receive, send
 from mavfi_cli.mission.node_server import Setup
 
 _CHANNEL = 3
+_FILE_CLOCK = 5  # CLOCK_REALTIME_COARSE, which stamps files; `time.time_ns` runs ahead of it
 _KEPT = ("PATH", "HOME", "PYTHONPATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR")
 _FIXED = {"PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
@@ -41,7 +42,7 @@ class SpawnedNode:
         ]
         # -P: where we stand must not decide what is imported, and so how its memory lies.
         line = [sys.executable, "-P", "-m", "mavfi_cli.mission.node_server", str(_CHANNEL)]
-        self._started_ns = time.time_ns()  # as the file system stamps what the program writes
+        self._started_ns = time.clock_gettime_ns(_FILE_CLOCK)
         with theirs, linux.fixed_addresses():
             self.pid = os.posix_spawn(
                 sys.executable, line, {**environment, **_FIXED},
