@@ -147,14 +147,21 @@ def _ratio_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
         ]
 
 
+def _platforms(told: Row, rows: Sequence[Row]) -> Iterator[tuple[Row, str]]:
+    """Each row with its platform, once."""
+    titles, last = titles_of(told), ""
+    for row in rows:
+        title = titles[row["platform"]]
+        yield row, "" if title == last else title
+        last = title
+
+
 def _cost_rows(told: Row) -> Iterator[list[str]]:
     yield ["", "", "flights", "lost", "mean, s", "95th perc., x", "worst, x",
            "recovered"]  # fmt: skip
-    titles, last = titles_of(told), ""
-    for row in told["costs"]:
-        title = titles[row["platform"]]
+    for row, title in _platforms(told, told["costs"]):
         yield [
-            "" if title == last else title,
+            title,
             setting_title(row["setting"]),
             f"{row['pairs']}",
             f"{row['lost']}",
@@ -163,7 +170,6 @@ def _cost_rows(told: Row) -> Iterator[list[str]]:
             _number(row["over_own"]["largest"], "{:.3f}"),
             _number(row["over_own"]["recovered_share"], "{:.1%}"),
         ]
-        last = title
 
 
 def _difference_lines(told: Row, platform: Row) -> list[str]:
@@ -192,17 +198,14 @@ def _difference_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 
 def _worst_rows(told: Row) -> Iterator[list[str]]:
     yield ["", "", "longest, s", "over mean golden, x", "recovered"]
-    titles, last = titles_of(told), ""
-    for row in told["worst"]:
-        title = titles[row["platform"]]
+    for row, title in _platforms(told, told["worst"]):
         yield [
-            "" if title == last else title,
+            title,
             setting_title(row["setting"]),
             _number(row["worst_s"], "{:.1f}"),
             _number(row["over_mean_ratio"], "{:.3f}"),
             _number(row["over_mean_recovered_share"], "{:.1%}"),
         ]
-        last = title
 
 
 def _again(told: Row) -> list[str]:

@@ -107,7 +107,7 @@ def profile_run(
     *,
     markers: Sequence[Location] = (),
     windows: int = 1,
-    enough: int | None = None,
+    enough: int = ENOUGH,
     limit: int = STEPS,
 ) -> TargetProfile:
     """Step a fault-free run, or a sample of the windows that markers cut it into.
@@ -117,7 +117,7 @@ def profile_run(
         rng: draws the windows.
         markers: instructions in scope; none for the whole run.
         windows: how many of each marker are stepped at least.
-        enough: more of them where together they have no more instructions; default `ENOUGH`.
+        enough: more of them where together they have no more instructions.
         limit: refuse longer windows, instructions.
 
     Raises:
@@ -132,7 +132,7 @@ def profile_run(
         if count := stepper.count():
             order = rng.permutation(count) + 1
             profile = stepper.profile(order[:windows], count)
-            fit = (ENOUGH if enough is None else enough) * windows // max(1, profile.executed)
+            fit = enough * windows // max(1, profile.executed)
             if windows < min(fit, count):
                 profile = stepper.profile(order[:fit], count)
             strata.append(Stratum(marker=marker, profile=profile))
