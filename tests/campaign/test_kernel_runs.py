@@ -3,18 +3,20 @@
 import csv
 import io
 import json
+from functools import partial
 
 import pytest
 
 from mavfi_cli.campaign.kernels import catalogue
+from mavfi_cli.campaign.kernels import profile as kernel_profile
 from mavfi_cli.campaign.kernels.difference import pack
 from mavfi_cli.campaign.kernels.inputs import load_inputs
 from mavfi_cli.campaign.kernels.replay import replay_runs
 from mavfi_cli.campaign.kernels.summary import CSV_COLUMNS, csv_rows, summarise, table
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
-from mavfi_cli.fi.isolated import profile as isolated_profile
 from mavfi_cli.fi.isolated.compare import digest
+from mavfi_cli.fi.isolated.profile import profile_run
 from mavfi_cli.report.kernel_plot import write_kernel_plot
 
 OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
@@ -158,7 +160,7 @@ def test_the_planner_is_attacked_in_its_own_library(attack):
 
 
 def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
-    monkeypatch.setattr(isolated_profile, "ENOUGH", 0)
+    monkeypatch.setattr(kernel_profile, "profile_run", partial(profile_run, enough=0))
     (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
     plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
     start, windows = runs.prepared.profile.strata

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import TargetError, UnknownName
-from mavfi_cli.fi.isolated import profile as isolated_profile
 from mavfi_cli.fi.isolated.compare import Comparison
 from mavfi_cli.fi.isolated.profile import profile_function, profile_run
 from mavfi_cli.fi.isolated.program import ProgramTarget, Workplace
@@ -116,13 +115,12 @@ def test_calls_of_a_function_that_calls_itself_are_whole_calls(recursive):
     assert [segment.start[0].count for segment in stratum.profile.segments] == list(range(1, 16))
 
 
-def test_a_sample_estimates_the_run(recursive, monkeypatch):
+def test_a_sample_estimates_the_run(recursive):
     """The mean over many samples is the run: no instruction is left out or counted twice."""
-    monkeypatch.setattr(isolated_profile, "ENOUGH", 0)
     markers = functions(recursive, "leaf", "tree")
     rng = np.random.default_rng(3)
     whole = profile_run(recursive, rng).executed
-    samples = [profile_run(recursive, rng, markers=markers, windows=4) for _ in range(40)]
+    samples = [profile_run(recursive, rng, markers=markers, windows=4, enough=0) for _ in range(40)]
     assert not any(sample.complete for sample in samples)
     estimates = np.array([sample.instructions for sample in samples])
     error = estimates.std(ddof=1) / np.sqrt(len(estimates))
