@@ -22,7 +22,7 @@ from missions import fly
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.detect import registry
 from mavfi_cli.detect.gate import Gate
-from mavfi_cli.mission.detection_cost import detection_cost
+from mavfi_cli.mission.record.detection_cost import detection_cost
 
 TICK_S = 0.02
 REPORT_EVERY = 15  # ticks

@@ -7,7 +7,7 @@ from enum import Enum
 from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.mission.run_folder import RESULT
+from mavfi_cli.mission.record.run_folder import RESULT
 
 SAMPLE = 20  # about one success in so many is kept by `sampled`
 _WORD = 1 << 32

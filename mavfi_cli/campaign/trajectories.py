@@ -15,7 +15,7 @@ from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.outcome import Injected, MissionResult, State
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.mission.run_folder import RESULT
+from mavfi_cli.mission.record.run_folder import RESULT
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 

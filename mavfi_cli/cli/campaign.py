@@ -156,7 +156,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     from mavfi_cli.campaign.ledger import Ledger
     from mavfi_cli.campaign.trajectories import pair
     from mavfi_cli.core.files import plain
-    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.trajectories import Panel, lines, write_trajectories
 
     with Ledger(folder_of(what)) as ledger:

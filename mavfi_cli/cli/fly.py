@@ -160,8 +160,8 @@ def fly(
     A mission that fails is a result: the exit code is 0 unless --expect asks otherwise.
     """
     from mavfi_cli.cli.progress import progress_view
+    from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.run import fly_mission
-    from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report.summary import outcome_line, summary_lines
     from mavfi_cli.report.top_view import write_top_view
 

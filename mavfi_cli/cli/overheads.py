@@ -76,7 +76,7 @@ def measured(text: str, platform: str | None = None) -> dict[str, tuple[float, s
 def _results(path: Path) -> Iterator[Mapping[str, Any]]:
     """result.json of a run folder, of all runs in a folder, or of all missions of a campaign."""
     from mavfi_cli.campaign.ledger import Ledger
-    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.mission.record.run_folder import load_run
 
     if path.is_file() or (path / _RESULT).is_file():
         yield load_run(path).result

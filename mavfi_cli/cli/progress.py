@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mavfi_cli.mission.events import Event
 from mavfi_cli.mission.progress import Progress, Watcher
+from mavfi_cli.mission.record.events import Event
 
 if TYPE_CHECKING:
     from rich.live import Live

@@ -29,6 +29,7 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     from mavfi_cli.core.errors import Interrupted
     from mavfi_cli.fi.record import read
     from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.replay import (
         config_of,
         differing_results,
@@ -38,7 +39,6 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
         version_differences,
     )
     from mavfi_cli.mission.run import fly_mission, installed_versions
-    from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report.summary import difference_lines, outcome_line
 
     recorded = load_run(run)

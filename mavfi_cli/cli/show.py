@@ -19,7 +19,7 @@ import click
 def show(run: Path, as_json: bool, golden: bool, events: bool, picture: Path | None) -> None:
     """Say what happened in RUN, a run folder."""
     from mavfi_cli.mission.golden import paired_golden
-    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.summary import difference_lines, event_lines, summary_lines
 
     record = load_run(run)

@@ -25,21 +25,21 @@ from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.transport import Transport
-from mavfi_cli.mission import quality
 from mavfi_cli.mission.branching import Trunk
 from mavfi_cli.mission.briefing import Briefing, require_flyable
-from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.companion.companion import Companion
+from mavfi_cli.mission.companion.protection import gate_of, protection_of
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.events import EventLog
 from mavfi_cli.mission.injection import DetectorInjection, Injection, NoInjection
-from mavfi_cli.mission.instruction_injection import InstructionInjection
-from mavfi_cli.mission.instruction_plan import Recorder
+from mavfi_cli.mission.instruction.injection import InstructionInjection
+from mavfi_cli.mission.instruction.plan import Recorder
+from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.narrator import Narrator
-from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.protection import gate_of, protection_of
-from mavfi_cli.mission.trace import Trace
+from mavfi_cli.mission.record import quality
+from mavfi_cli.mission.record.events import EventLog
+from mavfi_cli.mission.record.trace import Trace
 
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
 IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing

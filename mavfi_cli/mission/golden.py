@@ -8,9 +8,9 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import Interrupted, RecordError
 from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.record.run_folder import Run, load_run
 from mavfi_cli.mission.replay import config_of, interrupted
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.run_folder import Run, load_run
 
 FOLDER = "golden"
 

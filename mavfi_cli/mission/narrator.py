@@ -7,10 +7,10 @@ import numpy as np
 from mavfi_cli.autonomy.orders import Mode
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
-from mavfi_cli.mission.companion import Companion
-from mavfi_cli.mission.events import EventLog
+from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.progress import Progress, Watcher
+from mavfi_cli.mission.record.events import EventLog
 
 PROGRESS_EVERY_S = 1.0
 

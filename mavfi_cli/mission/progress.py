@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mavfi_cli.mission.events import Event
+from mavfi_cli.mission.record.events import Event
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

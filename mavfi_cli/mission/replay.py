@@ -14,7 +14,7 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.platform import measured_factor
-from mavfi_cli.mission.run_folder import Run
+from mavfi_cli.mission.record.run_folder import Run
 
 HOST_SECTION = "host"
 

@@ -23,23 +23,24 @@ from mavfi_cli import __version__
 from mavfi_cli.autonomy import planners
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission import briefing, quality
+from mavfi_cli.mission import briefing
 from mavfi_cli.mission.branching import Branching
+from mavfi_cli.mission.companion.response import response_times
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
+from mavfi_cli.mission.instruction.injection import InstructionInjection, require_possible
+from mavfi_cli.mission.instruction.plan import PlannedFault, Recorder, plan_fault, planned_of
+from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
 from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.instruction_injection import InstructionInjection, require_possible
-from mavfi_cli.mission.instruction_plan import PlannedFault, Recorder, plan_fault, planned_of
-from mavfi_cli.mission.plan_file import write_plans
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.response import response_times
-from mavfi_cli.mission.run_folder import CRASH, RunFolder
+from mavfi_cli.mission.record import quality
+from mavfi_cli.mission.record.plan_file import write_plans
+from mavfi_cli.mission.record.run_folder import CRASH, RunFolder
+from mavfi_cli.mission.record.statistics import mission_statistics, plan_lines
+from mavfi_cli.mission.record.timetable import timetable_of, write_timetable
+from mavfi_cli.mission.record.trace import write_trace
 from mavfi_cli.mission.sortie import Sortie, other_end
-from mavfi_cli.mission.spawned_node import SpawnedNode
-from mavfi_cli.mission.statistics import mission_statistics, plan_lines
-from mavfi_cli.mission.timetable import timetable_of, write_timetable
-from mavfi_cli.mission.trace import write_trace
 from mavfi_cli.mission.vehicle_template import VehicleTemplate
 
 _VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")

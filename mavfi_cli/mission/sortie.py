@@ -19,7 +19,7 @@ from mavfi_cli.mission.branching import Branching, Trunk
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.run_folder import RunFolder, new_run_folder, stem_of
+from mavfi_cli.mission.record.run_folder import RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.vehicle_process import VehicleProcess
 from mavfi_cli.mission.vehicle_template import VehicleTemplate
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from mavfi_cli.mission.detection_cost import detection_cost
+from mavfi_cli.mission.record.detection_cost import detection_cost
+from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.replay import first_difference, largest_deviation_m
-from mavfi_cli.mission.run_folder import Run
 
 _OUTCOMES = {
     "success": "SUCCESS: reached the goal",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.mission.run_folder import Run
+from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.report.drawing import write_svg
 
 if TYPE_CHECKING:

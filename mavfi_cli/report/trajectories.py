@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.mission.run_folder import Run
+from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.report.drawing import DETECTORS, INK, write_svg
 from mavfi_cli.report.top_view import (
     draw_end,

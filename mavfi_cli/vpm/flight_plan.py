@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_text
-from mavfi_cli.mission.companion import BRAKE_SHARE
+from mavfi_cli.mission.companion.companion import BRAKE_SHARE
 from mavfi_cli.mission.config import LIMITS, MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.platform import PlatformProfile

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.mission.detection_cost import HOST_CHECKS
+from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
 from mavfi_cli.vpm.table import columns, csv_of
 
 MANY_ALARMS = 10.0  # of an error-free flight: more is not the detector's usual rate

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.mission.detection_cost import HOST_CHECKS, KERNELS, detection_cost
 from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, KERNELS, detection_cost
 
 MEASURED = "measured"  # how the source of a measured overhead begins
 TIMES = " x "  # between a platform's name and the one factor on its latencies, in a file's name

@@ -9,7 +9,7 @@ import numpy as np
 from mavfi_cli.campaign.kernels import template
 from mavfi_cli.campaign.kernels.catalogue import Kernel
 from mavfi_cli.fi.native.image import Image
-from mavfi_cli.mission.kernel_scope import KernelScope
+from mavfi_cli.mission.instruction.scope import KernelScope
 
 
 class Known(Kernel):

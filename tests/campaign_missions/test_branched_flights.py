@@ -19,7 +19,7 @@ from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.run_folder import RunFolder
+from mavfi_cli.mission.record.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
 FILES = ("trace.parquet", "plans.parquet", "kernels.parquet", "flight.tlog", "fault.json")

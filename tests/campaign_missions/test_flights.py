@@ -12,7 +12,7 @@ from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.run_folder import RunFolder
+from mavfi_cli.mission.record.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
 FAULT = FaultConfig(target="waypoint_position", at="time=1", together=True, field="mantissa")

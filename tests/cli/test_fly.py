@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mavfi_cli.mission import sortie
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.record.run_folder import load_run
 
 SHORT = ("fly", "--world", "farm", "--seed=5", "--start=2,2,0", "--goal=10,6,5")
 

@@ -13,7 +13,7 @@ from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.record.run_folder import load_run
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"

@@ -6,8 +6,8 @@ import pytest
 
 from mavfi_cli.cli.progress import progress_view
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.events import Event
 from mavfi_cli.mission.progress import Progress
+from mavfi_cli.mission.record.events import Event
 
 
 def tell(config, events=(), quiet=False):

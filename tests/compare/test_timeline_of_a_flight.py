@@ -4,10 +4,10 @@ import pytest
 
 from mavfi_cli.campaign.compare.timeline import chain_of, timeline_of, timelines, typical
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.mission.executor import Invocation
-from mavfi_cli.mission.response import Reaction
-from mavfi_cli.mission.run_folder import load_run
-from mavfi_cli.mission.timetable import Timetable, read_timetable, write_timetable
+from mavfi_cli.mission.companion.executor import Invocation
+from mavfi_cli.mission.companion.response import Reaction
+from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.record.timetable import Timetable, read_timetable, write_timetable
 
 
 def ran(node, start_s, end_s):

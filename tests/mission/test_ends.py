@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.autonomy import collision
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.record.run_folder import load_run
 
 MAVLOGDUMP = Path(sys.executable).parent / "mavlogdump.py"
 

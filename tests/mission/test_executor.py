@@ -3,7 +3,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.mission.executor import Executor
+from mavfi_cli.mission.companion.executor import Executor
 
 
 def make(latencies: dict[str, float], cores: int = 8) -> tuple[Executor, list[tuple[Any, ...]]]:

@@ -14,7 +14,7 @@ from mavfi_cli.core.errors import CommandRefused, ConfigError, Interrupted, NoAu
 from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.mission import flight, sortie
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.record.run_folder import load_run
 
 SPEED = 2.0
 

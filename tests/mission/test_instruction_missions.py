@@ -18,13 +18,13 @@ from mavfi_cli.fi import record as records
 from mavfi_cli.fi.native.arch import SUPPORTED
 from mavfi_cli.fi.native.doctor import check_tracing
 from mavfi_cli.mission.briefing import of_config
+from mavfi_cli.mission.instruction.server import Setup
+from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
 from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.run_folder import load_run
-from mavfi_cli.mission.spawned_node import SpawnedNode
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"

@@ -6,11 +6,11 @@ import pytest
 
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.mission.companion.executor import Executor
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.executor import Executor
 from mavfi_cli.mission.platform import KERNELS, latency_model, load_platform
+from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
-from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.summary import measured_lines
 
 

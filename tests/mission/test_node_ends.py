@@ -9,9 +9,9 @@ import pytest
 
 from mavfi_cli.autonomy import planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import OccupancyMap
-from mavfi_cli.mission import node_process
-from mavfi_cli.mission.executor import Executor
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.companion import node_process
+from mavfi_cli.mission.companion.executor import Executor
+from mavfi_cli.mission.record.run_folder import load_run
 
 
 def record(folder):

@@ -13,16 +13,16 @@ from mavfi_cli.fi.isolated.profile import profile_run
 from mavfi_cli.fi.native.arch import SUPPORTED
 from mavfi_cli.fi.native.doctor import check_tracing
 from mavfi_cli.fi.native.tracer import TracerThread
+from mavfi_cli.mission.companion.node_process import NodeProcess
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.instruction.plan import draw_invocation
+from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_request
+from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.instruction_plan import draw_invocation
-from mavfi_cli.mission.node_process import NodeProcess
-from mavfi_cli.mission.node_server import Setup
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.rehearsal import Rehearsal, profile_request
+from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.run_folder import load_run
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"

@@ -8,7 +8,7 @@ import pytest
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
 from mavfi_cli.mission.platform import KERNELS, LatencyModel, load_platform, platform_names
-from mavfi_cli.mission.timetable import read_timetable
+from mavfi_cli.mission.record.timetable import read_timetable
 
 SOUND = 'name = "mine"\ncores = 2\n' + "".join(
     f"[kernels.{kernel}]\nlatency_s = {0.01 * (k + 1):.2f}\nspread = 0.5\n"

@@ -10,14 +10,14 @@ from mavfi_cli.core.errors import ConfigError, FaultSpecError, UnknownName
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
-from mavfi_cli.mission import protection as protection_module
+from mavfi_cli.mission.companion import protection as protection_module
+from mavfi_cli.mission.companion.protection import Protection, Response
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.protection import Protection, Response
+from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of, differing_results, same_file
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.run_folder import load_run
 
 LIMIT = 8.0
 TRAJECTORY = Trajectory(

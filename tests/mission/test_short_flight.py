@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.states import STATES
-from mavfi_cli.mission.plan_file import read_plans
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.record.plan_file import read_plans
+from mavfi_cli.mission.record.run_folder import load_run
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,9 @@ from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of, differing_results, first_difference, same_file
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.summary import difference_lines
 
 pytestmark = pytest.mark.slow

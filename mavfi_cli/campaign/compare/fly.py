@@ -26,8 +26,8 @@ from mavfi_cli.campaign.spec_difference import differences
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import installed_versions
-from mavfi_cli.mission.run_folder import load_run
 
 SCHEMA = 2  # 1 had the costs of faults among the worst cases
 TIMELINE = "timeline"

@@ -10,12 +10,12 @@ import statistics
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.mission.companion import SAME_TICK_S
-from mavfi_cli.mission.executor import Invocation
+from mavfi_cli.mission.companion.companion import SAME_TICK_S
+from mavfi_cli.mission.companion.executor import Invocation
+from mavfi_cli.mission.companion.response import Reaction
 from mavfi_cli.mission.platform import KERNELS
-from mavfi_cli.mission.response import Reaction
-from mavfi_cli.mission.run_folder import Run
-from mavfi_cli.mission.timetable import read_timetable
+from mavfi_cli.mission.record.run_folder import Run
+from mavfi_cli.mission.record.timetable import read_timetable
 
 CHAIN = ("point_cloud", "octomap", "collision_check")  # from a frame to the verdict on the way
 LEAST_S = 1.0  # of flight that a timeline shows

@@ -23,8 +23,8 @@ from mavfi_cli.detect.model import preprocessing
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.detect.registry import find
 from mavfi_cli.fi import bits
-from mavfi_cli.mission.plan_file import read_plans
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.record.plan_file import read_plans
+from mavfi_cli.mission.record.run_folder import load_run
 
 SCORES = "scores.json"
 _WAY = "looks ahead"  # how scores are taken; those of another way are not mixed with them

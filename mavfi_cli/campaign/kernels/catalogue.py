@@ -14,7 +14,7 @@ from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.campaign.kernels.difference import Compare, Output, numbers, paths, voxels
 from mavfi_cli.campaign.kernels.inputs import KernelInputs
 from mavfi_cli.core.errors import UnknownName
-from mavfi_cli.mission.kernel_scope import KernelScope, compiled_region, kernel_scope
+from mavfi_cli.mission.instruction.scope import KernelScope, compiled_region, kernel_scope
 
 Call = Callable[[], Output]
 

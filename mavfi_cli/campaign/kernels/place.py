@@ -20,7 +20,7 @@ from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.image import Image, Scope, scope_of
 from mavfi_cli.fi.native.tracee import Tracee
-from mavfi_cli.mission.kernel_scope import KernelScope
+from mavfi_cli.mission.instruction.scope import KernelScope
 
 # Nothing else of the environment reaches a run, so that its memory does not depend on the shell.
 _KEPT = ("HOME", "PATH", "LANG", "NUMBA_CACHE_DIR", "VIRTUAL_ENV")

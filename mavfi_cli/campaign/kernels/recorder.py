@@ -24,10 +24,10 @@ from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import Command, DepthFrame, FloatArray, Outcome, PointCloud, VehicleState
 from mavfi_cli.link.transport import open_transport
 from mavfi_cli.mission import briefing
-from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.companion.companion import Companion
+from mavfi_cli.mission.companion.kernels import tracking_inputs
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight import Flight
-from mavfi_cli.mission.kernels import tracking_inputs
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.vehicle_process import VehicleProcess

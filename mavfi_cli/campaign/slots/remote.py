@@ -21,9 +21,9 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.slots.desk import SCRATCH
 from mavfi_cli.campaign.slots.local import Slots
 from mavfi_cli.campaign.slots.seats import Assignment, Ended
+from mavfi_cli.mission.record.run_folder import FAULT, RESULT
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
-from mavfi_cli.mission.run_folder import FAULT, RESULT
 
 _SMALL = (RESULT, FAULT)  # of a run folder that is not kept, what the runner reads
 _thread = threading.local()

@@ -15,7 +15,7 @@ from mavfi_cli.campaign.slots.desk import ERRORS, SCRATCH
 from mavfi_cli.campaign.slots.seats import Ended
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.run_folder import RunFolder
+from mavfi_cli.mission.record.run_folder import RunFolder
 
 FULL_BYTES = 16 << 20  # with less free space a disk counts as full
 # A fault can make a process kill itself by other signals than these; these come from outside.

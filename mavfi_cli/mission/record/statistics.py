@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.link.images import ImageReceiver
-from mavfi_cli.mission.companion import Companion
-from mavfi_cli.mission.executor import Node
+from mavfi_cli.mission.companion.companion import Companion
+from mavfi_cli.mission.companion.executor import Node
 
 
 def mission_statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:

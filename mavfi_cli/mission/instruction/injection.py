@@ -12,12 +12,12 @@ from mavfi_cli.fi import record
 from mavfi_cli.fi.native.image import Image
 from mavfi_cli.fi.native.node import Attack, attack
 from mavfi_cli.fi.native.tracer import TracerThread
+from mavfi_cli.mission.companion.node_process import NodeProcess
 from mavfi_cli.mission.injection import SCHEMA, NoInjection
-from mavfi_cli.mission.instruction_plan import PlannedFault
-from mavfi_cli.mission.kernel_scope import KernelScope
-from mavfi_cli.mission.node_process import NodeProcess
-from mavfi_cli.mission.node_server import Setup
-from mavfi_cli.mission.spawned_node import SpawnedNode
+from mavfi_cli.mission.instruction.plan import PlannedFault
+from mavfi_cli.mission.instruction.scope import KernelScope
+from mavfi_cli.mission.instruction.server import Setup
+from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
 
 _TIMING = ("stop_s",)
 

@@ -34,14 +34,14 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.source.activation import Follower
 from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.companion.executor import Executor, Node
+from mavfi_cli.mission.companion.kernels import CheckInput, ControlInput, Kernels, tracking_inputs
+from mavfi_cli.mission.companion.protection import NoProtection
+from mavfi_cli.mission.companion.recovery import Recovery, Retry, Setpoint
+from mavfi_cli.mission.companion.response import Reaction
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.executor import Executor, Node
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.kernels import CheckInput, ControlInput, Kernels, tracking_inputs
 from mavfi_cli.mission.platform import PlatformProfile, latency_model
-from mavfi_cli.mission.protection import NoProtection
-from mavfi_cli.mission.recovery import Recovery, Retry, Setpoint
-from mavfi_cli.mission.response import Reaction
 
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
 # a shorter delay is below what the simulation resolves.

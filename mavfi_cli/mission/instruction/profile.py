@@ -25,11 +25,11 @@ from mavfi_cli.fi.native.node import (
 from mavfi_cli.fi.native.profile import Profile, Segment, record_window
 from mavfi_cli.fi.native.tracee import Tracee
 from mavfi_cli.fi.native.tracer import TracerThread
-from mavfi_cli.mission.kernel_scope import KernelScope
-from mavfi_cli.mission.node_process import NodeProcess
-from mavfi_cli.mission.node_server import Setup
-from mavfi_cli.mission.rehearsal import WHOLE_LIMIT, profile_request
-from mavfi_cli.mission.spawned_node import SpawnedNode
+from mavfi_cli.mission.companion.node_process import NodeProcess
+from mavfi_cli.mission.instruction.rehearsal import WHOLE_LIMIT, profile_request
+from mavfi_cli.mission.instruction.scope import KernelScope
+from mavfi_cli.mission.instruction.server import Setup
+from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
 
 T = TypeVar("T")
 Order = tuple[Any, float]  # input, start stamp

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.mission.trace import read_trace
+from mavfi_cli.mission.record.trace import read_trace
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.mission.node_process import NodeLost, NodeProcess
+from mavfi_cli.mission.companion.node_process import NodeLost, NodeProcess
 
 Run = Callable[[Any, float], Any]  # (input, start stamp) -> output
 Publish = Callable[[Any, float], None]  # (output, stamp at which it takes effect)

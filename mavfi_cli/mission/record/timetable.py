@@ -8,9 +8,9 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_atomically
-from mavfi_cli.mission.companion import Companion
-from mavfi_cli.mission.executor import Invocation
-from mavfi_cli.mission.response import Reaction
+from mavfi_cli.mission.companion.companion import Companion
+from mavfi_cli.mission.companion.executor import Invocation
+from mavfi_cli.mission.companion.response import Reaction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

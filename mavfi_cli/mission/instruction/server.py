@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from mavfi_cli.autonomy import planners, warm_up
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.briefing import Briefing
-from mavfi_cli.mission.companion import Companion
+from mavfi_cli.mission.companion.companion import Companion
+from mavfi_cli.mission.companion.node_process import receive, send, serve
+from mavfi_cli.mission.companion.protection import NoProtection
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.kernel_scope import node_scope
-from mavfi_cli.mission.node_process import receive, send, serve
+from mavfi_cli.mission.instruction.scope import node_scope
 from mavfi_cli.mission.platform import load_platform
-from mavfi_cli.mission.protection import NoProtection
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,9 +22,9 @@ from mavfi_cli.fi.native.image import Image, Scope, scope_of
 from mavfi_cli.fi.native.profile import WindowTooLong
 from mavfi_cli.fi.native.tracee import Tracee
 from mavfi_cli.fi.native.tracer import TracerThread
-from mavfi_cli.mission.node_process import NodeProcess
-from mavfi_cli.mission.node_server import Setup
-from mavfi_cli.mission.spawned_node import SpawnedNode
+from mavfi_cli.mission.companion.node_process import NodeProcess
+from mavfi_cli.mission.instruction.server import Setup
+from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
 
 WHOLE_LIMIT = 600_000  # instructions of a request without a search, or of one window
 WINDOWS, ENOUGH = 4, 50_000  # of a request with a search: see `profile_run`

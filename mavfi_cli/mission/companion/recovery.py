@@ -26,7 +26,7 @@ from mavfi_cli.autonomy.trajectory import without_waypoint
 from mavfi_cli.core.states import Message
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.fi.source.activation import Follower
-from mavfi_cli.mission.protection import NoProtection, Response
+from mavfi_cli.mission.companion.protection import NoProtection, Response
 
 ATTEMPTS = 2  # a command is computed again in one tick
 WITHHELD = (Response.RECOMPUTE, Response.HOLD)

@@ -25,10 +25,10 @@ from mavfi_cli.fi.isolated.profile import TargetProfile
 from mavfi_cli.fi.native.fault import InstructionFault
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.instruction.profile import Order, count_entries, profile_kernel
+from mavfi_cli.mission.instruction.scope import kernel_of_node
+from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.instruction_profile import Order, count_entries, profile_kernel
-from mavfi_cli.mission.kernel_scope import kernel_of_node
-from mavfi_cli.mission.node_server import Setup
 
 T = TypeVar("T")
 CACHE = ".profiles"

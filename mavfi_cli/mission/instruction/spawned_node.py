@@ -11,9 +11,9 @@ import time
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.native import linux
-from mavfi_cli.mission.kernel_scope import KernelScope
-from mavfi_cli.mission.node_process import receive, send
-from mavfi_cli.mission.node_server import Setup
+from mavfi_cli.mission.companion.node_process import receive, send
+from mavfi_cli.mission.instruction.scope import KernelScope
+from mavfi_cli.mission.instruction.server import Setup
 
 _CHANNEL = 3
 _FILE_CLOCK = 5  # CLOCK_REALTIME_COARSE, which stamps files; `time.time_ns` runs ahead of it
@@ -41,7 +41,7 @@ class SpawnedNode:
             (os.POSIX_SPAWN_DUP2, theirs.fileno(), _CHANNEL),
         ]
         # -P: where we stand must not decide what is imported, and so how its memory lies.
-        line = [sys.executable, "-P", "-m", "mavfi_cli.mission.node_server", str(_CHANNEL)]
+        line = [sys.executable, "-P", "-m", "mavfi_cli.mission.instruction.server", str(_CHANNEL)]
         self._started_ns = time.clock_gettime_ns(_FILE_CLOCK)
         with theirs, linux.fixed_addresses():
             self.pid = os.posix_spawn(
