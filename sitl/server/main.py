@@ -19,7 +19,7 @@ from sitl.server.lockstep import run_lockstep
 from sitl.server.options import Options, parse
 from sitl.server.realtime import Door, Realtime
 from sitl.server.simulation import Simulation
-from sitl.vehicle.profile import load_profile
+from sitl.vehicle.profile_files import load_profile
 from sitl.world import load_world
 
 

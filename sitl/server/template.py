@@ -47,7 +47,7 @@ from mavfi_cli.core.processes import (
 )
 from sitl.server.main import Place, main
 from sitl.server.simulation import Simulation
-from sitl.vehicle.profile import load_profile
+from sitl.vehicle.profile_files import load_profile
 from sitl.world import load_world
 
 PACKET = 1 << 16

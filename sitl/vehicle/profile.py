@@ -6,11 +6,9 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.config import load_toml, read_toml, structure
-from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.errors import ConfigError
 
 AIR_DENSITY_KGPM3 = 1.225  # ISA sea level, which is where the physics world lies
 GRAVITY_MPS2 = 9.80665
@@ -31,8 +29,6 @@ _MAY_BE_ZERO = (
     "battery.resistance_ohm",
     "battery.avionics_w",
 )
-
-_PROFILES = Path(__file__).parent / "profiles"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,40 +255,3 @@ def _check_sign(key: str, value: float) -> None:
         raise ConfigError(f"must not be negative, is {value:g}", key=key)
     if value <= 0.0 and key not in _MAY_BE_ZERO:
         raise ConfigError(f"must be above zero, is {value:g}", key=key)
-
-
-def profile_names() -> list[str]:
-    """The names of the profiles that come with the package."""
-    return sorted(path.stem for path in _PROFILES.glob("*.toml"))
-
-
-def load_profile(name_or_path: str) -> VehicleProfile:
-    """A shipped profile by name, or any profile by the path of its TOML file.
-
-    A file with a `base` scales a shipped profile, see `sitl.vehicle.stand_in`.
-
-    Raises:
-        UnknownName: neither a shipped profile nor a TOML path.
-        ConfigError: the file cannot be read, or describes no vehicle that can fly.
-    """
-    if name_or_path in profile_names():
-        return load_toml(_PROFILES / f"{name_or_path}.toml", VehicleProfile)
-    if name_or_path.endswith(".toml") or "/" in name_or_path:
-        return _load_file(Path(name_or_path))
-    raise UnknownName("vehicle", name_or_path, profile_names())
-
-
-def _load_file(path: Path) -> VehicleProfile:
-    from sitl.vehicle.stand_in import StandIn
-
-    data, text = read_toml(path)
-    if "base" not in data:
-        return structure(data, VehicleProfile, path=path, text=text)
-    stand_in = structure(data, StandIn, path=path, text=text)
-    if stand_in.base not in profile_names():
-        error = UnknownName("vehicle", stand_in.base, profile_names())
-        raise ConfigError(str(error), path=path, key="base")
-    try:
-        return stand_in.profile(load_profile(stand_in.base))
-    except (ConfigError, ValueError) as problem:
-        raise ConfigError(str(problem), path=path) from None

@@ -11,7 +11,7 @@ from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
 from sitl.control import layout
 from sitl.control.attitude import rotation, specific_force, tilt_rates
 from sitl.control.gains import gains_for
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile_files import load_profile, profile_names
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in profile_names()}
 angles = st.floats(-3.0, 3.0)

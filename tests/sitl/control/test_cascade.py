@@ -10,7 +10,7 @@ from mavfi_cli.core.frames import quaternion_from_euler
 from sitl.control import layout
 from sitl.control.cascade import control_step
 from sitl.control.gains import gains_for
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile_files import load_profile, profile_names
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in profile_names()}
 names = st.sampled_from(profile_names())

@@ -11,7 +11,7 @@ from sitl.control import layout
 from sitl.control.gains import gains_for
 from sitl.control.mixer import LEAST_SHARE, mix, throttle, thrust_shares
 from sitl.vehicle.model import ROTOR_LAYOUT
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile_files import load_profile, profile_names
 
 PROFILES = {name: load_profile(name) for name in profile_names()}
 GAINS = {name: gains_for(profile, 0.004) for name, profile in PROFILES.items()}

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sitl.control import layout
 from sitl.control.gains import gains_for
 from sitl.control.setpoint import FARTHEST_M, clean_setpoint, wrap
-from sitl.vehicle.profile import load_profile
+from sitl.vehicle.profile_files import load_profile
 
 GAINS = gains_for(load_profile("solo"), 0.004)
 anything = st.lists(st.floats(), min_size=11, max_size=11).map(np.array)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sitl.control import layout
 from sitl.control.gains import gains_for
 from sitl.control.velocity import acceleration_target, velocity_target
-from sitl.vehicle.profile import load_profile
+from sitl.vehicle.profile_files import load_profile
 
 GAINS = gains_for(load_profile("solo"), 0.004)
 FREE = math.nan

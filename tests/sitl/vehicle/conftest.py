@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sitl.vehicle.profile import load_profile
+from sitl.vehicle.profile_files import load_profile
 from sitl.vehicle.truth import T_POSITION, T_QUATERNION, T_VELOCITY
 from sitl.vehicle.vehicle import PHYSICS_DT_S, Vehicle
 

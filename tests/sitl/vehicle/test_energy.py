@@ -14,7 +14,7 @@ from sitl.vehicle.energy import (
     regression_coefficients,
     regression_power,
 )
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile_files import load_profile, profile_names
 
 components = st.lists(st.floats(-20.0, 20.0), min_size=3, max_size=3).map(np.array)
 

@@ -18,7 +18,8 @@ from sitl.vehicle.physics import (
     RAW_VELOCITY,
     Physics,
 )
-from sitl.vehicle.profile import GRAVITY_MPS2, load_profile, profile_names
+from sitl.vehicle.profile import GRAVITY_MPS2
+from sitl.vehicle.profile_files import load_profile, profile_names
 
 DT_S = 0.004
 
