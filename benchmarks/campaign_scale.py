@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.campaign.findings.summary import summarise
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, State
 from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.run import Options, run_campaign, store_plan
-from mavfi_cli.campaign.summary import summarise
 from mavfi_cli.mission.config import MissionConfig
 
 CELLS = 40

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
 from mavfi_cli.campaign.missions import (
     PlannedMission,
@@ -21,10 +20,11 @@ from mavfi_cli.campaign.missions import (
 )
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.run import require_versions, store_plan
-from mavfi_cli.campaign.spec import Spec, load_spec, parse_spec, presets
-from mavfi_cli.campaign.spec_difference import differences
-from mavfi_cli.campaign.spec_set import replaced
-from mavfi_cli.campaign.spec_text import to_toml
+from mavfi_cli.campaign.specification.changes import replaced
+from mavfi_cli.campaign.specification.difference import differences
+from mavfi_cli.campaign.specification.factors import check_names
+from mavfi_cli.campaign.specification.spec import Spec, load_spec, parse_spec, presets
+from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.campaign.stopping import Gate
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_text

@@ -21,7 +21,7 @@ from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.slots.local import TASK, Slots
 from mavfi_cli.campaign.slots.seats import Assignment, Ended, Seats
 from mavfi_cli.campaign.slots.verdict import CampaignStopped, Verdict, judge
-from mavfi_cli.campaign.spec import Stop
+from mavfi_cli.campaign.specification.spec import Stop
 from mavfi_cli.campaign.stopping import Entry, Gate, Queue
 from mavfi_cli.campaign.together import Together
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError

@@ -11,7 +11,7 @@ import click
 
 if TYPE_CHECKING:
     from mavfi_cli.campaign.ledger import Ledger
-    from mavfi_cli.campaign.spec import Spec
+    from mavfi_cli.campaign.specification.spec import Spec
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _SET = click.option("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
@@ -125,8 +125,8 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 def export(what: str, path: Path) -> None:
     """Write one row a mission to PATH, a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.export import export as write
-    from mavfi_cli.campaign.export import export_csv
+    from mavfi_cli.campaign.findings.export import export as write
+    from mavfi_cli.campaign.findings.export import export_csv
     from mavfi_cli.campaign.ledger import Ledger
 
     with Ledger(folder_of(what)) as ledger:
@@ -153,8 +153,8 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     from dataclasses import asdict
 
     from mavfi_cli.campaign.begin import folder_of
+    from mavfi_cli.campaign.findings.trajectories import pair
     from mavfi_cli.campaign.ledger import Ledger
-    from mavfi_cli.campaign.trajectories import pair
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.trajectories import Panel, lines, write_trajectories
@@ -271,7 +271,7 @@ def _show(
     more: Mapping[str, Any] | None = None,
 ) -> None:
     from mavfi_cli.campaign.begin import stopped
-    from mavfi_cli.campaign.summary import summarise, table
+    from mavfi_cli.campaign.findings.summary import summarise, table
     from mavfi_cli.core.files import plain
 
     summary = summarise(ledger, by or [], confidence)
@@ -294,8 +294,8 @@ def _add_more(
     lines: list[str],
 ) -> None:
     """What --quality, --overhead and --failures ask for, as plain values and as text."""
-    from mavfi_cli.campaign import across, overhead, quality
-    from mavfi_cli.campaign.groups import groups
+    from mavfi_cli.campaign.findings import across, overhead, quality
+    from mavfi_cli.campaign.findings.groups import groups
 
     if not (more["quality"] or more["overhead"] or more["failures"]):
         return

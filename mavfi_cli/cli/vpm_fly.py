@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.arms import Arm, Flown, arm_missions, fly_arms, paired_ratio
-from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.missions import canonical, changes_of
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
+from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.campaign.training import WORLDS as TRAINING_WORLDS
 from mavfi_cli.campaign.training import TrainingPlan, train
 from mavfi_cli.core.config import require_distinct

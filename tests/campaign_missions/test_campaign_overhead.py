@@ -6,9 +6,9 @@ import math
 import pytest
 from click.testing import CliRunner
 
-from mavfi_cli.campaign.groups import groups
+from mavfi_cli.campaign.findings.groups import groups
+from mavfi_cli.campaign.findings.overhead import lines, overheads
 from mavfi_cli.campaign.outcome import Injected
-from mavfi_cli.campaign.overhead import lines, overheads
 from mavfi_cli.cli.campaign import campaign as command
 
 KERNELS = {

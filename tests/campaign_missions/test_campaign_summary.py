@@ -5,16 +5,16 @@ import math
 
 import pytest
 
-from mavfi_cli.campaign.across import across
-from mavfi_cli.campaign.across import lines as across_lines
 from mavfi_cli.campaign.begin import stopped
-from mavfi_cli.campaign.comparison import against_golden, protection
-from mavfi_cli.campaign.groups import METRICS, groups
+from mavfi_cli.campaign.findings.across import across
+from mavfi_cli.campaign.findings.across import lines as across_lines
+from mavfi_cli.campaign.findings.comparison import against_golden, protection
+from mavfi_cli.campaign.findings.groups import METRICS, groups
+from mavfi_cli.campaign.findings.quality import lines as quality_lines
+from mavfi_cli.campaign.findings.quality import qualities
+from mavfi_cli.campaign.findings.summary import summarise, table
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, State
-from mavfi_cli.campaign.quality import lines as quality_lines
-from mavfi_cli.campaign.quality import qualities
-from mavfi_cli.campaign.summary import summarise, table
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.native.fault import FaultModel

@@ -314,7 +314,7 @@ def test_wrong_usage_is_exit_code_2(mavfi, arguments):
 
 
 def test_every_preset_is_named_in_the_help():
-    from mavfi_cli.campaign.spec import presets
+    from mavfi_cli.campaign.specification.spec import presets
 
     for name in presets():
         assert name in command.campaign.help

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.campaign.groups import METRICS, Group, Words, matched
+from mavfi_cli.campaign.findings.groups import METRICS, Group, Words, matched
 from mavfi_cli.campaign.outcome import Injected
 
 FATES = (Injected.ACTIVE.value, Injected.NOT_INJECTED.value)

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.spec import Stop, load_spec, parse_spec, presets
-from mavfi_cli.campaign.spec_text import to_toml
+from mavfi_cli.campaign.specification.spec import Stop, load_spec, parse_spec, presets
+from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey, UnknownName
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.campaign.compare.plan import ComparePlan
-from mavfi_cli.campaign.spec import parse_spec
-from mavfi_cli.campaign.spec_difference import differences
+from mavfi_cli.campaign.specification.difference import differences
+from mavfi_cli.campaign.specification.spec import parse_spec
 
 STORED = """
 repetitions = 10

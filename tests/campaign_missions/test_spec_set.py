@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.spec import load_spec, parse_spec
-from mavfi_cli.campaign.spec_set import replaced
+from mavfi_cli.campaign.specification.changes import replaced
+from mavfi_cli.campaign.specification.spec import load_spec, parse_spec
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey
 
 SPEC = """

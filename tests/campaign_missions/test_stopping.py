@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.campaign.outcome import Injected
-from mavfi_cli.campaign.spec import Stop
+from mavfi_cli.campaign.specification.spec import Stop
 from mavfi_cli.campaign.statistics.proportions import half_width, rate
 from mavfi_cli.campaign.stopping import Gate, Queue
 

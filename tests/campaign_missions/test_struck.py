@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.campaign.struck import COLUMNS, struck
+from mavfi_cli.campaign.findings.struck import COLUMNS, struck
 
 STRIKE = {
     "changes": [

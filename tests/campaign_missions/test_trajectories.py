@@ -3,10 +3,10 @@
 import pytest
 
 from mavfi_cli.campaign.begin import chosen
+from mavfi_cli.campaign.findings.trajectories import pair
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, State
-from mavfi_cli.campaign.trajectories import pair
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig

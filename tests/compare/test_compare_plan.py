@@ -8,7 +8,7 @@ from flown_twice import flight
 
 from mavfi_cli.campaign.compare.fly import timeline_seed
 from mavfi_cli.campaign.compare.plan import ComparePlan, titles
-from mavfi_cli.campaign.spec import load_spec
+from mavfi_cli.campaign.specification.spec import load_spec
 from mavfi_cli.core.errors import ConfigError
 
 

@@ -21,8 +21,8 @@ from mavfi_cli.campaign.ledger import LEDGER, Ledger
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
-from mavfi_cli.campaign.spec import Spec, parse_spec
-from mavfi_cli.campaign.spec_difference import differences
+from mavfi_cli.campaign.specification.difference import differences
+from mavfi_cli.campaign.specification.spec import Spec, parse_spec
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.platform import load_platform

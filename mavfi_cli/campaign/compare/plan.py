@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.spec import Setting, Spec
+from mavfi_cli.campaign.specification.spec import Setting, Spec
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from mavfi_cli.campaign.evaluation.pairs import Flights, Harm, flown_of
 from mavfi_cli.campaign.evaluation.plan import NONE, EvaluationPlan, Fault, require_held_out
-from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
@@ -22,6 +21,7 @@ from mavfi_cli.campaign.outcome import MissionResult, State
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
+from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.core.errors import RecordError
 
 BARE, PROTECTED = "bare", "protected"

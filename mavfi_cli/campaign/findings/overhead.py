@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mavfi_cli.campaign.comparison import RESAMPLES
-from mavfi_cli.campaign.groups import Group
+from mavfi_cli.campaign.findings.comparison import RESAMPLES
+from mavfi_cli.campaign.findings.groups import Group
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval

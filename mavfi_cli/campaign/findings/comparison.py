@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.campaign.groups import METRICS, BoolArray, Group, IntArray, matched, untreated
+from mavfi_cli.campaign.findings.groups import (
+    METRICS,
+    BoolArray,
+    Group,
+    IntArray,
+    matched,
+    untreated,
+)
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.paired import McNemar, holm, mcnemar
 from mavfi_cli.campaign.statistics.worst_case import WorstCase, worst_case, worst_over_own

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.campaign.spec import Axes, Setting, Spec
+from mavfi_cli.campaign.specification.spec import Axes, Setting, Spec
 
 _Choices = Mapping[str, Sequence[Any]]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.campaign import struck
+from mavfi_cli.campaign.findings import struck
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import MissionResult

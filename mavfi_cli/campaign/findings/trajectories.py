@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.groups import TREATMENT, untreated
+from mavfi_cli.campaign.findings.groups import TREATMENT, untreated
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.outcome import Injected, MissionResult, State

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from mavfi_cli.campaign.spec import Axes, Spec
+from mavfi_cli.campaign.specification.spec import Axes, Spec
 
 
 def to_toml(spec: Spec) -> str:

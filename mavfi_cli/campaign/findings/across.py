@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.campaign.groups import Group
+from mavfi_cli.campaign.findings.groups import Group
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import Injected

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.campaign.comparison import RESAMPLES, Comparison, against_golden
-from mavfi_cli.campaign.groups import METRICS, Group
+from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden
+from mavfi_cli.campaign.findings.groups import METRICS, Group
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 
 _TITLES = {

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mavfi_cli.campaign.comparison import RESAMPLES, Comparison, against_golden, protection
-from mavfi_cli.campaign.groups import INACTIVE, METRICS, Group, groups
+from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden, protection
+from mavfi_cli.campaign.findings.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate

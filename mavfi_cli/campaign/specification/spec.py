@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.autonomy.planner_names import canonical
-from mavfi_cli.campaign.factors import NAMES, Point
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import Label, PlannedMission, naming
+from mavfi_cli.campaign.specification.factors import NAMES, Point
 from mavfi_cli.core.config import syntax_error
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 from mavfi_cli.core.seeds import Stream, derive

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.factors import MISSION, NAMES
-from mavfi_cli.campaign.spec import LISTS, Spec, read_spec
-from mavfi_cli.campaign.spec_text import to_toml
+from mavfi_cli.campaign.specification.factors import MISSION, NAMES
+from mavfi_cli.campaign.specification.spec import LISTS, Spec, read_spec
+from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 
 _ODD = re.compile(r"[^\w.+=-]+")  # what no folder's name gets

@@ -1,0 +1,1 @@
+"""What a campaign has found: its missions gathered, compared, summarised, drawn and exported."""
