@@ -24,9 +24,9 @@ _KEEP = ("none", "failures", "sampled", "all")
 def campaign() -> None:
     """Thousands of missions: planned, paired, resumable, counted.
 
-    WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16), a campaign.toml, or the
-    folder of a campaign that was begun. Presets and files fly into campaigns/NAME, and that is
-    where status, draw and export look for them.
+    WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16 speeds), a campaign.toml, or
+    the folder of a campaign that was begun. Presets and files fly into campaigns/NAME, and that
+    is where status, draw and export look for them.
     """
 
 
