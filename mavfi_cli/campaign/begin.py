@@ -48,34 +48,73 @@ def chosen(
         changes: factors to replace, as `spec_set.replaced`; the default folder's name has them.
 
     Raises:
-        ConfigError: the specification, or the scale, cannot be used.
+        ConfigError: the specification, or the scale, cannot be used; or a preset without `out`
+            has the name of a campaign here.
         UnknownName: neither of them exists.
     """
-    folder = folder_of(what)
-    if folder == Path(what):
-        with Ledger(folder) as ledger:
-            if scale is not None or out is not None or changes:
-                raise ConfigError("goes without --scale, --set and --out: it has all", path=folder)
-            return _stored_spec(ledger), folder
-    spec = replaced(load_spec(what), changes)
-    return spec if scale is None else spec.scaled(scale), out or DEFAULT / spec.name
+    spec = chosen_spec(what, scale, changes, folder_fits=out is None)
+    if _is_folder(what):
+        return spec, Path(what)
+    if out is None:
+        _require_one_meaning(what)
+    return spec, out or DEFAULT / spec.name
+
+
+def chosen_spec(
+    what: str, scale: float | None, changes: Sequence[str] = (), *, folder_fits: bool = True
+) -> Spec:
+    """The specification that is named; what `chosen` gives without its folder.
+
+    Args:
+        what, scale, changes: as for `chosen`.
+        folder_fits: False refuses the folder of a campaign, as `scale` and `changes` do.
+
+    Raises:
+        ConfigError: the specification, or the scale, cannot be used.
+        UnknownName: neither preset nor file nor folder.
+    """
+    if not _is_folder(what):
+        spec = replaced(load_spec(what), changes)
+        return spec if scale is None else spec.scaled(scale)
+    with Ledger(Path(what)) as ledger:
+        if scale is not None or changes or not folder_fits:
+            raise ConfigError("goes without --scale, --set and --out: it has all", path=Path(what))
+        return _stored_spec(ledger)
 
 
 def folder_of(what: str) -> Path:
     """The folder that is named, or into which what is named is flown.
 
     Args:
-        what: a preset, a TOML file, or the folder of a campaign. A preset's name is the preset,
-            also where a folder has the same; ./NAME is the folder.
+        what: a preset, a TOML file, or the folder of a campaign. A preset's name is the preset;
+            ./NAME is the folder. Where ./NAME holds a campaign, the name alone is refused.
 
     Raises:
-        ConfigError: a file that is no specification.
+        ConfigError: a file that is no specification, or a name with two meanings.
         UnknownName: a single word that is neither a preset nor a folder.
     """
-    folder = Path(what)
-    if what not in presets() and (folder.is_dir() or (os.sep in what and folder.suffix != ".toml")):
-        return folder
+    if _is_folder(what):
+        return Path(what)
+    _require_one_meaning(what)
     return DEFAULT / load_spec(what).name
+
+
+def _is_folder(what: str) -> bool:
+    """Whether a campaign's folder is named, not a preset or a file."""
+    folder = Path(what)
+    return what not in presets() and (
+        folder.is_dir() or (os.sep in what and folder.suffix != ".toml")
+    )
+
+
+def _require_one_meaning(what: str) -> None:
+    """Refuse a preset's name where a folder of that name holds a campaign: either may be meant."""
+    if what in presets() and (Path(what) / LEDGER).is_file():
+        own = DEFAULT / what
+        raise ConfigError(
+            f"{what} is a preset, and .{os.sep}{what} holds a campaign: say .{os.sep}{what} for "
+            f"that one; the preset's own folder is {own}, or run with --out {own} to begin it"
+        )
 
 
 def _stored_spec(ledger: Ledger) -> Spec:

@@ -26,7 +26,7 @@ def campaign() -> None:
 
     WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16 speeds), a campaign.toml, or
     the folder of a campaign that was begun. Presets and files fly into campaigns/NAME, and that
-    is where status, draw and export look for them.
+    is where status, draw and export look for them. A folder with a preset's name is ./NAME.
     """
 
 
@@ -224,11 +224,11 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
 def _planned(what: str, scale: float | None, changes: Sequence[str]) -> dict[str, Any]:
     from collections import Counter
 
-    from mavfi_cli.campaign.begin import chosen, flyable
+    from mavfi_cli.campaign.begin import chosen_spec, flyable
     from mavfi_cli.campaign.missions import label_text
 
     spec: Spec
-    spec, _ = chosen(what, None, scale, changes)
+    spec = chosen_spec(what, scale, changes)
     missions = flyable(spec)
     cells = Counter(label_text(mission.labels) for mission in missions)
     return {

@@ -96,10 +96,14 @@ def _attack_program(options: dict[str, Any]) -> None:
     as_json, out = options["as_json"], options["out"]
     plan = _plan(options)
     name = Path(options["program"]).name
-    with runs_view([name], plan.runs) as show:
-        show(name, 0)
+    with runs_view([name], plan.runs) as view:
+        view.show(name, 0)
         campaign = run_campaign(
-            plan, jobs=options["jobs"], folder=out, progress=lambda done: show(name, done)
+            plan,
+            jobs=options["jobs"],
+            folder=out,
+            progress=lambda done: view.show(name, done),
+            stage=view.stage,
         )
     if out is not None:
         _save(campaign, out)

@@ -30,8 +30,10 @@ def run_own_kernels(options: dict[str, Any], model: FaultModel) -> None:
     kernels = select(options["kernel"])
     with _folder(options["out"]) as folder:
         plan = _plan(options, tuple(kernel.name for kernel in kernels), model, folder)
-        with runs_view(plan.kernels, plan.runs) as show:
-            campaign = run_kernels(plan, jobs=options["jobs"], folder=folder, progress=show)
+        with runs_view(plan.kernels, plan.runs) as view:
+            campaign = run_kernels(
+                plan, jobs=options["jobs"], folder=folder, progress=view.show, stage=view.stage
+            )
         summary = summarise(plan, campaign)
         if options["out"] is not None:
             _save(folder, summary, campaign)

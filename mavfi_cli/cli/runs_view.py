@@ -6,13 +6,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 import click
 
 from mavfi_cli.cli.missions_view import PLAIN_EVERY_S
 
-Show = Callable[[str, int], None]
+
+class RunsView(Protocol):
+    """What a person sees of the runs, kernel by kernel."""
+
+    def show(self, kernel: str, done: int) -> None:
+        """A kernel's so many runs are there; 0: it begins."""
+
+    def stage(self, what: str) -> None:
+        """What goes on before the first run of the kernel that has begun."""
 
 
 class PlainRuns:
@@ -44,23 +52,46 @@ class PlainRuns:
             return
         self._last_s = now_s
 
+    def stage(self, what: str) -> None:
+        """Say what goes on where ten seconds have passed."""
+        now_s = self._clock()
+        if now_s - self._last_s >= PLAIN_EVERY_S:
+            click.echo(f"{self._kernel}: {what}", err=True)
+            self._last_s = now_s
+
+
+class LiveRuns:
+    """A bar over all runs that names the kernel, and what goes on before its first run.
+
+    Args:
+        bar: click's.
+        kernels, runs: as for `PlainRuns`.
+    """
+
+    def __init__(self, bar: Any, kernels: Sequence[str], runs: int) -> None:
+        self._bar, self._kernels, self._runs = bar, list(kernels), runs
+        self._kernel, self._reached = "", 0
+
+    def show(self, kernel: str, done: int) -> None:
+        """Move the bar to a kernel's so many runs."""
+        self._kernel = kernel
+        position = self._kernels.index(kernel) * self._runs + done
+        self._bar.update(position - self._reached, kernel)
+        self._reached = position
+
+    def stage(self, what: str) -> None:
+        """Say it beside the bar."""
+        self._bar.current_item = f"{self._kernel}: {what}"
+        self._bar.render_progress()
+
 
 @contextmanager
-def runs_view(kernels: Sequence[str], runs: int) -> Iterator[Show]:
-    """What is to be called with a kernel and how many of its runs are there."""
+def runs_view(kernels: Sequence[str], runs: int) -> Iterator[RunsView]:
+    """The view that suits stderr: plain lines, or a bar."""
     if not sys.stderr.isatty():
-        yield PlainRuns(kernels, runs).show
+        yield PlainRuns(kernels, runs)
         return
     make: Any = click.progressbar
-    length, names = runs * len(kernels), list(kernels)
+    length = runs * len(kernels)
     with make(length=length, file=sys.stderr, item_show_func=lambda name: name) as bar:
-        reached = 0
-
-        def show(kernel: str, done: int) -> None:
-            """Move the bar to a kernel's so many runs."""
-            nonlocal reached
-            position = names.index(kernel) * runs + done
-            bar.update(position - reached, kernel)
-            reached = position
-
-        yield show
+        yield LiveRuns(bar, kernels, runs)

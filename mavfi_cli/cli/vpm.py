@@ -34,8 +34,8 @@ _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
                    "[the vehicle's own].")  # fmt: skip
 @click.option("--chain", type=click.Choice(["serial", "pipelined"]), default="serial",
               show_default=True,
-              help="Response time of a platform: the sum of its kernels' latencies, or the "
-                   "slowest.")  # fmt: skip
+              help="With --platform: its response time is the sum of its kernels' latencies, or "
+                   "the slowest.")  # fmt: skip
 @click.option("--board", metavar="NAME|FILE",
               help="Mass and power of a computer: a57, ncs, raspi3b, tx2, xavier or a TOML "
                    "file  [the platform's, or the vehicle's own].")  # fmt: skip
@@ -123,12 +123,20 @@ def vpm(
 
 
 def _refuse_unused() -> None:
-    """An option that would do nothing is a mistake: exit code 2."""
+    """An option that would do nothing without --fly is a mistake: exit code 2."""
     context = click.get_current_context()
     for option in context.command.params:
-        given = context.get_parameter_source(str(option.name))
-        if option.name in _FLYING and given is ParameterSource.COMMANDLINE:
+        if option.name in _FLYING and _given(str(option.name)):
             raise click.UsageError(f"{option.opts[0]} needs --fly")
+    if _given("chain") and not _given("platform"):
+        raise click.UsageError("--chain needs --platform: it is how its latencies add up")
+    if _given("chain") and _given("response"):
+        raise click.UsageError("--chain or --response, not both: either is the response time")
+
+
+def _given(name: str) -> bool:
+    source = click.get_current_context().get_parameter_source(name)
+    return source is ParameterSource.COMMANDLINE
 
 
 def _flown(

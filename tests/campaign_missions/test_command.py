@@ -283,6 +283,31 @@ def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
     assert "goes without --scale, --set and --out" in str(both.exception)
 
 
+def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mavfi_cli.campaign.run.fly_missing", lambda *_: None)
+
+    def called(*arguments):
+        return CliRunner().invoke(command.campaign, arguments)
+
+    begin = ("run", "fig8", "--out", "fig8", "--scale", "0.01", "--quiet")
+    (tmp_path / "fig8").mkdir()  # as long as it holds no campaign, the name is the preset alone
+    assert str(called("status", "fig8").exception).startswith("campaigns/fig8: ")
+    for _ in range(2):  # --out says which is meant: begun, and gone on with by the same line
+        assert called(*begin).stdout.startswith("fig8: 0 of ")
+    for line in (("run", "fig8"), ("run", "fig8", "--scale", "0.01"), ("status", "fig8"),
+                 ("export", "fig8", "-"), ("draw", "fig8", "--output", "pair.svg")):  # fmt: skip
+        said = str(called(*line).exception)
+        assert "fig8 is a preset, and ./fig8 holds a campaign: say ./fig8" in said
+        assert "campaigns/fig8" in said
+    assert not (tmp_path / "campaigns").exists()
+    assert called("plan", "fig8", "--scale", "0.01").exit_code == 0  # the preset: nothing is flown
+    own = called("run", "fig8", "--out", "campaigns/fig8", "--scale", "0.02", "--quiet")
+    assert own.exit_code == 0
+    assert called("status", "campaigns/fig8").stdout == own.stdout
+    assert called("status", "./fig8").stdout == called(*begin).stdout != own.stdout
+
+
 def test_set_names_the_nearest_factor(refused):
     for name in ("run", "plan"):
         assert "did you mean 'world'?" in refused(name, "fig8", "--set", "wrold=dense")

@@ -163,6 +163,27 @@ def test_usage(command_line, arguments):
     assert "Error: " in err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "--chain needs --platform"),
+        (("--platform", "tx2", "--response", "0.2"), "--chain or --response, not both"),
+    ],
+)
+def test_a_chain_of_no_latencies_is_refused(command_line, arguments, said):
+    for chain in ("serial", "pipelined"):
+        code, out, err = command_line("vpm", "--chain", chain, *arguments)
+        assert (code, out) == (2, "")
+        assert said in err
+
+
+def test_a_chain_says_how_a_platform_s_latencies_add_up(command_line):
+    line = ("vpm", "--vehicle", "airsim", "--platform", "tx2", "--chain", "pipelined")
+    code, out, _ = command_line(*line)
+    assert code == 0
+    assert "platform tx2: slowest of point_cloud, octomap" in out
+
+
 def test_platforms(command_line, tmp_path):
     code, out, _ = command_line("platforms")
     assert code == 0

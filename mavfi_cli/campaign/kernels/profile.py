@@ -7,11 +7,16 @@ import re
 import numpy as np
 
 from mavfi_cli.campaign.kernels.place import Place
-from mavfi_cli.fi.isolated.profile import TargetProfile, profile_run
+from mavfi_cli.fi.isolated.profile import TargetProfile, Watch, profile_run
 
 
 def profile_kernel(
-    place: Place, rng: np.random.Generator, *, windows: int, sampled: bool = False
+    place: Place,
+    rng: np.random.Generator,
+    *,
+    windows: int,
+    sampled: bool = False,
+    watch: Watch | None = None,
 ) -> TargetProfile:
     """Step a fault-free run of the kernel, or a sample of it.
 
@@ -20,6 +25,7 @@ def profile_kernel(
         rng: draws the windows.
         windows: how many are stepped, at least, of those that begin at the same function.
         sampled: cut the run into windows, as it is too long to be stepped.
+        watch: is told how far it is.
 
     Raises:
         TargetError: the kernel never enters its native code.
@@ -27,7 +33,7 @@ def profile_kernel(
     """
     scope = place.layout.scope
     markers = (scope.inner or (scope.entry,)) if sampled else ()
-    return profile_run(place, rng, markers=markers, windows=windows)
+    return profile_run(place, rng, markers=markers, windows=windows, watch=watch)
 
 
 def in_words(profile: TargetProfile) -> str:

@@ -21,7 +21,7 @@ from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.sources import own_digest
 from mavfi_cli.fi.isolated.attack import Attacker
 from mavfi_cli.fi.isolated.journal import Journal
-from mavfi_cli.fi.isolated.profile import TargetProfile
+from mavfi_cli.fi.isolated.profile import TargetProfile, in_words
 from mavfi_cli.fi.isolated.runs import (
     FaultPlan,
     Record,
@@ -33,6 +33,7 @@ from mavfi_cli.fi.isolated.runs import (
 from mavfi_cli.fi.sampling import Rule
 
 Progress = Callable[[str, int], None]
+Stage = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +105,7 @@ def run_kernels(
     jobs: int = 1,
     folder: Path | None = None,
     progress: Progress | None = None,
+    stage: Stage = lambda _: None,
 ) -> list[KernelRuns]:
     """Golden run, profile, fault list and runs of every kernel.
 
@@ -113,6 +115,7 @@ def run_kernels(
         folder: where records go; the runs that it has already are not repeated.
         progress: called with the kernel and the number of its runs that are there; with 0 before
             its golden run and profile.
+        stage: called with what goes on before a kernel's first run.
 
     Raises:
         TracingForbidden: the operating system refuses.
@@ -123,17 +126,23 @@ def run_kernels(
     if folder is not None:
         journal = Journal(folder, plan.to_json(), runs=plan.runs, kernels=plan.kernels)
     with Workers(jobs) as workers:
-        return [_run_kernel(plan, name, workers, journal, progress) for name in plan.kernels]
+        return [_run_kernel(plan, name, workers, journal, progress, stage) for name in plan.kernels]
 
 
 def _run_kernel(
-    plan: Plan, name: str, workers: Workers, journal: Journal | None, progress: Progress | None
+    plan: Plan,
+    name: str,
+    workers: Workers,
+    journal: Journal | None,
+    progress: Progress | None,
+    stage: Stage,
 ) -> KernelRuns:
     begun = time.perf_counter()
     if progress is not None:
         progress(name, 0)
     with one_processor():
-        prepared, place = _prepare(plan, name)
+        prepared, place = _prepare(plan, name, stage)
+    stage(f"drawing {plan.runs} faults")
     bench = _Bench(plan=plan, kernel=name, layout=prepared.layout, golden=prepared.golden)
     workers.take(bench, bench.attacker(place))
     context = {
@@ -152,17 +161,22 @@ def _run_kernel(
     return KernelRuns(prepared=prepared, records=records, wall_s=time.perf_counter() - begun)
 
 
-def _prepare(plan: Plan, name: str) -> tuple[Prepared, Place]:
+def _prepare(plan: Plan, name: str, stage: Stage) -> tuple[Prepared, Place]:
     """Golden run and profile, and the place where they were made."""
     begun = time.perf_counter()
     kernel, template = catalogue.find(name), template_of(name, plan.inputs)
+    stage("loading")
     load(name, template)
     with contextlib.ExitStack() as undo:
         place = undo.enter_context(contextlib.closing(Place(name, template)))
+        stage("golden runs")
         golden, profile = golden_run(place), None
         if plan.strategy().rule is Rule.INSTRUCTION:
             rng = generator(plan.seed, Stream.FAULT, name, "profile")
-            profile = profile_kernel(place, rng, windows=plan.windows, sampled=kernel.too_long)
+            stage("profile")
+            profile = profile_kernel(
+                place, rng, windows=plan.windows, sampled=kernel.too_long, watch=in_words(stage)
+            )
         undo.pop_all()
     prepared = Prepared(
         kernel=name,

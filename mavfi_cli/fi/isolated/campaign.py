@@ -12,7 +12,7 @@ from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.isolated.attack import Attacker
 from mavfi_cli.fi.isolated.journal import Journal
 from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json
-from mavfi_cli.fi.isolated.profile import TargetProfile
+from mavfi_cli.fi.isolated.profile import TargetProfile, in_words
 from mavfi_cli.fi.isolated.program import (
     Golden,
     ProgramTarget,
@@ -116,6 +116,7 @@ def run_campaign(
     jobs: int = 1,
     folder: Path | None = None,
     progress: Callable[[int], None] | None = None,
+    stage: Callable[[str], None] = lambda _: None,
 ) -> Campaign:
     """Golden run, profile, fault list, runs.
 
@@ -125,6 +126,7 @@ def run_campaign(
         folder: where the faults are flushed before the first one runs, and every run after it;
             the runs that it has already are not repeated.
         progress: called with the number of runs that are there.
+        stage: called with what goes on before the first run.
 
     Raises:
         TracingForbidden: the operating system refuses.
@@ -134,8 +136,9 @@ def run_campaign(
     start = time.perf_counter()
     journal = None if folder is None else Journal(folder, plan.to_json(), runs=plan.runs)
     with one_processor():
-        golden, profiled = _prepare(plan)
+        golden, profiled = _prepare(plan, stage)
     bench = _Bench(plan=plan, golden=golden)
+    stage(f"drawing {plan.runs} faults")
     planned = draw_records(bench, profiled, plan.context())
     with Workers(jobs) as workers:
         records = run_records(bench, planned, workers, journal=journal, progress=progress)
@@ -148,14 +151,17 @@ def run_campaign(
     )
 
 
-def _prepare(plan: Plan) -> tuple[Golden, TargetProfile | None]:
+def _prepare(plan: Plan, stage: Callable[[str], None]) -> tuple[Golden, TargetProfile | None]:
     place = Workplace(plan.target)
     try:
+        stage("golden runs")
         golden = golden_run(place)
         if plan.strategy().rule is not Rule.INSTRUCTION:
             return golden, None
         rng = generator(plan.seed, Stream.FAULT, "profile")
-        return golden, profile_program(place, rng, windows=plan.windows)
+        stage("profile")
+        profiled = profile_program(place, rng, windows=plan.windows, watch=in_words(stage))
+        return golden, profiled
     finally:
         place.close()
 

@@ -13,7 +13,7 @@ their mean length, and an instruction uniformly out of its stepped windows.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ from mavfi_cli.fi.sampling import Strategy, draw_fault
 
 STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of one marker's windows
+Watch = Callable[[int], None]  # called with instructions stepped since it was called last
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +102,18 @@ class TargetProfile:
         return draw_fault(profile, plan, rng, code_at=self.code_at, locate=locate)
 
 
+def in_words(stage: Callable[[str], None]) -> Watch:
+    """A watch that has `stage` told how many instructions were stepped so far."""
+    total = 0
+
+    def watch(steps: int) -> None:
+        nonlocal total
+        total += steps
+        stage(f"profile, {total} instructions stepped")
+
+    return watch
+
+
 def profile_run(
     place: Place,
     rng: np.random.Generator,
@@ -109,6 +122,7 @@ def profile_run(
     windows: int = 1,
     enough: int = ENOUGH,
     limit: int = STEPS,
+    watch: Watch | None = None,
 ) -> TargetProfile:
     """Step a fault-free run, or a sample of the windows that markers cut it into.
 
@@ -119,16 +133,17 @@ def profile_run(
         windows: how many of each marker are stepped at least.
         enough: more of them where together they have no more instructions.
         limit: refuse longer windows, instructions.
+        watch: is told how far it is.
 
     Raises:
         TargetError: no instruction in scope executes, or the run does not repeat itself.
         WindowTooLong: too many instructions.
     """
     begun = time.perf_counter()
-    first = _Stepper(place, None, tuple(markers), limit)
+    first = _Stepper(place, None, tuple(markers), limit, watch)
     strata = [Stratum(marker=None, profile=first.profile(np.array([1]), 1))]
     for marker in markers:
-        stepper = _Stepper(place, marker, tuple(markers), limit)
+        stepper = _Stepper(place, marker, tuple(markers), limit, watch)
         if count := stepper.count():
             order = rng.permutation(count) + 1
             profile = stepper.profile(order[:windows], count)
@@ -143,7 +158,13 @@ def profile_run(
 
 
 def profile_function(
-    place: Place, rng: np.random.Generator, *, function: str, windows: int, limit: int = STEPS
+    place: Place,
+    rng: np.random.Generator,
+    *,
+    function: str,
+    windows: int,
+    limit: int = STEPS,
+    watch: Watch | None = None,
 ) -> TargetProfile:
     """Step invocations of one function in scope; only these can be hit.
 
@@ -153,6 +174,7 @@ def profile_function(
         function: its symbol.
         windows: how many invocations are stepped at most.
         limit: refuse longer ones, instructions.
+        watch: is told how far it is.
 
     Raises:
         WindowTooLong: too many instructions.
@@ -166,7 +188,7 @@ def profile_function(
         entry = image.function(function, place.scope(image).objects)
     finally:
         tracee.kill()
-    stepper = _Stepper(place, entry, None, limit)
+    stepper = _Stepper(place, entry, None, limit, watch)
     count = stepper.count()
     if not count:
         raise TargetError(place.name, f"never calls {function}")
@@ -196,6 +218,7 @@ class _Stepper:
     marker: Location | None  # None: the start of the run
     markers: tuple[Location, ...] | None  # where windows end; None: when the function returns
     limit: int
+    watch: Watch | None
 
     def count(self) -> int:
         """How many windows a run has."""
@@ -240,6 +263,7 @@ class _Stepper:
                     program=self.place.name,
                     until_return=self.markers is None,
                     markers=[image.address(marker) for marker in self.markers or ()],
+                    watch=self.watch,
                 )
                 passed = number + int(np.count_nonzero(trace == address)) - 1
                 yield Segment(start=start, trace=trace)

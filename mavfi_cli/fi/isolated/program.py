@@ -16,7 +16,7 @@ from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.isolated.attack import Attacker, Limits, run_out
 from mavfi_cli.fi.isolated.compare import Comparison, digest, magnitude
 from mavfi_cli.fi.isolated.outcome import Outcome
-from mavfi_cli.fi.isolated.profile import TargetProfile, profile_function, profile_run
+from mavfi_cli.fi.isolated.profile import TargetProfile, Watch, profile_function, profile_run
 from mavfi_cli.fi.native import linux
 from mavfi_cli.fi.native.breakpoints import Mechanism
 from mavfi_cli.fi.native.image import Image, Scope, scope_of
@@ -206,7 +206,11 @@ def _children_cpu_s() -> float:
 
 
 def profile_program(
-    place: Workplace, rng: np.random.Generator, *, windows: int = 16
+    place: Workplace,
+    rng: np.random.Generator,
+    *,
+    windows: int = 16,
+    watch: Watch | None = None,
 ) -> TargetProfile:
     """Step the fault-free run, or sampled invocations of the target's function.
 
@@ -214,6 +218,7 @@ def profile_program(
         place: where it runs.
         rng: draws the invocations.
         windows: how many invocations are stepped at most.
+        watch: is told how far it is.
 
     Raises:
         WindowTooLong: too many instructions.
@@ -222,8 +227,10 @@ def profile_program(
     """
     function, limit = place.target.function, place.target.limits.profile_steps
     if function is None:
-        return profile_run(place, rng, limit=limit)
-    return profile_function(place, rng, function=function, windows=windows, limit=limit)
+        return profile_run(place, rng, limit=limit, watch=watch)
+    return profile_function(
+        place, rng, function=function, windows=windows, limit=limit, watch=watch
+    )
 
 
 def absolute_arguments(argv: Sequence[str], directory: Path) -> tuple[str, ...]:

@@ -91,6 +91,7 @@ def record_window(
     program: str,
     until_return: bool = False,
     markers: Sequence[int] = (),
+    watch: Callable[[int], None] | None = None,
 ) -> NDArray[np.int64]:
     """Step from the present stop to the end of the program, of the function, or to a marker.
 
@@ -102,6 +103,7 @@ def record_window(
         until_return: the target is at a function's entry; the window ends when it returns.
         markers: addresses in scope; the window ends in front of the next execution of one. The
             instruction that the target is stopped in front of is in the window in any case.
+        watch: called now and then with the number of instructions recorded since the last call.
 
     Raises:
         WindowTooLong: more than `limit` instructions in scope.
@@ -117,6 +119,8 @@ def record_window(
     for part in _parts(tracee, scope, stop):
         parts.append(part)
         total += len(part)
+        if watch is not None:
+            watch(len(part))
         if total > limit:
             raise WindowTooLong(program, limit)
     return np.concatenate(parts) if parts else np.empty(0, np.int64)
