@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
@@ -82,9 +82,19 @@ def pair_of(config: MissionConfig) -> str:
 
 def label_text(labels: Mapping[str, Any]) -> str:
     """A setting in one phrase; the same whatever the order of its labels."""
-    rest = sorted(labels.keys() - set(_FIRST))
-    names = [name for name in _FIRST if name in labels] + rest
-    return " ".join(f"{name}={labels[name]}" for name in names) or "all missions"
+    told = (f"{name}={label_value(labels[name])}" for name in ordered(labels))
+    return " ".join(told) or "all missions"
+
+
+def label_value(value: Label) -> str:
+    """The value of a label as a specification has it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def ordered(names: Iterable[str]) -> list[str]:
+    """Names of labels in the order in which they are told."""
+    found = set(names)
+    return [name for name in _FIRST if name in found] + sorted(found - set(_FIRST))
 
 
 @contextlib.contextmanager

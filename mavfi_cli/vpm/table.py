@@ -7,6 +7,8 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from mavfi_cli.core.columns import columns as aligned
+from mavfi_cli.core.columns import wrapped
 from mavfi_cli.vpm.report import schemes_of
 
 
@@ -106,32 +108,29 @@ def _calibrations(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         return
     yield ""
     yield "Paper, Fig. 15, flight time over detection and recovery; one number is calibrated:"
-    for row in rows:
-        yield (
-            f"  board {row['board']} ({1000 * row['board_kg']:.0f} g a copy): {row['parameter']} = "
-            f"{row['value']:.4g} {row['unit']} (calibrated); TMR x {row['tmr_ratio']:.4f}, paper "
-            f"x {row['published_tmr_ratio']:g}; DMR x {row['predicted_dmr_ratio']:.4f} (predicted)"
-        )
+    yield from columns(
+        ["  board", "a copy", "calibrated", "TMR", "paper's TMR", "DMR, predicted"],
+        [[f"  {row['board']}", f"{1000 * row['board_kg']:.0f} g",
+          f"{row['parameter']} = {row['value']:.4g} {row['unit']}", f"x {row['tmr_ratio']:.4f}",
+          f"x {row['published_tmr_ratio']:g}", f"x {row['predicted_dmr_ratio']:.4f}"]
+         for row in rows],
+    )  # fmt: skip
 
 
 def _sources(one: Mapping[str, Any]) -> Iterator[str]:
     yield ""
-    yield from columns(
-        ["number", "value", "source"],
-        [
-            [row["parameter"], f"{row['value']:.5g} {row['unit']}", row["source"]]
-            for row in one["parameters"]
-        ]
-        + [
-            [f"scheme {row['scheme']}", f"{row['overhead_percent']:.4g} %", row["source"]]
-            for row in one["schemes"]
-        ],
-    )
+    rows = [["number", "value", "source"]]
+    rows += [
+        [row["parameter"], f"{row['value']:.5g} {row['unit']}", row["source"]]
+        for row in one["parameters"]
+    ]
+    rows += [
+        [f"scheme {row['scheme']}", f"{row['overhead_percent']:.4g} %", row["source"]]
+        for row in one["schemes"]
+    ]
+    yield from wrapped(rows)
 
 
 def columns(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """Left-aligned columns, two blanks between them."""
-    lines = [head, *rows] if head else rows
-    widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]
-    for line in lines:
-        yield "  ".join(f"{c:<{w}}" for c, w in zip(line, widths, strict=True)).rstrip()
+    """Left-aligned columns under a head, where there is one."""
+    yield from aligned([head, *rows] if head else rows)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import pytest
 
@@ -47,10 +48,13 @@ def test_faults_that_did_nothing_are_counted_apart(book):
     assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
     assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
     assert cell.metrics["flight_time_s"].count == 2
-    row = table(summarise(book.ledger))[1]
+    told = table(summarise(book.ledger))
+    row = told[1]
     assert "  2/3  " in row
     assert "  83.3 %  " in row  # of all six, as the paper counts
-    assert row.endswith("3  (collision 1, not activated 1, not injected 1, null 1)")
+    assert row.endswith("  3")
+    assert told[3].endswith("  ended otherwise")
+    assert told[4].endswith("  collision 1, not activated 1, not injected 1, null 1")
 
 
 def test_errors_are_counted_nowhere_else(book):
@@ -101,7 +105,9 @@ def test_the_worst_case_is_no_missions_own_length(book):
     (faulty,) = against_golden(groups(book.ledger))
     assert faulty.over_own.increase == 0.0
     assert faulty.over_mean.golden == 20.0
-    assert "worst +0.0 % over own golden" in table(summarise(book.ledger))[-1]
+    told = table(summarise(book.ledger))
+    assert told[-2].endswith("  worst over own golden")
+    assert told[-1].endswith("  +0.0 %")
 
 
 def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
@@ -123,9 +129,9 @@ def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
     assert (saved.over_mean.golden, saved.over_mean.golden_worst) == (20.0, 30.0)
     assert (saved.over_mean.faulty_worst, saved.over_mean.protected_worst) == (33.0, 30.0)
     assert saved.over_mean.recovered_share == pytest.approx(3.0 / 13.0)
-    line = table(summarise(book.ledger))[-1]
-    assert "worst +100.0 % over own golden, recovered 70.0 points, 70.0 %" in line
-    assert "worst +65.0 % over mean golden, recovered 15.0 points, 23.1 %" in line
+    told = [re.split("  +", line)[-1] for line in table(summarise(book.ledger))]
+    assert told[-5:-3] == ["worst over own golden", "+100.0 %, recovered 70.0 points, 70.0 %"]
+    assert told[-2:] == ["worst over mean golden", "+65.0 %, recovered 15.0 points, 23.1 %"]
 
 
 def test_a_group_without_what_it_is_gathered_by_is_named(book):
@@ -134,12 +140,42 @@ def test_a_group_without_what_it_is_gathered_by_is_named(book):
     assert names == ["golden", "stage=control"]
     assert summarise(book.ledger, ["detector"]).cells[0].name == "no detector"
     assert summarise(book.ledger, ["setting", "stage"]).cells[0].name == "setting=golden"
-    assert "golden" in table(summarise(book.ledger, ["stage"]))[1]
+    assert table(summarise(book.ledger, ["stage"]))[1].startswith("golden ")
 
 
 def test_means_are_called_means(book):
     fill(book)
-    assert "mean time  mean distance  mean energy  mean replans" in table(summarise(book.ledger))[0]
+    text = "\n".join(table(summarise(book.ledger)))
+    assert "mean time  mean distance  mean energy  mean replans" in text
+
+
+def test_no_line_is_wider_than_a_screen_and_common_labels_are_told_once(book):
+    for world in ("dense", "sparse"):
+        for seed in range(3):
+            common = {"world": world, "level": "instruction", "together": True}
+            book.add({"setting": "golden", "world": world}, seed, 20.0, injected=GOLDEN)
+            book.add({"setting": "FI", "stage": "control", **common}, seed, 22.0 + seed)
+            labels = {"setting": "D&R(G)", "detector": "gad", "stage": "control", **common}
+            book.add(labels, seed, 21.0, outcome="collision" if seed else "success")
+    found = groups(book.ledger)
+    told = table(summarise(book.ledger))
+    told += quality_lines(qualities(found))
+    assert max(map(len, told)) <= 100
+    assert told[0] == (
+        "in all settings that have it: detector=gad level=instruction stage=control together=true"
+    )
+    assert told[1].split()[:3] == ["setting", "world", "over"]
+    assert told[4].split()[:4] == ["D&R(G)", "dense", "3/3", "1/3"]
+    assert sum("collision 2" in line for line in told) == 2
+    assert sum("level" in line for line in told) == 1
+
+
+def test_a_label_that_alone_tells_settings_apart_has_a_column(book):
+    book.add({"setting": "FI"}, 1, 20.0)
+    book.add({"setting": "FI", "field": "sign"}, 1, 21.0)
+    told = table(summarise(book.ledger))
+    assert told[0] == "in all settings that have it: setting=FI"
+    assert [line.split()[0] for line in told[1:4]] == ["field", "1/1", "sign"]
 
 
 def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothing(book):
@@ -189,7 +225,7 @@ def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
     fill(book)
     summary = summarise(book.ledger)
     text = "\n".join(table(summary))
-    assert "setting=FI stage=control" in text
+    assert "in all settings that have it: detector=gad stage=control" in text
     assert "7/10" in text
     assert "collision 3" in text
     assert "recovered 40.0 points, 72.7 %" in text
@@ -221,7 +257,7 @@ def test_quality_without_a_success_is_no_number(book):
     book.add(FI, 1, 30.0, outcome="collision")
     found = qualities(groups(book.ledger))
     assert all(math.isnan(each.most) for each in found)
-    assert quality_lines(found)[2].split()[-6:] == ["0", "-", "-", "-", "-", "-"]
+    assert quality_lines(found)[3].split()[-5:] == ["0", "-", "-", "-", "-"]
 
 
 def test_failures_are_of_missions_that_succeed_without_the_fault(book):

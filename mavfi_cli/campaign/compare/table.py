@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
+from mavfi_cli.core.columns import columns
 
 Row = Mapping[str, Any]
 # The paper, section VII-E: on the TX2, a single bit flip in an inter-kernel state.
@@ -240,15 +241,7 @@ def command_of(told: Row, row: Row) -> str:
 def _columns(rows: Iterator[list[str]]) -> list[str]:
     """Rows as text: the first columns to the left, numbers to the right."""
     cells = list(rows)
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    labels = 2 if cells[0][1] == "" else 1
-    return [
-        "  ".join(
-            cell.ljust(width) if place < labels else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    ]
+    return columns(cells, 2 if cells[0][1] == "" else 1)
 
 
 def _chance(p_value: float) -> str:

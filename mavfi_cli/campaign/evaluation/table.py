@@ -12,6 +12,7 @@ from typing import Any
 from mavfi_cli.campaign.evaluation.evaluate import ALL, Pairs
 from mavfi_cli.campaign.evaluation.pairs import ErrorFree, FaultPair, Flown, lengthening
 from mavfi_cli.campaign.evaluation.plan import ERROR_FREE, FAULT, NONE
+from mavfi_cli.core.columns import columns
 from mavfi_cli.core.files import write_text
 
 Row = Mapping[str, Any]
@@ -22,19 +23,19 @@ def table(evaluation: Row) -> list[str]:
     """The evaluation in words and columns."""
     lines = _head(evaluation)
     lines += ["", "Without faults, against the same flights without a detector"]
-    lines += _columns(_error_free_rows(_of(evaluation["error_free"], ALL)))
+    lines += columns(_error_free_rows(_of(evaluation["error_free"], ALL)))
     faults = _of(evaluation["faults"], ALL)
     if not faults or not faults[0]["planned"]:
         return lines
     lines += ["", "Faults: detection, by an alarm at or after the strike"]
-    lines += _columns(_detection_rows(faults, evaluation["curves"]))
+    lines += columns(_detection_rows(faults, evaluation["curves"]))
     lines += ["", "Faults: recovery"]
-    lines += _columns(_recovery_rows(faults))
-    lines += ["", *_columns(_worst_rows(_of(evaluation["faults"], "world")))]
+    lines += columns(_recovery_rows(faults))
+    lines += ["", *columns(_worst_rows(_of(evaluation["faults"], "world")))]
     for by in ("world", "stage", "field", "state"):
-        rows = _columns(_group_rows(by, _of(evaluation["faults"], by)))
+        rows = columns(_group_rows(by, _of(evaluation["faults"], by)))
         lines += ["", *rows] if len(rows) > 1 else []
-    lines += ["", *_columns(_comparison_rows(evaluation["comparisons"]))]
+    lines += ["", *columns(_comparison_rows(evaluation["comparisons"]))]
     return [*lines, _INTERVALS]
 
 
@@ -167,18 +168,6 @@ def _comparison_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
             )
         ]
         yield [f"{row['first']} against {row['second']}", *told]
-
-
-def _columns(rows: Iterator[list[str]]) -> list[str]:
-    """Rows as aligned lines: the first column to the left, the others as well."""
-    found = list(rows)
-    count = max(len(row) for row in found)
-    padded = [[*row, *[""] * (count - len(row))] for row in found]
-    widths = [max(len(row[place]) for row in padded) for place in range(count)]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in padded
-    ]
 
 
 def _number(value: float, digits: int) -> str:

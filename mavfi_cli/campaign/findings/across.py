@@ -152,8 +152,10 @@ class _Alone:
 
 
 def lines(rows: Sequence[Across]) -> list[str]:
-    """What was found, a line a setting."""
-    return [f"  {each.name}: {', '.join(_parts(each))}" for each in rows]
+    """What was found: a setting, and a line for each number of it."""
+    return [
+        line for each in rows for line in (f"  {each.name}", *(f"    {p}" for p in _parts(each)))
+    ]
 
 
 def _parts(each: Across) -> list[str]:

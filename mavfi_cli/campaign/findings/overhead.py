@@ -15,6 +15,7 @@ from mavfi_cli.campaign.findings.comparison import RESAMPLES
 from mavfi_cli.campaign.findings.groups import Group
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
+from mavfi_cli.campaign.setting_columns import SettingColumns
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, detection_cost
@@ -100,36 +101,41 @@ def lines(found: Sequence[Overhead], confidence: float = 0.95) -> list[str]:
     """A table of detection, measured on the host, and one of recovery, simulated."""
     if not found:
         return ["", "overhead: no flight with a detector"]
-    detection, recovery = "detection: checks, host time", "recovery: % of flight time, simulated"
-    width = max(len(recovery), *(len(label_text(each.labels)) for each in found))
-    sure = f"{100 * confidence:g} % interval"
-    stages = "".join(f"  {stage:>10}" for stage in _STAGES)
-    told = ["", f"{detection:<{width}}  {'flights':>7}  {'a second':>8}  {'us each':>8}  "
-            f"{sure:>20}  {'% of time':>9}  {sure:>20}"]  # fmt: skip
-    told += [_detection_line(each, width) for each in found]
-    told += [f"({HOST_CHECKS})"]
-    told += ["", f"{recovery:<{width}}  {'times':>7}{stages}  {'in all':>8}  {sure:>20}  "
-             f"{'+ checks':>9}  {sure:>20}"]  # fmt: skip
-    return told + [_recovery_line(each, width) for each in found]
+    settings = SettingColumns.of([each.labels for each in found])
+    sure = f"({100 * confidence:g} % interval)"
+    named = [(each, (each.labels, label_text(each.labels))) for each in found]
+    return [
+        "", "detection: checks, host time", *settings.told(),
+        *settings.table(
+            ["flights", "a second", f"us each {sure}", f"% of time {sure}"],
+            [(*name, _detection_cells(each)) for each, name in named],
+        ),
+        f"({HOST_CHECKS})",
+        "", "recovery: % of flight time, simulated",
+        *settings.table(
+            ["times", *_STAGES, f"in all {sure}", f"+ checks {sure}"],
+            [(*name, _recovery_cells(each)) for each, name in named],
+        ),
+    ]  # fmt: skip
 
 
-def _detection_line(each: Overhead, width: int) -> str:
-    return (
-        f"{label_text(each.labels):<{width}}  {each.flights:>7}  {each.checks_per_s.value:>8.1f}  "
-        f"{1e6 * each.check_host_s.value:>8.2f}  {_ends(each.check_host_s, 1e6, 2):>20}  "
-        f"{_percent(each.detection_host_share.value):>9}  {_ends(each.detection_host_share):>20}"
-    )
+def _detection_cells(each: Overhead) -> list[str]:
+    return [
+        f"{each.flights}",
+        f"{each.checks_per_s.value:.1f}",
+        f"{1e6 * each.check_host_s.value:.2f}{_ends(each.check_host_s, 1e6, 2)}",
+        f"{_percent(each.detection_host_share.value)}{_ends(each.detection_host_share)}",
+    ]
 
 
-def _recovery_line(each: Overhead, width: int) -> str:
-    times = round(math.fsum(each.recomputations.values()))
-    stages = "".join(f"  {_percent(each.recovery_share[stage].value):>10}" for stage in _STAGES)
+def _recovery_cells(each: Overhead) -> list[str]:
     recovery, both = each.recovery_share_in_all, each.share_in_all
-    return (
-        f"{label_text(each.labels):<{width}}  {times:>7}{stages}  "
-        f"{_percent(recovery.value):>8}  {_ends(recovery):>20}  "
-        f"{_percent(both.value):>9}  {_ends(both):>20}"
-    )
+    return [
+        f"{round(math.fsum(each.recomputations.values()))}",
+        *(_percent(each.recovery_share[stage].value) for stage in _STAGES),
+        f"{_percent(recovery.value)}{_ends(recovery)}",
+        f"{_percent(both.value)}{_ends(both)}",
+    ]
 
 
 def _percent(share: float) -> str:
@@ -138,6 +144,7 @@ def _percent(share: float) -> str:
 
 
 def _ends(found: Interval, scale: float = 100.0, digits: int = 4) -> str:
+    """The interval beside a value; nothing where there is none."""
     if math.isnan(found.low):
-        return "-"
-    return f"{scale * found.low:.{digits}f} to {scale * found.high:.{digits}f}"
+        return ""
+    return f" ({scale * found.low:.{digits}f} to {scale * found.high:.{digits}f})"

@@ -10,6 +10,7 @@ import numpy as np
 
 from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden
 from mavfi_cli.campaign.findings.groups import METRICS, Group
+from mavfi_cli.campaign.setting_columns import SettingColumns
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 
 _TITLES = {
@@ -74,31 +75,35 @@ def _quality(group: Group, metric: str, compared: Comparison | None, confidence:
 
 def lines(found: Sequence[Quality], confidence: float = 0.95) -> list[str]:
     """A table for each metric."""
-    width = max((len(each.name) for each in found), default=0)
-    width = max(width, *(len(title) for title, _ in _TITLES.values()))
-    sure = f"{100 * confidence:g} % interval"
+    if not found:
+        return []
+    settings = SettingColumns.of([each.labels for each in found if each.metric == METRICS[0]])
+    head = ["flights", f"mean ({100 * confidence:g} % interval)", "least", "median", "most",
+            "to golden"]  # fmt: skip
     told = []
     for metric, (title, scale) in _TITLES.items():
-        told += ["", f"{title:<{width}}  {'flights':>7}  {'mean':>8}  {sure:>20}  {'least':>8}  "
-                 f"{'median':>8}  {'most':>8}  {'to golden':>9}  {sure:>20}"]  # fmt: skip
-        told += [_line(each, width, scale) for each in found if each.metric == metric]
+        rows = [
+            (each.labels, each.name, _cells(each, scale)) for each in found if each.metric == metric
+        ]
+        told += ["", title, *settings.table(head, rows)]
     return told
 
 
-def _line(each: Quality, width: int, scale: float) -> str:
-    mean, difference = each.mean, each.difference
-    cells = [f"{mean.count:>7}", _number(mean.value, scale), _ends(mean, scale)]
-    cells += [_number(value, scale) for value in (each.least, each.median, each.most)]
-    if difference is not None:
-        cells += [f"{_number(difference.value, scale, '+'):>9}", _ends(difference, scale, "+")]
-    return "  ".join([f"{each.name:<{width}}", *cells])
+def _cells(each: Quality, scale: float) -> list[str]:
+    difference = each.difference
+    return [
+        f"{each.mean.count}",
+        _with_ends(each.mean, scale),
+        *(_number(value, scale) for value in (each.least, each.median, each.most)),
+        "" if difference is None else _with_ends(difference, scale, "+"),
+    ]
 
 
 def _number(value: float, scale: float, sign: str = "") -> str:
-    return f"{'-' if np.isnan(value) else format(scale * value, sign + '.2f'):>8}"
+    return "-" if np.isnan(value) else format(scale * value, sign + ".2f")
 
 
-def _ends(found: Interval, scale: float, sign: str = "") -> str:
-    ends = (found.low, found.high)
-    told = " to ".join(_number(end, scale, sign).strip() for end in ends)
-    return f"{'-' if np.isnan(ends).any() else told:>20}"
+def _with_ends(found: Interval, scale: float, sign: str = "") -> str:
+    """A value and its interval, where there is one."""
+    value, *ends = (_number(each, scale, sign) for each in (found.value, found.low, found.high))
+    return value if "-" in ends else f"{value} ({' to '.join(ends)})"

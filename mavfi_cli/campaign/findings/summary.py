@@ -10,6 +10,7 @@ from typing import Any
 from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden, protection
 from mavfi_cli.campaign.findings.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.setting_columns import SettingColumns
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.campaign.statistics.worst_case import WorstCase
@@ -110,66 +111,80 @@ def _cell(group: Group, confidence: float) -> Cell:
 
 def table(summary: Summary) -> list[str]:
     """The settings and the comparisons as lines of text."""
-    width = max(len("setting"), *(len(cell.name) for cell in summary.cells))
-    interval_name = f"{100 * summary.confidence:g} % interval"
+    settings = SettingColumns.of([cell.labels for cell in summary.cells])
+    fates = [(cell.labels, cell.name, _fate_cells(cell)) for cell in summary.cells]
+    means = [(cell.labels, cell.name, _mean_cells(cell)) for cell in summary.cells]
+    sure = f"{100 * summary.confidence:g} % interval"
+    otherwise = ["ended otherwise"] if any(cells[-1] for _, _, cells in fates) else []
     lines = [
-        f"{'setting':<{width}}  {'over':>11}  {'success':>9}  {interval_name:>16}  {'of all':>7}  "
-        f"{'mean time':>9}  {'mean distance':>13}  {'mean energy':>11}  {'mean replans':>12}  "
-        "inactive"
+        *settings.told(),
+        *settings.table(["over", "success", sure, "of all", "inactive", *otherwise], fates),
+        "",
+        *settings.table(["mean time", "mean distance", "mean energy", "mean replans"], means),
     ]
-    lines += [_cell_line(cell, width) for cell in summary.cells]
     for title, comparisons in (
         ("against the golden flights of the same missions:", summary.faults),
         ("against the same faults without protection:", summary.protection),
     ):
         if comparisons:
-            lines += ["", title, *(_comparison_line(each) for each in comparisons)]
+            lines += ["", title, *_comparison_table(settings, comparisons)]
     return lines
 
 
-def _cell_line(cell: Cell, width: int) -> str:
+def _fate_cells(cell: Cell) -> list[str]:
     over = sum(cell.outcomes.values()) + cell.errors
     share = cell.success
-    success = f"{share.count}/{share.total}"
     ends = f"{100 * share.low:.1f} to {100 * share.high:.1f} %" if share.total else "-"
-    time, distance, energy, replans = (cell.metrics[name].value for name in METRICS)
     every = f"{100 * cell.every.share:.1f} %" if cell.every.total else "-"
     told = [f"{name} {count}" for name, count in cell.outcomes.items() if name != "success"]
     told += [f"{name.replace('_', ' ')} {count}"
              for name, count in cell.injected.items() if name in INACTIVE]  # fmt: skip
     told += [f"could not begin {cell.errors}"] if cell.errors else []
-    return (
-        f"{cell.name:<{width}}  {f'{over}/{cell.planned}':>11}  {success:>9}  "
-        f"{ends:>16}  {every:>7}  {_number(time, 's'):>9}  {_number(distance, 'm'):>13}  "
-        f"{_number(energy / 1e3, 'kJ'):>11}  {_number(replans, ''):>12}  {cell.inactive.total:>8}"
-        + (f"  ({', '.join(told)})" if told else "")
-    )
+    return [f"{over}/{cell.planned}", f"{share.count}/{share.total}", ends, every,
+            str(cell.inactive.total), ", ".join(told)]  # fmt: skip
+
+
+def _mean_cells(cell: Cell) -> list[str]:
+    time, distance, energy, replans = (cell.metrics[name].value for name in METRICS)
+    return [_number(time, "s"), _number(distance, "m"), _number(energy / 1e3, "kJ"),
+            _number(replans, "")]  # fmt: skip
 
 
 def _number(value: float, unit: str) -> str:
     return "-" if math.isnan(value) else f"{value:.1f} {unit}".rstrip()
 
 
-def _comparison_line(each: Comparison) -> str:
-    test, time = each.success, each.differences["flight_time_s"]
-    parts = [
-        f"  {each.name}: {test.pairs} pairs",
-        f"success {100 * test.difference:+.1f} points",
-        f"p = {each.corrected_p:.3g}",
+def _comparison_table(settings: SettingColumns, found: Sequence[Comparison]) -> list[str]:
+    """A line a comparison; without the columns in which none has a value."""
+    head = ["pairs", "success, points", "p", "time, s", "worst over own golden",
+            "worst over mean golden"]  # fmt: skip
+    cells = [_comparison_cells(each) for each in found]
+    used = [place for place, column in enumerate(zip(*cells, strict=True)) if any(column)]
+    rows = [
+        (each.second, each.name, [row[place] for place in used])
+        for each, row in zip(found, cells, strict=True)
     ]
-    if not math.isnan(time.low):
-        parts.append(f"time {time.value:+.2f} s ({time.low:+.2f} to {time.high:+.2f})")
-    if not math.isnan(each.over_own.increase):
-        parts.append(f"worst {100 * each.over_own.increase:+.1f} % over own golden")
-    if not math.isnan(each.over_own.recovered_share):
-        parts.append(_recovered(each.over_own))
-    if not math.isnan(each.over_mean.recovered_share):
-        parts.append(
-            f"worst {100 * each.over_mean.increase:+.1f} % over mean golden, "
-            f"{_recovered(each.over_mean)}"
-        )
-    return ", ".join(parts)
+    return settings.table([head[place] for place in used], rows)
 
 
-def _recovered(worst: WorstCase) -> str:
-    return f"recovered {100 * worst.recovered:.1f} points, {100 * worst.recovered_share:.1f} %"
+def _comparison_cells(each: Comparison) -> list[str]:
+    """Success, time, and worst cases; that over the mean golden flight beside protection only."""
+    test, time, mean = each.success, each.differences["flight_time_s"], each.over_mean
+    return [
+        f"{test.pairs}",
+        f"{100 * test.difference:+.1f}",
+        f"{each.corrected_p:.3g}",
+        "" if math.isnan(time.low) else f"{time.value:+.2f} ({time.low:+.2f} to {time.high:+.2f})",
+        _worst(each.over_own),
+        "" if math.isnan(mean.recovered_share) else _worst(mean),
+    ]
+
+
+def _worst(worst: WorstCase) -> str:
+    if math.isnan(worst.increase):
+        return ""
+    told = f"{100 * worst.increase:+.1f} %"
+    if math.isnan(worst.recovered_share):
+        return told
+    recovered = f"{100 * worst.recovered:.1f} points, {100 * worst.recovered_share:.1f} %"
+    return f"{told}, recovered {recovered}"

@@ -9,6 +9,7 @@ from typing import Any
 from mavfi_cli.campaign.kernels import catalogue
 from mavfi_cli.campaign.kernels.profile import in_words
 from mavfi_cli.campaign.kernels.runs import KernelRuns, Plan
+from mavfi_cli.core.columns import blocks
 from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json
 from mavfi_cli.fi.isolated.runs import csv_table
 
@@ -85,11 +86,12 @@ def _crash(entry: Mapping[str, Any]) -> str:
 
 def table(summary: Mapping[str, Any]) -> str:
     """The summary as text: one row a kernel, shares of injected runs with 95 % intervals."""
-    head = f"{'kernel':<17}{'runs':>6}" + "".join(f"{o.value:>21}" for o in _SHOWN)
-    lines = [head]
-    for kernel in summary["kernels"]:
-        cells = [_cell(kernel["outcomes"][outcome.value]) for outcome in _SHOWN]
-        lines.append(f"{kernel['title']:<17}{kernel['runs']:>6}" + "".join(cells))
+    head = ["kernel", "runs", *(outcome.value for outcome in _SHOWN)]
+    rows = [
+        [each["title"], str(each["runs"]), *(_cell(each["outcomes"][o.value]) for o in _SHOWN)]
+        for each in summary["kernels"]
+    ]
+    lines = blocks([head, *rows], labels=1)
     lines.append("")
     lines.append(
         f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
@@ -104,9 +106,9 @@ def table(summary: Mapping[str, Any]) -> str:
 
 def _cell(row: Mapping[str, Any]) -> str:
     if row["share"] is None:
-        return f"{'-':>21}"
+        return "-"
     low, high = (100.0 * edge for edge in row["wilson95"])
-    return f"{100.0 * row['share']:.1f} % ({low:.1f}-{high:.1f})".rjust(21)
+    return f"{100.0 * row['share']:.1f} % ({low:.1f} to {high:.1f})"
 
 
 def _notes(kernel: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,73 @@
+"""Settings as rows of a table: a column a label that tells them apart, the others told once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mavfi_cli.campaign.missions import label_text, label_value, ordered
+from mavfi_cli.core.columns import blocks
+
+
+@dataclass(frozen=True, slots=True)
+class SettingColumns:
+    """How the labels of some settings are told.
+
+    Attributes:
+        keys: the labels that have a column, in order.
+        common: the other labels: each has one value, in all settings that have it.
+    """
+
+    keys: tuple[str, ...]
+    common: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, settings: Sequence[Mapping[str, Any]]) -> SettingColumns:
+        """The columns of settings, from their labels; without the common ones they still differ.
+
+        A single setting has none: its name tells all.
+        """
+        if len(settings) == 1:
+            return cls((), {})
+        keys = ordered({key for labels in settings for key in labels})
+        common: dict[str, Any] = {}
+        for key in reversed(keys):
+            values = {label_value(labels[key]): labels[key] for labels in settings if key in labels}
+            left = [each for each in keys if each not in common and each != key]
+            apart = {tuple(_cells(labels, left)) for labels in settings}
+            if len(values) == 1 and len(apart) == len(settings):
+                (common[key],) = values.values()
+        return cls(tuple(key for key in keys if key not in common), common)
+
+    def told(self) -> list[str]:
+        """The line above a table that tells the common labels; none where there are none."""
+        return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
+
+    def table(
+        self, head: Sequence[str], rows: Sequence[tuple[Mapping[str, Any], str, Sequence[str]]]
+    ) -> list[str]:
+        """A line a setting, in as many tables below each other as the screen is too narrow.
+
+        Args:
+            head: of the cells.
+            rows: of each setting its labels, its name in one phrase, and its cells.
+        """
+        labels = [self._labels(labels, name) for labels, name, _ in rows]
+        heads = list(self.keys) or ["setting"]
+        told = [[*own, *cells] for own, (_, _, cells) in zip(labels, rows, strict=True)]
+        return blocks([[*heads, *head], *told], len(heads))
+
+    def _labels(self, labels: Mapping[str, Any], name: str) -> list[str]:
+        """The cells of a setting's labels; the first empty one has what its name says beyond."""
+        if not self.keys:
+            return [name]
+        cells = _cells(labels, self.keys)
+        beyond = name.removeprefix(label_text(labels)).strip()
+        if beyond and "" in cells:
+            cells[cells.index("")] = beyond
+        return cells
+
+
+def _cells(labels: Mapping[str, Any], keys: Sequence[str]) -> list[str]:
+    return [label_value(labels[key]) if key in labels else "" for key in keys]

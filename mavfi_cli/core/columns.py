@@ -1,0 +1,80 @@
+"""Rows of cells as aligned lines of text."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+
+WIDTH = 100  # columns of a screen that every table fits into, as far as its labels let it
+_GAP = 2
+_LEAST_ROOM = 20  # for prose
+
+
+def columns(rows: Iterable[Sequence[str]], labels: int | None = None) -> list[str]:
+    """A line a row, two blanks between the cells.
+
+    Args:
+        rows: the heads first, if any; a row may be shorter than the others.
+        labels: how many columns stand to the left, the others to the right; None: all to the left.
+    """
+    return _aligned(_padded(rows), labels)
+
+
+def blocks(rows: Iterable[Sequence[str]], labels: int, width: int = WIDTH) -> list[str]:
+    """The same in as many tables below each other as it takes to be no wider than `width`.
+
+    Each has the first `labels` columns, and of the others at least one; an empty line between two.
+    """
+    cells = _padded(rows)
+    lines: list[str] = []
+    for first, end in _cut(_widths(cells), labels, width):
+        part = [row[:labels] + row[first:end] for row in cells]
+        lines += ([""] if lines else []) + _aligned(part, labels)
+    return lines
+
+
+def wrapped(rows: Iterable[Sequence[str]], width: int = WIDTH) -> list[str]:
+    """All columns to the left; the last, which is prose, goes on below itself beyond `width`."""
+    cells = _padded(rows)
+    room = width - sum(each + _GAP for each in _widths(cells)[:-1])
+    told = []
+    for *row, prose in cells:
+        first, *rest = textwrap.wrap(prose, max(room, _LEAST_ROOM)) or [""]
+        told += [[*row, first], *([""] * len(row) + [each] for each in rest)]
+    return _aligned(told, None)
+
+
+def _cut(widths: Sequence[int], labels: int, width: int) -> Iterator[tuple[int, int]]:
+    """First column and the one after the last of each table."""
+    own = sum(each + _GAP for each in widths[:labels])
+    first, used = labels, own
+    for place in range(labels, len(widths)):
+        if place > first and used + widths[place] > width:
+            yield first, place
+            first, used = place, own
+        used += widths[place] + _GAP
+    yield first, len(widths)
+
+
+def _padded(rows: Iterable[Sequence[str]]) -> list[list[str]]:
+    found = [list(row) for row in rows]
+    count = max(map(len, found), default=0)
+    return [row + [""] * (count - len(row)) for row in found]
+
+
+def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
+    return [max(map(len, column)) for column in zip(*cells, strict=True)]
+
+
+def _aligned(cells: Sequence[Sequence[str]], labels: int | None) -> list[str]:
+    widths = _widths(cells)
+    left = len(widths) if labels is None else labels
+    return [
+        (" " * _GAP)
+        .join(
+            cell.ljust(width) if place < left else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        .rstrip()
+        for row in cells
+    ]
