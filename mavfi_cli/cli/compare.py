@@ -66,8 +66,8 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     elif as_csv:
         click.echo(rows_csv(told), nl=False)
     else:
-        click.echo("\n".join([*table(told), "", f"Pictures  {out / 'compare.svg'}, "
-                              f"{out / 'timeline.svg'}"]))  # fmt: skip
+        files = "compare.json, compare.csv, compare.svg, timeline.svg, timeline/"
+        click.echo("\n".join([*table(told), "", f"Files  {out}: {files}"]))
 
 
 def _plan(options: dict[str, Any]) -> Any:

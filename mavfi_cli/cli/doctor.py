@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import textwrap
 
 import click
 
+from mavfi_cli.core.columns import WIDTH
+
+_INDENT = 29  # what a check found begins here
 _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}
 
 
@@ -23,9 +27,12 @@ def doctor(as_json: bool) -> None:
         checks.append(check)
         if not as_json:
             colour, mark = _MARKS[check.verdict.value]
-            click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<20} {check.found}")
+            first, *rest = textwrap.wrap(check.found, WIDTH - _INDENT) or [""]
+            click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<20} {first}")
+            for line in rest:
+                click.echo(f"{'':<{_INDENT}}{line}")
             if check.remedy:
-                click.echo(f"{'':28} -> {check.remedy}")
+                click.echo(f"{'':<{_INDENT}}-> {check.remedy}")
     if as_json:
         click.echo(json.dumps([check.to_dict() for check in checks], indent=2))
     if any(check.verdict is Verdict.FAILED for check in checks):

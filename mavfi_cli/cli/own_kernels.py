@@ -37,7 +37,12 @@ def run_own_kernels(options: dict[str, Any], model: FaultModel) -> None:
         summary = summarise(plan, campaign)
         if options["out"] is not None:
             _save(folder, summary, campaign)
-    click.echo(json.dumps(summary, indent=2) if options["as_json"] else table(summary))
+    if options["as_json"]:
+        click.echo(json.dumps(summary, indent=2))
+        return
+    click.echo(table(summary))
+    if options["out"] is not None:
+        click.echo(f"\nFiles  {folder}: kernels.json, kernels.csv, kernels.svg, runs.jsonl")
 
 
 @contextlib.contextmanager

@@ -73,3 +73,5 @@ def train(
     )
     for kind, (model, path) in trained.models.items():
         click.echo(f"{kind:<11} threshold {model.provenance['threshold']:.6g}  {path}")
+    files = ["dataset.parquet", *(["loss.svg"] if "aad" in trained.models else [])]
+    click.echo(f"\nFiles  {out}: {', '.join(files)}")

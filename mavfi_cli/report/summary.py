@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
+from mavfi_cli.core.columns import WIDTH
+from mavfi_cli.fi.symbols import short_name
 from mavfi_cli.mission.record.detection_cost import detection_cost
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.replay import first_difference, largest_deviation_m
 
+_INDENT = 12 * " "
 _OUTCOMES = {
     "success": "SUCCESS: reached the goal",
     "collision": "COLLISION",
@@ -34,7 +38,7 @@ def outcome_line(result: dict[str, Any]) -> str:
 
 def summary_lines(result: dict[str, Any]) -> list[str]:
     """Outcome, quality of flight, perception-planning-control figures, cost on this machine."""
-    config, host = result["config"], result["host"]
+    config = result["config"]
     flown = f"{config['vehicle']} in {config['world']}, seed {config['seed']}"
     if config["link"] is not None:
         flown = f"foreign autopilot at {config['link']}, seed {config['seed']}"
@@ -54,13 +58,27 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
             f"(median), {response['p95'] * 1e3:.0f} ms (95th percentile)"
         )
     lines += measured_lines(result)
+    lines += _host_lines(result)
+    return [part for line in lines for part in _folded(line)]
+
+
+def _folded(line: str) -> list[str]:
+    """A line, and what goes beyond the screen below its text; words stay whole."""
+    return textwrap.wrap(
+        line, WIDTH, subsequent_indent=_INDENT, break_long_words=False, break_on_hyphens=False
+    ) or [""]
+
+
+def _host_lines(result: dict[str, Any]) -> list[str]:
+    """What the flight took of this machine's time."""
+    host = result["host"]
     if host.get("flight_wall_s"):
         factor = result["simulated_s"] / host["flight_wall_s"]
-        lines.append(
+        return [
             f"Host        {host['flight_wall_s']:.2f} s for {result['simulated_s']:.1f} simulated "
             f"seconds: {factor:.0f} times real time, after {host['startup_s']:.1f} s of start-up"
-        )
-    return lines
+        ]
+    return []
 
 
 def _flight_lines(result: dict[str, Any]) -> list[str]:
@@ -74,14 +92,25 @@ def _flight_lines(result: dict[str, Any]) -> list[str]:
         f"Flight      {_number(qof['flight_time_s'], 's')}, "
         f"{_number(qof['distance_m'], 'm')} flown, "
         f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
-        f"Clearance   {_number(qof['min_clearance_m'], 'm', 2)} at the closest",
-        f"Energy      {_number(_kilo(qof['energy_regression_j']), 'kJ')} (paper's regression), "
-        f"{_number(_kilo(qof['energy_propeller_j']), 'kJ')} (propeller shafts)",
+        *_clearance_and_energy(qof),
         f"Plans       {asked} asked for: {flown} flown ({counters['replans']} replans), "
         f"{failed} failed, {asked - flown - failed} not used",
         f"Obstacles   {counters['collisions_foreseen']} collisions foreseen, "
         f"{counters['slowdowns']} slow-downs, {counters['stops']} stops",
     ]
+
+
+def _clearance_and_energy(qof: dict[str, Any]) -> list[str]:
+    """What the simulated vehicle's side knows; of a foreign autopilot's flight nobody does."""
+    clearance, energy = "not known", "not known"
+    if qof["min_clearance_m"] is not None:
+        clearance = f"{_number(qof['min_clearance_m'], 'm', 2)} at the closest"
+    if qof["energy_regression_j"] is not None or qof["energy_propeller_j"] is not None:
+        energy = (
+            f"{_number(_kilo(qof['energy_regression_j']), 'kJ')} (paper's regression), "
+            f"{_number(_kilo(qof['energy_propeller_j']), 'kJ')} (propeller shafts)"
+        )
+    return [f"Clearance   {clearance}", f"Energy      {energy}"]
 
 
 def measured_lines(result: dict[str, Any]) -> list[str]:
@@ -200,12 +229,11 @@ def _activation(fault: dict[str, Any]) -> str:
 
 def _instruction_lines(fault: dict[str, Any]) -> list[str]:
     """What was drawn, from how much, and what came of it."""
-    place = fault["symbol"] or f"{fault['object']}+{fault['offset']:#x}"
     lines = [
         f"Fault       node {fault['node']}, invocation {fault['invocation']} of "
         f"{fault['invocations']} of {fault['kernel']}, at {fault['stamp_s']:.2f} s; "
         f"{fault['sampling']}, windows {fault['windows']}",
-        f"            before execution {fault['k']} of {fault['instruction']} ({place})",
+        f"            before execution {fault['k']} of {fault['instruction']} ({_place(fault)})",
     ]
     if fault["state"] == "null":
         return [*lines, "            null injection: nothing was flipped"]
@@ -222,12 +250,21 @@ def _instruction_lines(fault: dict[str, Any]) -> list[str]:
     ]
 
 
+def _place(fault: dict[str, Any]) -> str:
+    """Where an instruction is: its function by its plain name, or the offset in its object."""
+    if not fault["symbol"]:
+        return f"{fault['object']}+{fault['offset']:#x}"
+    name, _, offset = fault["symbol"].partition("+")
+    return f"{short_name(name)}{offset and '+'}{offset} in {fault['object']}"
+
+
 def _change_line(stamp_s: float, change: dict[str, Any]) -> str:
     place = f"[{change['index']}]" if change["state"].startswith("waypoint") else ""
     bits = ", ".join(map(str, change["bits"])) or "none: the value was that already"
+    plural = "s" if len(change["bits"]) > 1 else ""
     return (
         f"            at {stamp_s:.2f} s: {change['state']}{place} "
-        f"{_told(change, 'before')} -> {_told(change, 'after')} (bit {bits})"
+        f"{_told(change, 'before')} -> {_told(change, 'after')} (bit{plural} {bits})"
     )
 
 

@@ -139,7 +139,10 @@ def _signing_maker(key: bytes | None) -> Callable[[], Signing | None]:
 
 def _announce(options: Options, simulation: Simulation) -> None:
     world = simulation.referee.world
-    links = [f"  {preset.value:9} {url:32} {_how(url)}" for preset, url in options.links]
+    links = []
+    for preset, url in options.links:
+        first, *rest = _how(url) or [""]
+        links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{each}" for each in rest)]
     lines = [
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
         f"system {options.system_id}, {options.speed:g} x real time",
@@ -149,13 +152,14 @@ def _announce(options: Options, simulation: Simulation) -> None:
     print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201 - for who starts it by hand
 
 
-def _how(url: str) -> str:
-    """How a client gets to an endpoint."""
+def _how(url: str) -> list[str]:
+    """How clients get to an endpoint, a line each."""
     scheme, _, place = url.partition(":")
     port = place.rpartition(":")[2]
-    return {
-        "udpout": f"MAVSDK udpin://{place}, MAVProxy --master=udpin:{place}"
-        + (", QGroundControl by itself" if port == "14550" else ""),
-        "udpin": f"MAVSDK udpout://{place}, MAVProxy --master=udpout:{place}",
-        "tcpin": f"MAVSDK tcpout://{place}, MAVProxy --master=tcp:{place}",
-    }.get(scheme, "")
+    mavsdk, mavproxy = {
+        "udpout": ("udpin", "udpin"), "udpin": ("udpout", "udpout"), "tcpin": ("tcpout", "tcp"),
+    }.get(scheme, ("", ""))  # fmt: skip
+    if not mavsdk:
+        return []
+    alone = ["QGroundControl by itself"] if (scheme, port) == ("udpout", "14550") else []
+    return [f"MAVSDK    {mavsdk}://{place}", f"MAVProxy  --master={mavproxy}:{place}", *alone]

@@ -177,12 +177,14 @@ def test_doctor(command_line):
 def test_doctor_exits_with_1_where_flying_would_not_work(command_line, monkeypatch):
     from mavfi_cli.mission import machine
 
+    found = "missing: ompl, " + ", ".join(f"library-{number} 1.0" for number in range(20))
     broken = machine.Check(
-        name="Libraries", verdict=machine.Verdict.FAILED, found="missing: ompl", remedy="pip"
+        name="Libraries", verdict=machine.Verdict.FAILED, found=found, remedy="pip"
     )
     monkeypatch.setattr(machine, "check_machine", lambda: iter([broken]))
     code, out, _ = command_line("doctor")
     assert code == 1
+    assert max(map(len, out.splitlines())) <= 100
     assert "missing: ompl" in out
     assert "-> pip" in out
 
@@ -190,6 +192,9 @@ def test_doctor_exits_with_1_where_flying_would_not_work(command_line, monkeypat
 def test_sitl_is_the_process_that_was_started_so_signals_reach_it():
     line = [sys.executable, "-m", "mavfi_cli", "sitl", "--link", "udpout:127.0.0.1:9"]
     with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
-        assert any("Ctrl-C ends it" in told for told in process.stderr)
+        told = list(iter(process.stderr.readline, "Ctrl-C ends it.\n"))
+        assert told[1].split() == ["gcs", "udpout:127.0.0.1:9", "MAVSDK", "udpin://127.0.0.1:9"]
+        assert told[2].split() == ["MAVProxy", "--master=udpin:127.0.0.1:9"]
+        assert len(told) == 3
         process.terminate()
         assert process.wait(20) == 0

@@ -69,7 +69,8 @@ def test_what_is_not_known_is_said_so(result):
     result["host"]["flight_wall_s"] = 0.0
     text = "\n".join(summary_lines(result))
     assert "Flight      12.0 s, 30.0 m flown, not known from the goal" in text
-    assert "Clearance   not known at the closest" in text
+    assert "Clearance   not known\n" in text
+    assert "Energy      not known\n" in text
     assert "None" not in text
     assert "nan" not in text
     assert "Response" not in text
@@ -79,6 +80,39 @@ def test_what_is_not_known_is_said_so(result):
 def test_a_foreign_autopilot_is_named_by_its_link(result):
     result["config"]["link"] = "udpin:127.0.0.1:14540"
     assert "foreign autopilot at udpin:127.0.0.1:14540" in "\n".join(summary_lines(result))
+
+
+def test_a_long_line_goes_on_below_its_text(result):
+    states = [f"waypoint_a{axis}" for axis in "xyz"]
+    change = {"state": states[0], "index": 7, "bits": [52, 60], "before": 0.5, "after": 1.78e231,
+              "before_hex": "0x3fe0000000000000", "after_hex": "0x7ff0000000000001"}  # fmt: skip
+    result["fault"] = {
+        "level": "source", "stage": "planning", "states": states, "state": "applied",
+        "request": {"persistence": "transient", "effect": "flip"},
+        "trigger": {"when": "phase", "phase": "flying", "number": 0, "drawn_time_s": 0.0},
+        "strikes": [{"stamp_s": 10.52, "changes": [change]}], "strike_count": 1, "reason": "",
+        "activation": {"first_reader": None, "activation": "overwritten"},
+    }  # fmt: skip
+    lines = summary_lines(result)
+    assert max(map(len, lines)) <= 100
+    place = next(place for place, line in enumerate(lines) if line.startswith("Fault"))
+    assert lines[place].endswith(": transient flip, once the pilot is")
+    assert lines[place + 1] == "            in the phase flying"
+    assert lines[place + 2].endswith("waypoint_ax[7] 0.5 -> 1.78e+231 (bits 52, 60)")
+
+
+def test_a_struck_instruction_is_in_a_function_with_a_plain_name(result):
+    result["fault"] = {
+        "level": "instruction", "node": "octomap", "kernel": "octomap", "invocation": 15,
+        "invocations": 78, "stamp_s": 13.39, "sampling": "instruction-uniform", "k": 3,
+        "windows": "16 of 7704", "instruction": "and ebx, 1", "state": "null", "offset": 0x1234,
+        "symbol": "_ZNK7octomap14OcTreeBaseImplINS_10OcTreeNodeEE6searchERKNS_9OcTreeKeyEj+0x205",
+        "object": "liboctomap.so",
+    }  # fmt: skip
+    told = "before execution 3 of and ebx, 1 ({})"
+    assert told.format("search+0x205 in liboctomap.so") in "\n".join(summary_lines(result))
+    result["fault"]["symbol"] = ""
+    assert told.format("liboctomap.so+0x1234") in "\n".join(summary_lines(result))
 
 
 def test_events_come_one_a_line_in_order(result):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 
 from mavfi_cli.campaign.kernels.place import Place
 from mavfi_cli.fi.isolated.profile import TargetProfile, Watch, profile_run
+from mavfi_cli.fi.symbols import short_name
 
 
 def profile_kernel(
@@ -52,14 +51,3 @@ def in_words(profile: TargetProfile) -> str:
         f"about {profile.instructions:.3g} executed instructions in scope, by sample: "
         f"{', '.join(parts)}; {profile.executed} stepped"
     )
-
-
-def short_name(symbol: str) -> str:
-    """The plain name of a function in a mangled one: the last part of its qualified name."""
-    mangled = symbol.partition("+")[0]
-    for size in re.finditer(r"\d+", mangled):
-        end = size.end() + int(size.group())
-        name = mangled[size.end() : end]
-        if name[:1].islower() and mangled[end : end + 1] in ("E", "I"):
-            return name
-    return mangled or "its entry"
