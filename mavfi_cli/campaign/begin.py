@@ -26,7 +26,7 @@ from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.campaign.specification.spec import Spec, load_spec, parse_spec, presets
 from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.campaign.stopping import Gate
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.config import MissionConfig
 
@@ -74,6 +74,7 @@ def chosen_spec(
         UnknownName: neither preset nor file nor folder.
     """
     if not _is_folder(what):
+        _require_known(what)
         spec = replaced(load_spec(what), changes)
         return spec if scale is None else spec.scaled(scale)
     with Ledger(Path(what)) as ledger:
@@ -95,6 +96,7 @@ def folder_of(what: str) -> Path:
     """
     if _is_folder(what):
         return Path(what)
+    _require_known(what)
     _require_one_meaning(what)
     return DEFAULT / load_spec(what).name
 
@@ -105,6 +107,14 @@ def _is_folder(what: str) -> bool:
     return what not in presets() and (
         folder.is_dir() or (os.sep in what and folder.suffix != ".toml")
     )
+
+
+def _require_known(what: str) -> None:
+    """Refuse a word that is no preset; campaigns/NAME may be meant."""
+    if what not in presets() and Path(what).suffix != ".toml":
+        begun = sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
+        meant = [each for each in begun if Path(each).name == what]
+        raise UnknownName("campaign", what, meant or [*presets(), *begun])
 
 
 def _require_one_meaning(what: str) -> None:

@@ -107,7 +107,12 @@ def _attack_program(options: dict[str, Any]) -> None:
         )
     if out is not None:
         _save(campaign, out)
-    click.echo(json.dumps(campaign.summary(), indent=2) if as_json else _table(campaign))
+    if as_json:
+        click.echo(json.dumps(campaign.summary(), indent=2))
+        return
+    click.echo(_table(campaign))
+    if out is not None:
+        click.echo(f"\nFiles  {out}: kernels.json, kernels.csv, runs.jsonl")
 
 
 def _plan(options: dict[str, Any]) -> Plan:
@@ -164,12 +169,16 @@ def _model(options: dict[str, Any]) -> Any:
 
 
 def _table(campaign: Campaign) -> str:
+    from mavfi_cli.fi.isolated.outcome import Outcome
+
     summary = campaign.summary()
     lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
     for name, row in summary["outcomes"].items():
         share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
         low, high = (100 * edge for edge in row["wilson95"])
-        lines.append(f"{name:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %")
+        lines.append(
+            f"{Outcome(name).title:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %"
+        )
     lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
     if summary["executed_in_scope"] is not None:
         lines.append(
@@ -178,7 +187,7 @@ def _table(campaign: Campaign) -> str:
         )
     for title in ("crashes", "not_injected", "activation"):
         if summary[title]:
-            parts = ", ".join(f"{name}: {count}" for name, count in summary[title].items())
+            parts = ", ".join(f"{name} {count}" for name, count in summary[title].items())
             lines.append(f"{title.replace('_', ' ')}: {parts}")
     return "\n".join(lines)
 

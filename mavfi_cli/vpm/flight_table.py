@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from mavfi_cli.core.columns import wrapped
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
 from mavfi_cli.vpm.table import columns, csv_of
 
@@ -32,7 +34,7 @@ def flight_table(flights: Mapping[str, Any]) -> list[str]:
     for one in flights["vehicles"]:
         lines += ["", *_vehicle(one, flights)]
     lines += ["", *_overheads(flights["overheads"]), "", "What the flights do not scale:"]
-    return [*lines, *(f"  {text}" for text in flights["not_scaled"])]
+    return [*lines, *wrapped(["", text] for text in flights["not_scaled"])]
 
 
 def flight_rows_csv(flights: Mapping[str, Any]) -> str:
@@ -109,10 +111,10 @@ def _number(
     )  # fmt: skip
     return [
         row["scheme"],
-        f"{model:.{digits}f} {unit}",
-        f"{flight:.{digits}f} {unit}",
-        f"({low:.{digits}f} to {high:.{digits}f} {unit})",
-        f"{row[f'{name}_difference_percent']:+.1f} %",
+        _known(f"{model:.{digits}f} {unit}", model),
+        _known(f"{flight:.{digits}f} {unit}", flight),
+        _known(f"({low:.{digits}f} to {high:.{digits}f} {unit})", low, ""),
+        _known(f"{row[f'{name}_difference_percent']:+.1f} %", flight),
     ]
 
 
@@ -121,9 +123,9 @@ def _why(row: Mapping[str, Any]) -> list[str]:
     alarms = row["flight_alarms"]
     return [
         row["scheme"],
-        f"x {row['flight_path_ratio']:.3f} longer",
-        f"x {pace:.3f} slower",
-        f"{row['flight_replans']:.1f} a flight",
+        _known(f"x {row['flight_path_ratio']:.3f} longer", row["flight_path_ratio"]),
+        _known(f"x {pace:.3f} slower", pace),
+        _known(f"{row['flight_replans']:.1f} a flight", row["flight_replans"]),
         "no detector" if alarms != alarms else f"{alarms:.1f} a flight",
     ]
 
@@ -131,13 +133,19 @@ def _why(row: Mapping[str, Any]) -> list[str]:
 def _ratio(row: Mapping[str, Any], name: str, suffix: str) -> list[str]:
     key = f"{name}{suffix}"
     flight, low, high = (row[f"flight_{key}{end}_ratio"] for end in ("", "_low", "_high"))
+    ends = _known(f"x {low:.4f} to x {high:.4f}, ", low, "")
     return [
         row["scheme"],
         f"x {row[f'model_{key}_ratio']:.4f}",
-        f"x {flight:.4f}",
-        f"(x {low:.4f} to x {high:.4f}, {row[f'pairs{suffix}']} pairs)",
-        f"{row[f'{key}_ratio_difference_percent']:+.1f} %",
+        _known(f"x {flight:.4f}", flight),
+        f"({ends}{row[f'pairs{suffix}']} pairs)",
+        _known(f"{row[f'{key}_ratio_difference_percent']:+.1f} %", flight),
     ]
+
+
+def _known(text: str, value: float, otherwise: str = "-") -> str:
+    """The text of a value, where there is one: no flight succeeds, or one has no interval."""
+    return otherwise if math.isnan(value) else text
 
 
 def _remarks(row: Mapping[str, Any]) -> Iterator[str]:

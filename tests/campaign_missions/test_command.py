@@ -136,7 +136,7 @@ def test_a_pair_is_drawn(flown, mavfi, tmp_path, chosen, seed):
     assert run.returncode == 0, run.stderr
     place, title, golden, faulty, written_to = run.stdout.splitlines()
     assert place == f"farm, seed {seed}"
-    assert title == "fault: field=mantissa site=waypoint_position together=True"
+    assert title == "fault: field=mantissa site=waypoint_position together=true"
     assert re.fullmatch(rf"  golden: success, \d\.\d s  {folder}/runs/00000\d-farm-{seed}", golden)
     assert faulty.startswith("  FI: success, ")
     assert written_to == f"Picture  {picture}"
@@ -306,6 +306,18 @@ def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch
     assert own.exit_code == 0
     assert called("status", "campaigns/fig8").stdout == own.stdout
     assert called("status", "./fig8").stdout == called(*begin).stdout != own.stdout
+
+
+def test_the_name_of_a_campaign_that_was_begun_is_told_with_its_folder(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mavfi_cli.campaign.run.fly_missing", lambda *_: None)
+    invoke = CliRunner().invoke
+    begun = invoke(command.campaign, ["run", str(written(tmp_path)), "--quiet"])
+    assert begun.exit_code == 0, begun.output
+    for line in (["status", "short"], ["run", "short"], ["plan", "short"]):
+        said = str(invoke(command.campaign, line).exception)
+        assert said.startswith("unknown campaign 'short': did you mean 'campaigns/short'?")
+    assert "did you mean 'fig8'?" in str(invoke(command.campaign, ["status", "fig88"]).exception)
 
 
 def test_set_names_the_nearest_factor(refused):

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -403,6 +404,21 @@ def test_the_command_writes_a_table_json_and_csv(native_program, tmp_path):
     assert len(rows) == 9
     assert rows[0][:2] == ["run", "outcome"]
     assert [row[1] for row in rows[1:]] == [run["outcome"] for run in saved["runs"]]
+
+
+def test_the_table_names_outcomes_and_signals(native_program, tmp_path):
+    from mavfi_cli.cli.kernels import kernels
+
+    arguments = ["--program", str(native_program("counting")), "--args", "30", "--runs", "40"]
+    result = CliRunner().invoke(kernels, [*arguments, "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert [line[:14].rstrip() for line in lines[:6]] == [
+        "outcome", "benign", "crash", "hang", "SDC", "not injected",
+    ]  # fmt: skip
+    (crashes,) = (line for line in lines if line.startswith("crashes: "))
+    assert re.search(r"\bSIG[A-Z]+ \d+", crashes)
+    assert lines[-1] == f"Files  {tmp_path}: kernels.json, kernels.csv, runs.jsonl"
 
 
 def test_a_file_as_output(native_program, tmp_path, target):

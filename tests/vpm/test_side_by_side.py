@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import pytest
 
@@ -137,6 +138,15 @@ def test_the_table_tells_overheads_side_by_side(spark):
     assert "no detector" in text
     assert "3.0 a flight" in text
     assert "alarms in a flight without a fault" not in text
+
+
+def test_what_has_no_number_has_none_in_the_table(spark):
+    lines = flight_table(spark({"dmr": {"outcome": "collision"}}, count=1)["flights"])
+    text = "\n".join(lines)
+    assert "nan" not in text
+    assert max(map(len, lines)) <= 100
+    assert re.search(r"^dmr +6.50 m/s +- +-$", text, re.MULTILINE)  # no success
+    assert re.search(r"^tmr +x 0.5236 +x [\d.]+ +\(1 pairs\) ", text, re.MULTILINE)  # no interval
 
 
 def test_a_detector_that_does_not_know_these_flights(spark):

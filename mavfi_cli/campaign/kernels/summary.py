@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,7 +9,7 @@ from mavfi_cli.campaign.kernels import catalogue
 from mavfi_cli.campaign.kernels.profile import in_words
 from mavfi_cli.campaign.kernels.runs import KernelRuns, Plan
 from mavfi_cli.core.columns import blocks
-from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json
+from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json, signal_name
 from mavfi_cli.fi.isolated.runs import csv_table
 
 SCHEMA = 1
@@ -77,16 +76,14 @@ def _with(records: Iterable[dict[str, Any]], outcome: Outcome) -> Iterator[dict[
 
 
 def _crash(entry: Mapping[str, Any]) -> str:
-    number = entry["signal"]
-    if number:
-        known = {each.value for each in signal.Signals}
-        return signal.Signals(number).name if number in known else f"signal {number}"
+    if entry["signal"]:
+        return signal_name(entry["signal"])
     return str(entry["error"]).partition(":")[0] or "exit"
 
 
 def table(summary: Mapping[str, Any]) -> str:
     """The summary as text: one row a kernel, shares of injected runs with 95 % intervals."""
-    head = ["kernel", "runs", *(outcome.value for outcome in _SHOWN)]
+    head = ["kernel", "runs", *(outcome.title for outcome in _SHOWN)]
     rows = [
         [each["title"], str(each["runs"]), *(_cell(each["outcomes"][o.value]) for o in _SHOWN)]
         for each in summary["kernels"]

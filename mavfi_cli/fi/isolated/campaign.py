@@ -11,7 +11,7 @@ from typing import Any
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.isolated.attack import Attacker
 from mavfi_cli.fi.isolated.journal import Journal
-from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json
+from mavfi_cli.fi.isolated.outcome import Outcome, counted, shares, shares_to_json, signal_name
 from mavfi_cli.fi.isolated.profile import TargetProfile, in_words
 from mavfi_cli.fi.isolated.program import (
     Golden,
@@ -99,7 +99,7 @@ class Campaign:
                 shares((Outcome(entry["outcome"]) for entry in records), windows)
             ),
             "crashes": counted(
-                f"signal {entry['signal']}" if entry["signal"] else f"exit {entry['exit_code']}"
+                signal_name(entry["signal"]) if entry["signal"] else f"exit {entry['exit_code']}"
                 for entry in records
                 if entry["outcome"] == Outcome.CRASH.value
             ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,11 @@ class Outcome(Enum):
     HANG = "hang"
     SDC = "sdc"
     NOT_INJECTED = "not_injected"
+
+    @property
+    def title(self) -> str:
+        """What people call it."""
+        return "SDC" if self is Outcome.SDC else self.value.replace("_", " ")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,6 +125,12 @@ def shares_to_json(found: Mapping[Outcome, Share]) -> dict[str, dict[str, Any]]:
         }
         for outcome, share in found.items()
     }
+
+
+def signal_name(number: int) -> str:
+    """What a signal is called."""
+    known = {each.value for each in signal.Signals}
+    return signal.Signals(number).name if number in known else f"signal {number}"
 
 
 def counted(names: Iterable[str]) -> dict[str, int]:
