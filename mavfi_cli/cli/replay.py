@@ -45,6 +45,8 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     for text in version_differences(recorded.result["versions"], installed_versions()):
         click.echo(f"warning: another build: {text}", err=True)
     config = config_of(recorded, with_fault=not without_fault)
+    what = "without its fault" if without_fault else "again"
+    click.echo(f"flying {config.world}, seed {config.seed}, {what}", err=True)
     repeat = read(recorded.folder.fault) if config.instruction is not None else None
     again = load_run(
         fly_mission(

@@ -32,10 +32,14 @@ def show(run: Path, as_json: bool, golden: bool, events: bool, picture: Path | N
         return
     lines = summary_lines(record.result)
     if golden and record.result.get("fault"):
-        lines += difference_lines(record, paired_golden(record))
+        lines += difference_lines(record, paired_golden(record, _note))
     if events:
         lines += ["", "Events", *event_lines(record.result)]
     click.echo("\n".join(lines))
     click.echo(f"\nRun folder  {record.folder.path}")
     if picture is not None:
         click.echo(f"Picture     {picture}")
+
+
+def _note(text: str) -> None:
+    click.echo(text, err=True)

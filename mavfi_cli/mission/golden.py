@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 from mavfi_cli.core.errors import Interrupted, RecordError
@@ -15,8 +16,11 @@ from mavfi_cli.mission.run import fly_mission
 FOLDER = "golden"
 
 
-def paired_golden(run: Run) -> Run:
+def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
     """The golden pair of a run: flown once, then kept in the run's folder.
+
+    Args:
+        note: is told before it is flown.
 
     Raises:
         RecordError: the run does not repeat, or its folder cannot be written.
@@ -28,6 +32,7 @@ def paired_golden(run: Run) -> Run:
         golden = load_run(kept)
         if not interrupted(golden):
             return golden
+    note(f"flying the golden pair: {config.world}, seed {config.seed}")
     try:
         with tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent:
             flown = fly_mission(config, Path(parent), Watcher())

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from mavfi_cli.campaign.begin import flyable
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.specification.spec import Stop, load_spec, parse_spec, presets
 from mavfi_cli.campaign.specification.text import to_toml
@@ -222,6 +223,15 @@ def test_what_is_wrong_with_one_of_many_settings_names_it():
     """
     with pytest.raises(MavfiError, match=r"^fault.* \(in setting=FI world=farm bits=two stage="):
         spec_of(text).missions()
+
+
+def test_the_specification_of_the_documents_can_be_flown():
+    text = Path(__file__).parents[2].joinpath("docs", "campaign.md").read_text()
+    example = text.partition("## The specification\n\n```toml\n")[2].partition("```")[0]
+    spec = spec_of(example)
+    # two worlds x (golden, two stages x two numbers of bits: 100 each; native: 20)
+    assert len(flyable(spec)) == 2 * (5 * 100 + 20)
+    assert spec.stop == Stop(margin=0.05, batch=20)
 
 
 @pytest.mark.parametrize("name", presets())

@@ -53,10 +53,15 @@ def test_an_interrupted_golden_pair_is_not_kept(command_line, sideways, cut_once
     cut_once("mavfi_cli.mission.golden")
     code, out, err = command_line("show", sideways.path)
     assert (code, out) == (130, "")
-    assert err == "interrupted: the golden pair was not flown to its end\n"
+    assert err.splitlines() == [
+        "flying the golden pair: farm, seed 5",
+        "interrupted: the golden pair was not flown to its end",
+    ]
     assert {path.name for path in sideways.path.iterdir()} == before
-    code, out, _ = command_line("show", sideways.path)
+    code, out, err = command_line("show", sideways.path)
     assert (code, "Effect      first at" in out) == (0, True)
+    assert err == "flying the golden pair: farm, seed 5\n"
+    assert command_line("show", sideways.path) == (0, out, "")  # kept, so not flown again
 
 
 def test_an_interrupted_golden_pair_of_an_older_version_is_flown_anew(sideways):
@@ -74,7 +79,11 @@ def test_an_interrupted_repetition_is_neither_equal_nor_different(
     cut_once("mavfi_cli.mission.run")
     code, out, err = command_line("replay", sideways.path, "--out", "again", *options)
     assert (code, out) == (130, "")
-    assert err == "interrupted: the repetition was not flown to its end\n"
+    again = "without its fault" if "--without-fault" in options else "again"
+    assert err.splitlines() == [
+        f"flying farm, seed 5, {again}",
+        "interrupted: the repetition was not flown to its end",
+    ]
     assert not list((tmp_path / "again").iterdir())
 
 
