@@ -258,7 +258,8 @@ def _plan_lines(told: dict[str, Any], options: dict[str, Any]) -> list[str]:
         found = told["campaign"]
         lines.append(f"{found['name']}: {found['about']}" if found["about"] else found["name"])
         lines += [f"{count:>7}  {labels}" for labels, count in found["settings"].items()]
-        lines.append(f"{found['missions']:>7}  missions of {found['pairs']} pairs")
+        pairs = f"{found['pairs']} pair{'s' if found['pairs'] != 1 else ''}"
+        lines.append(f"{found['missions']:>7}  missions of {pairs}")
     return lines
 
 

@@ -58,7 +58,7 @@ def list_(models: Path | None, as_json: bool) -> None:
 @click.option("--field", "fields", default="sign,exponent,mantissa,integer", show_default=True,
               help="Bit fields that are struck at the source level; integer: states that have none "
                    "of the others.")  # fmt: skip
-@click.option("--platform", help="The companion computer  [x86].")
+@click.option("--platform", metavar="NAME|FILE", help="The companion computer  [x86].")
 @click.option("--jobs", type=click.IntRange(min=1),
               help="Missions at the same time  [one a core].")  # fmt: skip
 @click.option("--out", type=_FOLDER, default=Path("evaluation"), show_default=True,

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 @click.option("--kernel", multiple=True, metavar="NAME",
               help="point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar or control. "
                    "May be repeated  [all].")  # fmt: skip
-@click.option("--world", default="dense", show_default=True,
+@click.option("--world", default="dense", show_default=True, metavar="NAME|FILE",
               help="World of the golden flight that feeds the kernels.")  # fmt: skip
 @click.option("--world-seed", default=3, show_default=True, help="Its seed.")
 @click.option("--program", help="Attack this native program instead of our kernels.")
@@ -29,9 +30,12 @@ if TYPE_CHECKING:
 @click.option("--compare", help="What of it is compared: stdout or file:PATH  [stdout].")
 @click.option("--tolerance", default=0.0, type=click.FloatRange(min=0.0),
               help="Relative difference that is no SDC.")  # fmt: skip
-@click.option("--runs", default=1000, show_default=True, type=click.IntRange(min=1))
-@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1))
-@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
+@click.option("--runs", default=1000, show_default=True, type=click.IntRange(min=1),
+              help="Of each kernel, or of the program: one fault a run.")  # fmt: skip
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1),
+              help="Runs at the same time; the results are the same.")  # fmt: skip
+@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0),
+              help="Of the faults.")  # fmt: skip
 @click.option("--scope", multiple=True, help="Program: shared object in scope.")
 @click.option("--function", help="Program: attack only inside calls of this function.")
 @click.option(
@@ -46,16 +50,21 @@ if TYPE_CHECKING:
     show_default=True,
     help="instruction-uniform, cpu-time or wall-clock.",
 )
-@click.option("--site", multiple=True, help="general, flags, vector, x87, memory, opcode ...")
-@click.option("--role", multiple=True, help="source or destination; default both.")
-@click.option("--field", default="any", help="sign, exponent, mantissa or any.")
-@click.option("--bits", default=1, type=click.IntRange(min=1), help="Bits flipped at once.")
+@click.option("--site", multiple=True,
+              help="general, flags, vector, x87, mask, instruction-pointer, opcode, memory. May be "
+                   "repeated  [the first five: registers].")  # fmt: skip
+@click.option("--role", multiple=True, help="source or destination  [both].")
+@click.option("--field", default="any", show_default=True,
+              help="Of which field bits are flipped: sign, exponent, mantissa, any.")  # fmt: skip
+@click.option("--bits", default=1, show_default=True, type=click.IntRange(min=1),
+              help="How many bits are flipped.")  # fmt: skip
 @click.option("--compat", help="Repeat another injector's habits: rosfi-2021.")
 @click.option("--null", is_flag=True, help="Do everything but the flip.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False),
               help="Folder for records, JSON, CSV, plot; what it has is not repeated.")  # fmt: skip
 @click.option("--replay", type=click.Path(path_type=Path, file_okay=False),
-              help="Repeat the recorded runs of such a folder and compare.")  # fmt: skip
+              help="Repeat the recorded runs of such a folder and compare; with --kernel these "
+                   "kernels, with --runs so many of each.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def kernels(**options: Any) -> None:
     """Flip bits in one kernel at a time, one fault a run, and compare its output.
@@ -67,26 +76,29 @@ def kernels(**options: Any) -> None:
     from mavfi_cli.cli.own_kernels import replay_folder, run_own_kernels
 
     if options["replay"] is not None:
+        others = [name for name in options if name not in ("replay", "kernel", "runs")]
+        _refuse(others, "goes without --replay: a record says how it was drawn")
         limit = options["runs"] if _given("runs") else 0
         if not replay_folder(options["replay"], options["kernel"], limit):
             raise click.exceptions.Exit(1)
     elif options["program"] is not None:
-        _refuse(options, ("kernel",), "goes without --program")
+        _refuse(("kernel", "world", "world_seed"), "goes without --program")
         _attack_program(options)
     else:
-        _refuse(options, ("args", "compare", "scope", "function"), "needs --program")
+        _refuse(("args", "compare", "scope", "function"), "needs --program")
         run_own_kernels(options, _model(options))
 
 
 def _given(name: str) -> bool:
     source = click.get_current_context().get_parameter_source(name)
-    return source is not click.core.ParameterSource.DEFAULT
+    return source is click.core.ParameterSource.COMMANDLINE
 
 
-def _refuse(options: dict[str, Any], names: tuple[str, ...], why: str) -> None:
-    for name in names:
-        if options[name]:
-            raise click.UsageError(f"--{name} {why}")
+def _refuse(names: Sequence[str], why: str) -> None:
+    """An option that would do nothing is a mistake: exit code 2."""
+    for option in click.get_current_context().command.params:
+        if option.name in names and _given(option.name):
+            raise click.UsageError(f"{option.opts[0]} {why}")
 
 
 def _attack_program(options: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ import click
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
               show_default=True, help="Where flights, data set and models go.")  # fmt: skip
-@click.option("--world", "worlds", multiple=True,
+@click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
               help="Where to fly; may be repeated  [the paper's four: two densities, two "
                    "sizes].")  # fmt: skip
 @click.option("--flights", type=click.IntRange(min=1), default=25, show_default=True,

@@ -222,6 +222,10 @@ def test_the_command_line_refuses_what_makes_no_sense(mavfi):
     assert asked.stderr.startswith("error: unknown kernel 'contrl': did you mean 'control'?")
     assert mavfi("kernels", "--args", "5").returncode == 2
     assert mavfi("kernels", "--program", "/bin/true", "--kernel", "rrt").returncode == 2
+    for option in (["--json"], ["--seed", "1"], ["--program", "/bin/true"]):
+        asked = mavfi("kernels", "--replay", ".", *option)
+        assert asked.returncode == 2
+        assert f"Error: {option[0]} goes without --replay" in asked.stderr
     asked = mavfi("kernels", "--kernel", "control", "--sampling", "instruction")
     assert asked.returncode == 1
     assert "instruction-uniform" in asked.stderr
