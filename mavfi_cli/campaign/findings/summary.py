@@ -9,8 +9,8 @@ from typing import Any
 
 from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden, protection
 from mavfi_cli.campaign.findings.groups import INACTIVE, METRICS, Group, groups
+from mavfi_cli.campaign.findings.setting_columns import SettingColumns
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.setting_columns import SettingColumns
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.campaign.statistics.worst_case import WorstCase
