@@ -66,6 +66,24 @@ def test_a_chain_runs_at_its_own_stamps_not_at_the_ticks():
     assert seen == [0.012]
 
 
+def test_what_asked_for_the_core_first_has_it_first():
+    """Neither the next node of a chain nor the node's own newer input overtakes who waits."""
+    executor = Executor(draw_latency_s=lambda _name: 0.1, cores=1)
+    for name, follower in (("a", "b"), ("b", None), ("c", None)):
+
+        def publish(value: Any, _stamp: float, follower: str | None = follower) -> None:
+            if follower:
+                executor.submit(follower, value)
+
+        executor.add(name, lambda value, _start: value, publish)
+    for stamp, name in [(0.0, "a"), (0.02, "c"), (0.04, "a")]:
+        executor.advance(stamp)
+        executor.submit(name, stamp)
+    executor.advance(1.0)
+    order = [job.node for job in executor.timetable]
+    assert order == ["a", "c", "b", "a", "b"]
+
+
 inputs = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 30)), max_size=25)
 
 

@@ -268,9 +268,9 @@ class Executor:
             self._lose(job, end_s, loss)
             return
         job.node.busy = False
-        self._working -= 1
-        job.node.publish(output, end_s)
+        job.node.publish(output, end_s)  # its core is still taken: what this starts asks last
         self._start_if_free(job.node)
+        self._working -= 1
         self._start_waiting()
 
     def _start_waiting(self) -> None:
