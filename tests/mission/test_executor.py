@@ -84,6 +84,16 @@ def test_what_asked_for_the_core_first_has_it_first():
     assert order == ["a", "c", "b", "a", "b"]
 
 
+def test_a_called_node_takes_nothing_while_it_is_at_work():
+    executor, _ = make({"control": 0.046})
+    given = [executor.call("control", tick, 0.02 * tick) is not None for tick in range(6)]
+    assert given == [True, False, False, True, False, False]
+    assert executor.nodes["control"].dropped == 4
+    first, second = executor.timetable
+    assert first.end_s <= second.start_s
+    assert executor.call("control", 5, 0.1, again=True) is not None  # its newest work, anew
+
+
 inputs = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 30)), max_size=25)
 
 
