@@ -171,6 +171,10 @@ def test_faults_on_two_platforms(flown, told):
         }
         assert row["extra_s"]["value"] == pytest.approx(np.mean(list(extra.values())))
         assert_interval(row["extra_s"], by_mission(extra), np.mean)
+        sums = np.array([np.sum(values) for values in by_mission(extra)])
+        flips = np.abs(np.random.default_rng(4).choice([-1.0, 1.0], (20_000, len(sums))) @ sums)
+        chance = np.mean(flips >= abs(sums.sum()) * (1.0 - 1e-9))
+        assert row["p_value"] == pytest.approx(chance, abs=0.02)
         late = [np.percentile([of[key] for key in shared], 95.0) for of in (here, there)]
         assert row["p95_ratio"]["value"] == pytest.approx(late[1] / late[0])
         assert row["largest_ratio"] == pytest.approx(max(there.values()) / max(here.values()))

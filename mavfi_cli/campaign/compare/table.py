@@ -184,12 +184,13 @@ def _difference_lines(told: Row, platform: Row) -> list[str]:
 
 
 def _difference_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "pairs", "mean, s", "95th perc., x", "worst, x", "longest, x"]
+    yield ["", "pairs", "differ", "mean, s", "95th perc., x", "worst, x", "longest, x"]
     for row in rows:
         yield [
             setting_title(row["setting"]),
             f"{row['pairs']}",
-            _spread(row["extra_s"], digits=2),
+            f"{row['differ']}",
+            _spread(row["extra_s"], digits=2, chance=row["p_value"]),
             _spread(row["p95_ratio"], digits=3),
             _number(row["largest_ratio"], "{:.3f}"),
             _number(row["longest_ratio"], "{:.3f}"),
@@ -263,11 +264,14 @@ def _rate(share: Row) -> str:
     return f"{100 * share['share']:.1f} % {ends}"
 
 
-def _spread(each: Row, *, scale: float = 1.0, digits: int) -> str:
+def _spread(each: Row, *, scale: float = 1.0, digits: int, chance: float | None = None) -> str:
+    """A value with its interval, and the p-value where one is given."""
     value, low, high = (scale * each[name] for name in ("value", "low", "high"))
     if math.isnan(value):
         return "-"
-    ends = "" if math.isnan(low) else f" ({low:z.{digits}f} to {high:z.{digits}f})"
+    told = [] if math.isnan(low) else [f"{low:z.{digits}f} to {high:z.{digits}f}"]
+    told += [] if chance is None else [_chance(chance)]
+    ends = f" ({', '.join(told)})" if told else ""
     return f"{value:z.{digits}f}{ends}"
 
 
