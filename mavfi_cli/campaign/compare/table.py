@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
+from mavfi_cli.campaign.statistics.bootstrap import FEW
 
 Row = Mapping[str, Any]
 # The paper, section VII-E: on the TX2, a single bit flip in an inter-kernel state.
@@ -47,7 +48,16 @@ def table(told: Row) -> list[str]:
         "Energy: the paper's regression; that of the propellers is in compare.json.",
         "Response, depth frame to setpoint: each flight's median and 95th percentile; here the",
         "median over the flights.",
+        *_few(told),
     ]
+
+
+def _few(told: Row) -> list[str]:
+    """A word where intervals are of too few flights to be believed."""
+    counts = [row["quantities"]["flight_time_s"]["mean"]["count"] for row in told["settings"]]
+    if not any(1 < count < FEW for count in counts):
+        return []
+    return [f"Bootstrap intervals of fewer than {FEW} flights are too narrow to be believed."]
 
 
 def _head(told: Row) -> list[str]:
