@@ -19,13 +19,14 @@ from mavfi_cli.campaign.missions import (
     naming,
 )
 from mavfi_cli.campaign.preflight import ask_vehicle
-from mavfi_cli.campaign.run import require_versions, store_plan
+from mavfi_cli.campaign.run import store_plan
 from mavfi_cli.campaign.specification.changes import replaced
 from mavfi_cli.campaign.specification.difference import differences
 from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.campaign.specification.spec import Spec, load_spec, parse_spec, presets
 from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.campaign.stopping import Gate
+from mavfi_cli.campaign.unchanged import require_unchanged
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.config import MissionConfig
@@ -165,7 +166,7 @@ def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool 
     with contextlib.ExitStack() as undo:
         ledger = undo.enter_context(Ledger(folder, writing=True))
         if missions is None and ledger.meta("spec") == text:  # the list is what it would expand to
-            require_versions(ledger)
+            require_unchanged(ledger)
         else:
             store_plan(
                 ledger,

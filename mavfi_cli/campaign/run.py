@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import time
@@ -24,9 +23,9 @@ from mavfi_cli.campaign.slots.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.campaign.specification.spec import Stop
 from mavfi_cli.campaign.stopping import Entry, Gate, Queue
 from mavfi_cli.campaign.together import Together
+from mavfi_cli.campaign.unchanged import note_files, require_unchanged
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
-from mavfi_cli.mission.replay import version_differences
-from mavfi_cli.mission.run import installed_versions, interruptible
+from mavfi_cli.mission.run import interruptible
 
 WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # so often a mission is begun that something outside ends
@@ -110,9 +109,9 @@ def store_plan(
         can_append: how to have new missions added, told where no stored one is gone.
 
     Raises:
-        ConfigError: it is another list; says in what it differs.
+        ConfigError: it is another list; says in what it differs. Or as `require_unchanged`.
     """
-    require_versions(ledger)
+    require_unchanged(ledger)
     left = Counter(row[1:] for row in ledger.rows())
     stored = left.total()
     new = []
@@ -133,6 +132,7 @@ def store_plan(
         raise ConfigError(
             f"holds another campaign: {'; '.join([*found, remedy])}", path=ledger.folder
         )
+    note_files(ledger, new)
     ledger.plan(new)
 
 
@@ -144,21 +144,6 @@ def _first_of(new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]
     """The first mission that is new, and the first that is gone."""
     firsts = {"new": _row(new[0]) if new else None, "gone": next(iter(gone), None)}
     return [f"the first {how} one is {row[0]} {row[2]}" for how, row in firsts.items() if row]
-
-
-def require_versions(ledger: Ledger) -> None:
-    """Have one campaign flown by one version of everything that results depend on.
-
-    Raises:
-        ConfigError: it was begun with others; names them.
-    """
-    versions = installed_versions()
-    stored = ledger.meta("versions")
-    if stored is None:
-        ledger.set_meta({"versions": canonical(versions)})
-    elif stored != canonical(versions):
-        differing = version_differences(json.loads(stored), versions)
-        raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
 
 
 def fly_missing(

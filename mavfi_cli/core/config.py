@@ -7,6 +7,7 @@ import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import NoneType, UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import cattrs
@@ -135,20 +136,35 @@ def _converter() -> cattrs.Converter:
 _CONVERTER = _converter()
 
 
-def _refuse_unknown(
-    data: Mapping[str, Any], cls: Any, path: Path | None, text: str, prefix: str
-) -> None:
-    """Walk nested dataclass fields and refuse any key that none of them has."""
-    if not dataclasses.is_dataclass(cls) or not isinstance(data, Mapping):
-        return
+def _refuse_unknown(data: Any, cls: Any, path: Path | None, text: str, prefix: str) -> None:
+    """Walk nested dataclass fields; refuse any key that none of them has, and any wrong shape."""
     hints = get_type_hints(cls)
     for key, value in data.items():
         full = f"{prefix}{key}"
         if key not in hints:
             raise UnknownKey(full, hints, path=path, line=_line_of(text, full))
+        _refuse_shape(value, hints[key], path, text, full)
         for nested in _dataclasses_in(hints[key]):
             for name, item in _items(value, hints[key]):
-                _refuse_unknown(item, nested, path, text, prefix=f"{full}.{name}")
+                if item is not None:
+                    _refuse_shape(item, nested, path, text, f"{full}.{name}".rstrip("."))
+                    _refuse_unknown(item, nested, path, text, prefix=f"{full}.{name}")
+
+
+def _refuse_shape(value: Any, hint: Any, path: Path | None, text: str, key: str) -> None:
+    """Refuse what is no table, or no array, where one belongs: text is an array of letters."""
+    hints = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    kinds = [get_origin(each) or each for each in hints if each is not NoneType]
+    if all(kind is dict or dataclasses.is_dataclass(kind) for kind in kinds):
+        fits, wanted = isinstance(value, Mapping), "a table"
+    elif all(kind in (list, tuple) for kind in kinds):
+        fits, wanted = isinstance(value, (list, tuple)), "an array"
+    else:
+        return
+    if not fits and not (value is None and NoneType in hints):
+        raise ConfigError(
+            f"expected {wanted}, got {value!r}", path=path, line=_line_of(text, key), key=key
+        )
 
 
 def _items(value: Any, hint: Any) -> list[tuple[str, Any]]:

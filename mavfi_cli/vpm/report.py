@@ -16,7 +16,7 @@ from mavfi_cli.vpm.model import KNEE_SHARE, safe_velocity_mps
 from mavfi_cli.vpm.schemes import REFERENCE, Scheme, named, unlike_sources
 from mavfi_cli.vpm.sensitivity import sensitivity
 from mavfi_cli.vpm.setting import Outcome, Setting, outcome
-from mavfi_cli.vpm.vehicle import Vehicle
+from mavfi_cli.vpm.vehicle import SMALLEST, Vehicle
 
 # How the latencies of a platform's kernels make one response time, and how that is told.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
@@ -113,7 +113,7 @@ def _setting(
             )
         combined, how = CHAINS[choices.chain]
         compute_s = combined([each.latency_s for each in kernels.values()])
-        if compute_s == 0.0:
+        if compute_s < SMALLEST:
             raise ConfigError(f"no kernel of platform {choices.platform.name!r} takes any time")
         given = f"platform {choices.platform.name}: {how} of {', '.join(kernels)}"
     if given:

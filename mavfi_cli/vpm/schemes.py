@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.mission.platform import LARGEST
 
 REFERENCE = "aad"  # what the paper's Fig. 15 holds redundancy against
 
@@ -46,13 +46,15 @@ def schemes_with(
 
     Raises:
         UnknownName: a scheme that does not detect and recover.
-        ConfigError: an overhead that is negative or not finite.
+        ConfigError: an overhead that is negative, not finite, or a slip of the unit.
     """
     for name, percent in overheads_percent.items():
         if name not in DETECTORS:
             raise UnknownName("detector", name, DETECTORS)
-        if not 0.0 <= percent < math.inf:
-            raise ConfigError(f"must be zero or more, is {percent:g} %", key=f"overhead of {name}")
+        if not 0.0 <= percent <= LARGEST:
+            raise ConfigError(
+                f"must be within 0 and {LARGEST:g} %, is {percent:g} %", key=f"overhead of {name}"
+            )
     told = sources or {}
     return tuple(
         replace(

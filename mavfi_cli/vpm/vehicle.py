@@ -10,6 +10,7 @@ from mavfi_cli.core.config import load_shipped, shipped_names
 from mavfi_cli.mission.platform import LARGEST
 
 CALIBRATED = ("rotor_pull_n", "response_s")  # what a calibration may set
+SMALLEST = 1.0e-6  # in any unit; less is a slip of the unit
 SMALL_KG = 0.67  # geometric mean of the simulated vehicles, 0.3 kg and 1.5 kg
 _FOLDER = Path(__file__).parent / "vehicles"
 
@@ -57,8 +58,10 @@ class Vehicle:
             value = getattr(self, key)
             if value is not None and value <= 0.0:
                 raise ValueError(f"{key}: must be above zero, is {value:g}")
-            if value is not None and value > LARGEST:
-                raise ValueError(f"{key}: must be at most {LARGEST:g}, is {value:g}")
+            if value is not None and not SMALLEST <= value <= LARGEST:
+                least = value < SMALLEST
+                limit = f"at least {SMALLEST:g}" if least else f"at most {LARGEST:g}"
+                raise ValueError(f"{key}: must be {limit}, is {value:g}")
         if not 0.0 <= self.tilt_deg < 90.0:
             raise ValueError(f"tilt_deg: must be within 0 and 90, is {self.tilt_deg:g}")
         free = self.calibration.parameter if self.calibration else ""

@@ -219,6 +219,24 @@ def test_append_adds_what_is_new(campaign):
         assert ledger.planned() == 2
 
 
+def test_a_file_that_missions_name_must_not_change_between_them(campaign, tmp_path):
+    mine, other = tmp_path / "mine.toml", tmp_path / "other.toml"
+    mine.write_text("scale = 1.2")
+    other.write_text("")
+    missions = planned("fly", platform=str(mine))
+    campaign.run(missions).close()
+    campaign.run([*missions, *planned("fly", vehicle=str(other))], append=True).close()
+    mine.write_text("scale = 2.5")
+    more = [*missions, *planned("fly", "fly", platform=str(mine))[1:]]
+    with pytest.raises(ConfigError, match=r"mine\.toml: not as it was when the campaign was begun"):
+        campaign.run(more, append=True)
+    mine.write_text("scale = 1.2")
+    campaign.run(more, append=True).close()
+    other.unlink()
+    with pytest.raises(ConfigError, match=r"/other\.toml: not as it was"):
+        campaign.run(more, append=True)
+
+
 def test_a_mission_that_is_listed_twice_is_flown_twice(campaign):
     missions = planned("fly") * 2
     for _ in range(2):

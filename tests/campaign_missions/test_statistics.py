@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mavfi_cli.campaign.statistics.bootstrap import BLOCKS, LARGE, interval, mean, median
+from mavfi_cli.campaign.statistics.bootstrap import BLOCKS, FEW, LARGE, interval, mean, median
 from mavfi_cli.campaign.statistics.layers import cross_layer, failures_per_hour
-from mavfi_cli.campaign.statistics.paired import holm, mcnemar
+from mavfi_cli.campaign.statistics.paired import holm, mcnemar, sign_flips
 from mavfi_cli.campaign.statistics.proportions import (
     half_width,
     missions_for_margin,
@@ -64,6 +64,36 @@ def test_mcnemar_is_the_sign_test_of_the_pairs_that_differ(pairs):
     if pairs:
         expected = np.mean([b for _, b in pairs]) - np.mean([a for a, _ in pairs])
         assert found.difference == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(("count", "least", "most"), [(3, 0.65, 0.85), (FEW, 0.86, 0.94)])
+def test_how_often_an_interval_of_few_values_holds_the_true_mean(count, least, most):
+    """Of 95 in a hundred that it promises; what the text says of few flights hangs on it."""
+    rng = np.random.default_rng(8)
+    found = [interval(rng.normal(size=count), resamples=999) for _ in range(400)]
+    assert least < np.mean([each.low <= 0.0 <= each.high for each in found]) < most
+
+
+@given(st.lists(st.integers(-20, 20), min_size=2, max_size=9))
+def test_sign_flips_are_scipys_permutation_test_of_pairs(differences):
+    if not any(differences):
+        assert sign_flips(differences) == 1.0
+        return
+    oracle = stats.permutation_test(
+        (np.array(differences, float), np.zeros(len(differences))),
+        lambda x, y: abs(np.sum(x - y)),
+        permutation_type="samples",
+        vectorized=False,
+        alternative="greater",
+    )
+    assert sign_flips([float(each) for each in differences]) == pytest.approx(oracle.pvalue)
+
+
+def test_sign_flips_of_many_differences_are_near_the_t_test():
+    differences = np.random.default_rng(3).normal(0.2, 1.0, 120)
+    oracle = stats.ttest_1samp(differences, 0.0).pvalue
+    assert sign_flips(differences.tolist()) == pytest.approx(oracle, abs=0.01)
+    assert sign_flips([*differences.tolist(), *[0.0] * 500]) == sign_flips(differences.tolist())
 
 
 def test_mcnemar_of_thousands_of_pairs():

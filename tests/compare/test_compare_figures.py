@@ -165,6 +165,17 @@ def test_no_line_of_the_text_is_longer_than_100_columns_but_commands():
     assert [line for line in text if len(line) > 100 and not line.startswith("  mavfi fly")] == []
 
 
+@pytest.mark.parametrize(("missions", "said"), [(1, False), (2, True), (9, True), (10, False)])
+def test_intervals_of_too_few_flights_are_said_to_be_too_narrow(missions, said):
+    plan = ComparePlan(inject=(), missions=missions)
+    flights = [
+        flight(platform, seed, 20.0 + seed) for platform in plan.platforms
+        for seed in range(1, missions + 1)
+    ]  # fmt: skip
+    told = {"plan": plan_told(plan), "errors": [], **figures(plan, flights)}
+    assert ("fewer than 10 flights are too narrow" in "\n".join(table(told))) is said
+
+
 def test_text_and_csv_say_every_number_with_its_unit(whole):
     text = table(whole)
     assert all(len(line) <= 100 for line in text if not line.startswith("  mavfi fly"))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from flown_twice import flight
 
-from mavfi_cli.campaign.compare.fly import timeline_seed
+from mavfi_cli.campaign.compare.fly import plan_told, timeline_seed
 from mavfi_cli.campaign.compare.plan import ComparePlan, titles
 from mavfi_cli.campaign.specification.spec import load_spec
 from mavfi_cli.core.errors import ConfigError
@@ -77,6 +77,11 @@ def test_a_plan_that_makes_no_sense_is_refused(changes, told):
     assert str(refused.value) == told
 
 
+def test_two_spellings_of_one_file_are_one_platform():
+    with pytest.raises(ConfigError, match=r"^platform: .*/a\.toml is named twice$"):
+        ComparePlan(platforms=("a.toml", "./a.toml"))
+
+
 def test_files_are_called_by_their_stems_unless_two_have_the_same():
     assert titles(("x86", "boards/mine.toml")) == {"x86": "x86", "boards/mine.toml": "mine"}
     assert titles(("a/mine.toml", "b/mine.toml")) == {
@@ -97,3 +102,10 @@ def test_the_timeline_is_of_a_mission_that_all_fly_well_with_a_new_plan_on_the_w
     assert timeline_seed(plan, flights) == 4
     assert timeline_seed(plan, [f for f in flights if f.seed != 4]) == 1
     assert timeline_seed(plan, []) == plan.first_seed
+
+
+def test_a_platform_that_does_not_describe_itself_is_called_by_its_name(tmp_path):
+    path = tmp_path / "board.toml"
+    path.write_text('name = "mine"\ncores = 4\nbase = "tx2"\n')
+    (told,) = plan_told(ComparePlan(platforms=(str(path),), inject=()))["platforms"]
+    assert (told["title"], told["description"]) == ("board", "mine")

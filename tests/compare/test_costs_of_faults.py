@@ -111,3 +111,26 @@ def test_equal_costs_differ_by_nothing_with_no_width():
     told = cost_difference("tx2", "x86", "none", of("x86", costs), of("tx2", costs))
     assert told["extra_s"] == {"value": 0.0, "low": 0.0, "high": 0.0, "count": 10}
     assert told["p95_ratio"] == {"value": 1.0, "low": 1.0, "high": 1.0, "count": 10}
+
+
+def test_three_faults_that_cost_more_are_no_difference_whatever_the_interval():
+    """A bootstrap of zeros and a few positive costs never falls below zero; chance is 2 in 8."""
+    costs = dict.fromkeys(range(1, 51), 0.0)
+    told = cost_difference(
+        "tx2", "x86", "none", of("x86", costs), of("tx2", costs | {3: 1.84, 14: 0.38, 15: 0.5})
+    )
+    assert (told["pairs"], told["differ"]) == (50, 3)
+    assert told["extra_s"]["low"] > 0.0
+    assert told["p_value"] == pytest.approx(0.25)
+
+
+def test_the_chance_takes_the_faults_of_one_mission_as_one():
+    golden = [flight(p, seed, 20.0) for p in ("x86", "tx2") for seed in SEEDS]
+
+    def found(platform, cost_s):
+        own = [each for each in golden if each.platform == platform]
+        return struck(own, [flight(platform, s, 20.0 + cost_s, "none", target=target)
+                            for s in (1, 2, 3) for target in ("planning", "control")])  # fmt: skip
+
+    told = cost_difference("tx2", "x86", "none", found("x86", 0.0), found("tx2", 1.0))
+    assert (told["pairs"], told["differ"], told["p_value"]) == (6, 6, 0.25)

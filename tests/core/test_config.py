@@ -64,6 +64,17 @@ def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
         ('name = "x', r"file\.toml: "),
         ('name = "x"\nbox = []\n[named.one]\na = "k"', r"file\.toml:4: named\.one\.a: expected"),
         ('name = "bad"\nbox = []', "a bad name"),
+        ('name = "x"\nbox = []\nsub = 3', r"file\.toml:3: sub: expected a table, got 3$"),
+        ('name = "x"\nbox = []\nsub = ["a"]', r"sub: expected a table, got \['a'\]$"),
+        ('name = "x"\nbox = []\nnamed = 3', r"named: expected a table, got 3$"),
+        (
+            'name = "x"\nbox = []\n[named]\none = 0.3',
+            r":4: named\.one: expected a table, got 0\.3$",
+        ),
+        ('name = "x"\nbox = []\n[[named.one]]\na = 1', r"named\.one: expected a table, got \["),
+        ('name = "x"\nbox = 3', r"file\.toml:2: box: expected an array, got 3$"),
+        ('name = "x"\nbox = [3]', r"file\.toml:2: box: expected a table, got 3$"),
+        ('name = "x"\nbox = []\npair = "12"', r"file\.toml:3: pair: expected an array, got '12'$"),
     ],
 )
 def test_what_is_wrong_is_said_with_file_line_and_key(tmp_path, text, message):

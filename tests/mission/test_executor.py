@@ -66,6 +66,34 @@ def test_a_chain_runs_at_its_own_stamps_not_at_the_ticks():
     assert seen == [0.012]
 
 
+def test_what_asked_for_the_core_first_has_it_first():
+    """Neither the next node of a chain nor the node's own newer input overtakes who waits."""
+    executor = Executor(draw_latency_s=lambda _name: 0.1, cores=1)
+    for name, follower in (("a", "b"), ("b", None), ("c", None)):
+
+        def publish(value: Any, _stamp: float, follower: str | None = follower) -> None:
+            if follower:
+                executor.submit(follower, value)
+
+        executor.add(name, lambda value, _start: value, publish)
+    for stamp, name in [(0.0, "a"), (0.02, "c"), (0.04, "a")]:
+        executor.advance(stamp)
+        executor.submit(name, stamp)
+    executor.advance(1.0)
+    order = [job.node for job in executor.timetable]
+    assert order == ["a", "c", "b", "a", "b"]
+
+
+def test_a_called_node_takes_nothing_while_it_is_at_work():
+    executor, _ = make({"control": 0.046})
+    given = [executor.call("control", tick, 0.02 * tick) is not None for tick in range(6)]
+    assert given == [True, False, False, True, False, False]
+    assert executor.nodes["control"].dropped == 4
+    first, second = executor.timetable
+    assert first.end_s <= second.start_s
+    assert executor.call("control", 5, 0.1, again=True) is not None  # its newest work, anew
+
+
 inputs = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 30)), max_size=25)
 
 

@@ -188,8 +188,8 @@ def test_an_overhead_of_one_s_own():
     assert slow["source"] == "--overhead"
     with pytest.raises(UnknownName, match="did you mean 'gad'"):
         schemes_with({"gda": 1.0})
-    for percent in (-1.0, math.nan, math.inf):
-        with pytest.raises(ConfigError, match="must be zero or more, is"):
+    for percent in (-1.0, math.nan, math.inf, 1e308):
+        with pytest.raises(ConfigError, match=r"must be within 0 and 1e\+06 %, is"):
             schemes_with({"aad": percent})
 
 
@@ -202,6 +202,12 @@ def test_an_overhead_of_one_s_own():
             "mass_kg = 0.300",
             "mass_kg = 1e300",
             r"mass_kg: must be at most 1e\+06, is 1e\+300",
+        ),
+        (
+            "spark",
+            "range_m = 7.0",
+            "range_m = 1e-300",
+            r"range_m: must be at least 1e-06, is 1e-300",
         ),
         ("spark", "range_m = 7.0\n", "", r"mine\.toml.*range_m.*missing"),
         (

@@ -18,12 +18,14 @@ import numpy as np
 from mavfi_cli.campaign.compare.flights import Flown
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
 from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
+from mavfi_cli.campaign.statistics.paired import sign_flips
 from mavfi_cli.campaign.statistics.worst_case import worst_case, worst_over_own
 from mavfi_cli.core.types import FloatArray
 
 LATE = 0.95  # the quantile beside the worst case, which has no interval
 CONFIDENCE = 0.95
 RESAMPLES = 1999
+_SAME_S = 1e-6  # flight times that far apart are equal: a tick is 20 ms
 Costs = Mapping[tuple[int, str], tuple[float, float]]  # of (seed, target): s, and ratio
 
 
@@ -117,22 +119,25 @@ def cost_difference(
     """What the same faults cost on a platform beyond what they cost on the reference.
 
     Returns:
-        `extra_s`: the mean difference of costs; `p95_ratio`: of the 95th percentiles over own
-        golden; both are over the faults that both platforms have a cost of. Of all flights of
+        `extra_s`: the mean difference of costs; `differ`: how many of them are not zero; `p_value`:
+        of the mean, by missions; `p95_ratio`: of the 95th percentiles over own golden; all are
+        over the faults that both platforms have a cost of. Of all flights of
         each platform: `largest_ratio` of the largest over own golden, `longest_ratio` of the
         longest in seconds.
     """
     shared = sorted(first.costs.keys() & second.costs.keys())
     here = _by_mission({mission: first.costs[mission] for mission in shared})
     there = _by_mission({mission: second.costs[mission] for mission in shared})
+    extra = there[:, :, 0] - here[:, :, 0]
+    extra[np.abs(extra) < _SAME_S] = 0.0
     return {
         "platform": platform,
         "reference": reference,
         "setting": setting,
         "pairs": len(shared),
-        "extra_s": asdict(
-            _over_missions(len(here), lambda drawn: _mean(there[drawn, :, 0] - here[drawn, :, 0]))
-        ),
+        "differ": int(np.count_nonzero(np.nan_to_num(extra))),
+        "extra_s": asdict(_over_missions(len(extra), lambda drawn: _mean(extra[drawn]))),
+        "p_value": sign_flips(np.nansum(extra, axis=1).tolist()) if shared else math.nan,
         "p95_ratio": asdict(
             _over_missions(
                 len(here), lambda drawn: _late(there[drawn, :, 1]) / _late(here[drawn, :, 1])

@@ -101,7 +101,7 @@ def _platform(name: str, title: str) -> dict[str, Any]:
     return {
         "platform": name,
         "title": title,
-        "description": profile.description,
+        "description": profile.description or profile.name,
         "cores": profile.cores,
         "power_w": profile.power_w,
         "kernel_latency_s": {

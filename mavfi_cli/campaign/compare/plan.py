@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.keep import Keep
@@ -66,6 +67,7 @@ class ComparePlan:
             ("detector", self.detectors),
         ):
             require_distinct(names, key)
+        require_distinct([_place(name) for name in self.platforms], "platform")
 
     @property
     def protectors(self) -> tuple[str, ...]:
@@ -98,6 +100,11 @@ class ComparePlan:
             axes={"world": (self.world,), "platform": self.platforms},
             settings=(Setting(name=GOLDEN), *faulty),
         )
+
+
+def _place(name: str) -> str:
+    """The same of two spellings of one file."""
+    return str(Path(name).resolve()) if name.endswith(".toml") else name
 
 
 def _setting_name(detector: str) -> str:

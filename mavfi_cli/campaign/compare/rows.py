@@ -56,6 +56,10 @@ def _csv_rows(told: Row) -> Iterator[dict[str, Any]]:
         at = {"table": "costs", **{k: row[k] for k in ("platform", "reference", "setting")}}
         yield {**at, "quantity": "cost of a fault", "statistic": "mean difference", "unit": "s",
                **row["extra_s"]}  # fmt: skip
+        yield {**at, "quantity": "cost of a fault", "statistic": "pairs that differ",
+               "unit": "count", "value": row["differ"], "count": row["pairs"]}  # fmt: skip
+        yield {**at, "quantity": "cost of a fault", "statistic": "p-value of the mean difference",
+               "unit": "1", "value": row["p_value"], "count": row["pairs"]}  # fmt: skip
         yield {**at, "quantity": "flight time over own golden", "unit": "1",
                "statistic": "ratio of 95th percentiles", **row["p95_ratio"]}  # fmt: skip
         yield {**at, "quantity": "flight time over own golden", "statistic": "ratio of the largest",

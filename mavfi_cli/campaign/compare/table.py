@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
+from mavfi_cli.campaign.statistics.bootstrap import FEW
 from mavfi_cli.core.columns import columns
 
 Row = Mapping[str, Any]
@@ -48,7 +49,16 @@ def table(told: Row) -> list[str]:
         "Energy: the paper's regression; that of the propellers is in compare.json.",
         "Response, depth frame to setpoint: each flight's median and 95th percentile; here the",
         "median over the flights.",
+        *_few(told),
     ]
+
+
+def _few(told: Row) -> list[str]:
+    """A word where intervals are of too few flights to be believed."""
+    counts = [row["quantities"]["flight_time_s"]["mean"]["count"] for row in told["settings"]]
+    if not any(1 < count < FEW for count in counts):
+        return []
+    return [f"Bootstrap intervals of fewer than {FEW} flights are too narrow to be believed."]
 
 
 def _head(told: Row) -> list[str]:
@@ -185,12 +195,13 @@ def _difference_lines(told: Row, platform: Row) -> list[str]:
 
 
 def _difference_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "pairs", "mean, s", "95th perc., x", "worst, x", "longest, x"]
+    yield ["", "pairs", "differ", "mean, s", "95th perc., x", "worst, x", "longest, x"]
     for row in rows:
         yield [
             setting_title(row["setting"]),
             f"{row['pairs']}",
-            _spread(row["extra_s"], digits=2),
+            f"{row['differ']}",
+            _spread(row["extra_s"], digits=2, chance=row["p_value"]),
             _spread(row["p95_ratio"], digits=3),
             _number(row["largest_ratio"], "{:.3f}"),
             _number(row["longest_ratio"], "{:.3f}"),
@@ -256,11 +267,14 @@ def _rate(share: Row) -> str:
     return f"{100 * share['share']:.1f} % {ends}"
 
 
-def _spread(each: Row, *, scale: float = 1.0, digits: int) -> str:
+def _spread(each: Row, *, scale: float = 1.0, digits: int, chance: float | None = None) -> str:
+    """A value with its interval, and the p-value where one is given."""
     value, low, high = (scale * each[name] for name in ("value", "low", "high"))
     if math.isnan(value):
         return "-"
-    ends = "" if math.isnan(low) else f" ({low:z.{digits}f} to {high:z.{digits}f})"
+    told = [] if math.isnan(low) else [f"{low:z.{digits}f} to {high:z.{digits}f}"]
+    told += [] if chance is None else [_chance(chance)]
+    ends = f" ({', '.join(told)})" if told else ""
     return f"{value:z.{digits}f}{ends}"
 
 

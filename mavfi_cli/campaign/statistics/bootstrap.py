@@ -17,6 +17,7 @@ from mavfi_cli.campaign.statistics.proportions import z_of
 from mavfi_cli.core.types import FloatArray
 
 RESAMPLES = 9999
+FEW = 10  # of fewer values a 95 % interval holds the true mean in less than nine cases of ten
 LARGE = 500  # from so many values on the mean is normal, and the bootstrap would only be slow
 BLOCKS = 2000  # of more values whole blocks are left out in turn
 _CHUNK = 4_000_000  # numbers that are drawn at once

@@ -219,7 +219,7 @@ class Companion:
         if directive.trajectory is not None and directive.trajectory is not self._checked:
             self._check(stamp_s)
         setpoint = self._track(stamp_s, state, directive)
-        if setpoint is not None:  # else the last one stays in force: the node is down
+        if setpoint is not None:  # else the last one stays in force: the node is busy, or down
             self._commands.append(setpoint)
         while self._commands and self._commands[0].due_s <= stamp_s:
             self._take_command(stamp_s, self._commands.popleft())
@@ -262,25 +262,20 @@ class Companion:
         job = ControlInput(
             inputs=tracking_inputs(stamp_s, state, directive), fresh=fresh, yaw_rad=state.yaw_rad
         )
-        command: Command | None = self.executor.call("control", job, stamp_s)
-        due_s = stamp_s + self._control_delay_s(stamp_s)
-        if command is None:
+        called = self.executor.call("control", job, stamp_s, again=retry is not None)
+        if called is None:
             return None
+        command, latency_s = called
         frame_s, self._fresh_frame_s = self._fresh_frame_s, None
         flown = directive.trajectory
         return Setpoint(
-            due_s=due_s,
+            due_s=stamp_s + (latency_s if latency_s >= SAME_TICK_S else 0.0),
             command=command,
             directive=directive,
             waypoint=0 if flown is None else waypoint_index(flown, directive.time_s),
             attempt=attempt,
             frame_s=frame_s,
         )
-
-    def _control_delay_s(self, stamp_s: float) -> float:
-        latency_s = self._latency.draw_s("control")
-        self.executor.book("control", stamp_s, latency_s)
-        return latency_s if latency_s >= SAME_TICK_S else 0.0
 
     def _take_command(self, stamp_s: float, setpoint: Setpoint) -> None:
         """A command is due: through the gate, and out.

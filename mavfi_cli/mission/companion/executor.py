@@ -25,6 +25,7 @@ from mavfi_cli.mission.companion.node_process import NodeLost, NodeProcess
 Run = Callable[[Any, float], Any]  # (input, start stamp) -> output
 Publish = Callable[[Any, float], None]  # (output, stamp at which it takes effect)
 _Event = Callable[[float], None]
+_SAME_S = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +56,7 @@ class Node:
     losses: list[Loss] = field(default_factory=list)
     restarts: int = 0
     finished: int = 0  # invocations that are over, well or not
+    free_s: float = 0.0  # end of the newest work outside the queue
 
 
 @dataclass(slots=True, eq=False)
@@ -184,34 +186,46 @@ class Executor:
                 node.process.close(kill=True)
                 node.process = None
 
-    def call(self, name: str, value: Any, stamp_s: float) -> Any:
-        """Have a node work at once, outside the queue; None while it is down, or if it is lost."""
+    def call(
+        self, name: str, value: Any, stamp_s: float, *, again: bool = False
+    ) -> tuple[Any, float] | None:
+        """Have a node work at once, outside the queue and on no core of the platform's.
+
+        Args:
+            again: its newest work anew; else it takes nothing before the end of that.
+
+        Returns:
+            Its output, and the latency after which that takes effect, s; None while the node is
+            still at work or down, or if it is lost.
+        """
         node = self._nodes[name]
-        if node.busy:
+        if node.busy or (stamp_s < node.free_s - _SAME_S and not again):
             node.dropped += 1
             return None
         node.invocations += 1
         node.finished += 1
         self.on_start(name, value, stamp_s)
+        output: Any = None
+        lost: NodeLost | None = None
         try:
-            return _Job(node=node, start_s=stamp_s, input=value).result(self.wall)
+            output = _Job(node=node, start_s=stamp_s, input=value).result(self.wall)
         except NodeLost as loss:
-            node.busy = True
-            gone_s = stamp_s + self.watchdog_s if loss.hung else stamp_s
-            self._note_loss(node, gone_s, loss)
-            self._at(gone_s + self.restart_s, lambda stamp_s: self._revive(node, stamp_s))
-            return None
+            lost = loss
+        latency_s = self.draw_latency_s(name)
+        self._book(name, stamp_s, latency_s)
+        node.free_s = max(node.free_s, stamp_s + latency_s)
+        if lost is None:
+            return output, latency_s
+        node.busy = True
+        gone_s = stamp_s + self.watchdog_s if lost.hung else stamp_s
+        self._note_loss(node, gone_s, lost)
+        self._at(gone_s + self.restart_s, lambda stamp_s: self._revive(node, stamp_s))
+        return None
 
     @property
     def nodes(self) -> dict[str, Node]:
         """All nodes by name, in the order in which they were added."""
         return self._nodes
-
-    def book(self, name: str, start_s: float, latency_s: float) -> None:
-        """Put an invocation into the time table; also one outside the queue, as of `call`."""
-        self._nodes[name].busy_s += latency_s
-        end_s = start_s + latency_s
-        self.timetable.append(Invocation(node=name, start_s=start_s, end_s=end_s))
 
     def submit(self, name: str, value: Any) -> None:
         """Give a node its newest input at the present simulated time; `value` is not None."""
@@ -234,6 +248,12 @@ class Executor:
         while self._uncomputed:
             self._uncomputed.pop(0).begin(self.wall)
 
+    def _book(self, name: str, start_s: float, latency_s: float) -> None:
+        """Put an invocation into the time table."""
+        self._nodes[name].busy_s += latency_s
+        end_s = start_s + latency_s
+        self.timetable.append(Invocation(node=name, start_s=start_s, end_s=end_s))
+
     def _start_if_free(self, node: Node) -> None:
         if node.busy or node.pending is None:
             return
@@ -249,7 +269,7 @@ class Executor:
         if self.compute_first:
             job.begin(self.wall)
         latency_s = self.draw_latency_s(node.name)
-        self.book(node.name, job.start_s, latency_s)
+        self._book(node.name, job.start_s, latency_s)
         self._working += 1
         self._uncomputed.append(job)
         self._jobs[node.name] = job
@@ -268,9 +288,9 @@ class Executor:
             self._lose(job, end_s, loss)
             return
         job.node.busy = False
-        self._working -= 1
-        job.node.publish(output, end_s)
+        job.node.publish(output, end_s)  # its core is still taken: what this starts asks last
         self._start_if_free(job.node)
+        self._working -= 1
         self._start_waiting()
 
     def _start_waiting(self) -> None:

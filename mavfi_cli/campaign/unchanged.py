@@ -1,0 +1,70 @@
+"""What all missions of a campaign fly with: the same versions, the same files of the user's."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.missions import PlannedMission, canonical
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.replay import version_differences
+from mavfi_cli.mission.run import installed_versions
+
+_VERSIONS, _FILES = "versions", "files"  # words of the ledger
+
+
+def require_unchanged(ledger: Ledger) -> None:
+    """Have one campaign flown by one version of everything, with files that stay as they are.
+
+    Raises:
+        ConfigError: it was begun with others; names them.
+    """
+    versions = installed_versions()
+    stored = ledger.meta(_VERSIONS)
+    if stored is None:
+        ledger.set_meta({_VERSIONS: canonical(versions)})
+    elif stored != canonical(versions):
+        differing = version_differences(json.loads(stored), versions)
+        raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
+    changed = [name for name, digest in _noted(ledger).items() if digest != _digest(name)]
+    if changed:
+        raise ConfigError(
+            f"{', '.join(changed)}: not as it was when the campaign was begun; "
+            "another folder starts anew",
+            path=ledger.folder,
+        )
+
+
+def note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
+    """Note what the files hold that missions name, for `require_unchanged`."""
+    noted = _noted(ledger)
+    named = {name for mission in missions for name in _files(mission.config)}
+    new = {name: _digest(name) for name in sorted(named - noted.keys())}
+    if new:
+        ledger.set_meta({_FILES: canonical({**noted, **new})})
+
+
+def _noted(ledger: Ledger) -> dict[str, str]:
+    found: dict[str, str] = json.loads(ledger.meta(_FILES) or "{}")
+    return found
+
+
+def _files(config: MissionConfig) -> Iterator[str]:
+    """The users' files that a mission reads."""
+    for name in (config.world, config.platform, config.vehicle):
+        if name.endswith(".toml"):
+            yield name
+    if config.detector is not None and config.detector.model is not None:
+        yield config.detector.model
+
+
+def _digest(name: str) -> str:
+    """Of a file's bytes; empty where there is none."""
+    try:
+        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
+    except OSError:
+        return ""
