@@ -77,7 +77,7 @@ def test_the_ratio_is_of_missions_that_both_platforms_fly_and_win():
         flight("tx2", 4, 99.0),
     ]  # fmt: skip
     golden = row(figures(PLAN, flights), "ratios", platform="tx2", setting="golden")
-    assert golden["pairs"] == 2
+    assert (golden["pairs"], golden["both_succeed"]) == (2, 1)
     assert golden["quantities"]["flight_time_s"]["count"] == 1
     assert golden["quantities"]["flight_time_s"]["value"] == pytest.approx(2.0)
     assert golden["success"]["only_first"] == 1

@@ -177,6 +177,7 @@ def _ratio(table: _Table, setting: str, first: str, second: str) -> dict[str, An
         "reference": first,
         "setting": setting,
         "pairs": len(pairs),
+        "both_succeed": sum(a.succeeded and b.succeeded for a, b in pairs),
         "success": {**asdict(test), "difference": test.difference},
         "quantities": {each.name: _paired(each, pairs) for each in QUANTITIES},
     }
