@@ -148,7 +148,7 @@ def _ratio_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
         difference = row["success"]["difference"]
         yield [
             setting_title(row["setting"]),
-            f"{row['both_succeed']} of {row['pairs']}",
+            f"{row['both_succeed']}",
             _spread(found["flight_time_s"], digits=3),
             _spread(found["energy_regression_j"], digits=2),
             _spread(found["response_median_s"], digits=2),
