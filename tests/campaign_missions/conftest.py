@@ -24,17 +24,6 @@ def _fake_task_is_importable(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
 
 
-def planned(*worlds, **config):
-    """A mission a world, of seeds 0, 1, 2 ..."""
-    return [
-        PlannedMission(
-            config=MissionConfig(world=world, seed=seed, **config),
-            labels={"kind": world.partition(":")[0]},
-        )
-        for seed, world in enumerate(worlds)
-    ]
-
-
 class Notes(Spectator):
     """Keeps what it is told."""
 

@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import planned
 from killing import results_of
+from plans import planned
 
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
@@ -24,7 +24,7 @@ START_S = 90.0
 RUNNER = """
 import sys
 from pathlib import Path
-from conftest import planned
+from plans import planned
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.run import Options, run_campaign
 

@@ -5,7 +5,6 @@ import signal
 import time
 from functools import partial
 
-from conftest import planned
 from killing import (
     RUNNER,
     WITHOUT_VEHICLES,
@@ -15,6 +14,7 @@ from killing import (
     results_of,
     start_fake,
 )
+from plans import planned
 
 from mavfi_cli.core.processes import MISSION, SLOT
 

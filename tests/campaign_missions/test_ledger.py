@@ -4,7 +4,7 @@ import contextlib
 import sqlite3
 
 import pytest
-from conftest import planned
+from plans import planned
 
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
 from mavfi_cli.campaign.missions import (

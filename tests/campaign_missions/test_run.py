@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from conftest import planned
+from plans import planned
 
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger

@@ -3,9 +3,9 @@
 import random
 
 import pytest
-from conftest import planned
 from hypothesis import given
 from hypothesis import strategies as st
+from plans import planned
 
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.specification.spec import Stop
