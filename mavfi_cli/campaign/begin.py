@@ -46,7 +46,7 @@ def chosen(
         what: a preset, a TOML file, or the folder of a campaign that was begun.
         out: the folder; None: campaigns/NAME, or the one that is named.
         scale: of the repetitions; of a folder, only what it was begun with.
-        changes: factors to replace, as `spec_set.replaced`; the default folder's name has them.
+        changes: factors to replace, as `specification.changes`; the default folder's name has them.
 
     Raises:
         ConfigError: the specification, or the scale, cannot be used; or a preset without `out`
