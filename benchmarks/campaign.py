@@ -25,6 +25,7 @@ from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 
+STACK = "hardened"  # of the figures in docs/campaign.md
 STAGES = ("perception", "planning", "control")
 REQUIRED = {"golden and source level": 1000.0, "instruction level": 700.0}
 OUTSIDE_LIMIT = 0.05
@@ -44,7 +45,7 @@ def source_missions(world: str, count: int, faults: int) -> list[PlannedMission]
     """Golden flights, each with so many faulty ones."""
     found = []
     for seed in range(1, count // (1 + faults) + 1):
-        golden = MissionConfig(world=world, seed=seed)
+        golden = MissionConfig(world=world, seed=seed, stack=STACK)
         found.append(PlannedMission(config=golden))
         for number in range(faults):
             fault = FaultConfig(target=STAGES[(seed + number) % 3], seed=seed)
@@ -57,7 +58,7 @@ def instruction_missions(world: str, count: int) -> list[PlannedMission]:
     return [
         PlannedMission(
             config=MissionConfig(
-                world=world, seed=1 + index // 9,
+                world=world, seed=1 + index // 9, stack=STACK,
                 instruction=InstructionConfig(target=STAGES[index % 3], seed=index),
             )
         )

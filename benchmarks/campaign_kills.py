@@ -30,6 +30,7 @@ repetitions = {repetitions}
 [mission]
 start = [2.0, 2.0, 0.0]
 goal = [20.0, 16.0, 5.0]
+stack = "hardened"
 [factors]
 world = "farm"
 [[setting]]

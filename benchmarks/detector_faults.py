@@ -2,7 +2,8 @@
 
     python benchmarks/detector_faults.py --flights 50 --out detector-faults
 
-Each flight is paired with the same flight, detector and all, without the flip.
+Each flight is paired with the same flight, detector and all, without the flip. All fly the stack
+`hardened`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,10 @@ def main() -> None:
         for world in asked.world:
             for number in range(asked.flights):
                 calm = MissionConfig(
-                    world=world, seed=FIRST_SEED + number, detector=DetectorConfig(name=name)
+                    world=world,
+                    seed=FIRST_SEED + number,
+                    stack="hardened",
+                    detector=DetectorConfig(name=name),
                 )
                 fault = FaultConfig(target=DETECTOR, seed=number + 1)
                 for struck in (False, True):

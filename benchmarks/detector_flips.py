@@ -24,6 +24,9 @@ from mavfi_cli.detect import registry
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.offline import replay
 from mavfi_cli.detect.preprocess import DETECTED, NAMES
+from mavfi_cli.mission.detector_config import DetectorConfig, detector_of
+
+STACK = "hardened"  # that the runs were flown on
 
 WAYPOINT_TICKS = 25
 
@@ -94,7 +97,7 @@ def found(held: list[Run], count: int = 3000) -> None:
     kept: dict[str, np.ndarray] = {}
     for name in registry.names():
         seen = []
-        detector = registry.find(name)
+        detector = detector_of(DetectorConfig(name=name), STACK)
         for strike in struck:
             judged = replay(strike.columns, detector)
             seen.append(
@@ -107,7 +110,9 @@ def found(held: list[Run], count: int = 3000) -> None:
     print(f"{len(held)} flights, {hours:.2f} h\n\n{'false alarms':34}", end="")
     for name in kept:
         alarms = sum(
-            j.alarm is not None for run in held for j in replay(run.columns, registry.find(name))
+            j.alarm is not None
+            for run in held
+            for j in replay(run.columns, detector_of(DetectorConfig(name=name), STACK))
         )
         print(f" {name}: {alarms} ({alarms / hours:.1f}/h)", end="")
     keys = [(strike.state, strike.field, strike.material) for strike in struck]

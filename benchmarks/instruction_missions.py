@@ -7,7 +7,8 @@ the fault and keeps its profile (the first of a mission also keeps its golden fl
 whole commands in turn, the golden mission and the one with the fault. Printed are medians, their
 ratio with the range over the pairs, the same for processor time, and how long the first took.
 Target: at most 1.3 times the wall time. `--null` injects without the flip, so that both fly the
-same flight; else a faulty flight that is longer or shorter shows in the ratio.
+same flight; else a faulty flight that is longer or shorter shows in the ratio. All missions fly the
+stack `hardened`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ def row(node: str, seed: int, given: argparse.Namespace, out: str) -> str:
     """One line of the table."""
     planner = node if node in PLANNERS else "rrtstar"
     plain = ["--world", given.world, "--seed", str(given.seed), "--planner", planner, "--out", out]
+    plain += ["--stack", "hardened"]
     fault = ["--level", "instruction", "--inject", "planner" if node in PLANNERS else node]
     fault += ["--fault-seed", str(seed)] + (["--null-injection"] if given.null else [])
     first = fly(*plain, *fault)

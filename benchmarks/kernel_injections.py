@@ -92,7 +92,7 @@ def main() -> None:
     equal = total = 0
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        path, flight, sha256 = inputs_of_flight(MissionConfig(), folder)
+        path, flight, sha256 = inputs_of_flight(MissionConfig(stack="hardened"), folder)
         for kernel in catalogue.select(options.kernel):
             plan = Plan(
                 kernels=(kernel.name,), runs=options.runs, seed=1, inputs=path,

@@ -124,7 +124,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
-        inputs, _, _ = inputs_of_flight(MissionConfig(), Path(scratch))
+        inputs, _, _ = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))
         for kernel in catalogue.select(options.kernel):
             measure(kernel.name, inputs, options.rounds)
 

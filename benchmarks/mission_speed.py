@@ -2,7 +2,7 @@
 
 Prints the tables of docs/results.md:
 
-    python benchmarks/mission_speed.py [--runs 7] [--world dense] [--seed 3]
+    python benchmarks/mission_speed.py [--runs 7] [--world dense] [--seed 3] [--stack mavbench]
 
 `wait` is one process waiting for the other, and for being woken; the two overlap.
 """
@@ -35,9 +35,11 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--world", default="dense")
     parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--stack", default="mavbench")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as out:
-        line = ["--world", given.world, "--seed", str(given.seed), "--out", out]
+        line = ["--world", given.world, "--seed", str(given.seed)]
+        line += ["--stack", given.stack, "--out", out]
         fly(*line)  # warms the caches
         results = [fly(*line).result for _ in range(given.runs)]
     factors = sorted(r["simulated_s"] / r["host"]["flight_wall_s"] for r in results)
@@ -46,8 +48,8 @@ def main() -> None:
         side: max(r["host"]["memory_mb"][side] for r in results)
         for side in ("companion", "vehicle")
     }
-    print(f"{given.world}, seed {given.seed}: {results[0]['simulated_s']:.1f} simulated seconds, "
-          f"{given.runs} runs")  # fmt: skip
+    print(f"{given.world}, seed {given.seed}, stack {given.stack}: "
+          f"{results[0]['simulated_s']:.1f} simulated seconds, {given.runs} runs")  # fmt: skip
     print(f"times real time: median {statistics.median(factors):.1f} "
           f"({factors[0]:.1f} to {factors[-1]:.1f})")  # fmt: skip
     print(f"start-up to first heartbeat: median {statistics.median(startups):.2f} s")

@@ -2,7 +2,7 @@
 
 Prints the table of docs/results.md:
 
-    python benchmarks/success.py [--seeds 100] [--jobs 2] [--world dense ...]
+    python benchmarks/success.py [--seeds 100] [--jobs 2] [--world dense ...] [--stack mavbench]
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ WORLDS = ("farm", "factory", "sparse", "dense")
 REQUIRED = {"farm": 0.99, "factory": 0.99, "sparse": 0.95, "dense": 0.85}
 
 
-def outcome_of(world: str, seed: int, planner: str, out: str) -> dict[str, Any]:
+def outcome_of(world: str, seed: int, given: argparse.Namespace, out: str) -> dict[str, Any]:
     """The record of one golden mission."""
-    line = ["--world", world, "--seed", str(seed), "--planner", planner, "--out", out]
+    line = ["--world", world, "--seed", str(seed), "--planner", given.planner]
+    line += ["--stack", given.stack, "--out", out]
     return fly(*line).result
 
 
@@ -64,16 +65,18 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("--planner", default="rrtstar")
+    parser.add_argument("--stack", default="mavbench")
     parser.add_argument("--world", action="append", choices=WORLDS)
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.seeds)
-    print(f"Golden missions, seeds {seeds[0]} to {seeds[-1]}, planner {given.planner}\n")
+    print(f"Golden missions, seeds {seeds[0]} to {seeds[-1]}, planner {given.planner}, "
+          f"stack {given.stack}\n")  # fmt: skip
     print("| world | success | Wilson 95 % | required | time | distance | energy | replans "
           "(mean) | failures |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
         for world in given.world or WORLDS:
-            flights = [pool.submit(outcome_of, world, s, given.planner, folder) for s in seeds]
+            flights = [pool.submit(outcome_of, world, s, given, folder) for s in seeds]
             results = [flight.result() for flight in flights]
             print(row(world, results), flush=True)
             lost = [r["config"]["seed"] for r in results if r["outcome"] != "success"]

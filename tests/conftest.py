@@ -21,7 +21,9 @@ from mavfi_cli.mission.run import fly_mission
 
 sys.path.insert(0, str(Path(__file__).parent / "link"))  # the scripted autopilots live there
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
-SHORT = MissionConfig(world="farm", seed=5, start=(2.0, 2.0, 0.0), goal=(10.0, 6.0, 5.0))
+SHORT = MissionConfig(
+    world="farm", seed=5, stack="hardened", start=(2.0, 2.0, 0.0), goal=(10.0, 6.0, 5.0)
+)
 
 
 @pytest.fixture(scope="session")
@@ -57,7 +59,9 @@ def troubled_flight(tmp_path_factory):
         "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
         "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
     )
-    return fly_mission(MissionConfig(world=str(world), seed=2), folder / "runs", Watcher())
+    return fly_mission(
+        MissionConfig(world=str(world), seed=2, stack="hardened"), folder / "runs", Watcher()
+    )
 
 
 @pytest.fixture(scope="session")

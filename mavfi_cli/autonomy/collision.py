@@ -3,24 +3,31 @@
 The vehicle is a sphere. It is placed along the reference that the tracker will follow, densely
 enough that the spheres cover the swept capsule: spheres of radius sqrt(r^2 + (s/2)^2) at spacing s
 contain the capsule of radius r. Unknown space is free, as in the reference.
+
+A check that refuses far waypoints reports one that is not finite or too far away as a collision. A
+check that does not, looks for obstacles in the known map only, as the reference casts its rays:
+towards a far waypoint as far as `REACH_M`, and past one that is not finite.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import fcl
 import numpy as np
+from numpy.typing import NDArray
 
 from mavfi_cli.autonomy.occupancy import MapSnapshot
-from mavfi_cli.autonomy.trajectory import locate
+from mavfi_cli.autonomy.trajectory import locate, reference_waypoint
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory
 
 MAX_SAMPLES = 4096
 MAX_SAMPLES_A_PIECE = 256
 LONGEST_DURATION_S = 60.0
+REACH_M = 150.0  # no map reaches farther from one waypoint to the next
+FASTEST_MPS = 100.0  # a faster waypoint leaves the map within its duration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +41,9 @@ class CollisionParams:
     radius_m: float = 0.9
     spacing_m: float = 0.2
     body_radius_m: float = 0.35  # never shrunk below, even where the vehicle starts in contact
+    refuses_far_waypoints: bool = True
     farthest_m: float = 1000.0  # a waypoint farther than this from the first one is unflyable
+    owns_sequence_numbers: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +62,7 @@ class CollisionInputs:
     snapshot: MapSnapshot
     trajectory: Trajectory | None
     time_s: float  # present point on the trajectory, from its first waypoint
+    front_enu_m: FloatArray | None = None  # (3,) where the path shall begin; None: where it does
 
 
 def step(
@@ -67,10 +77,14 @@ def step(
     """
     time_s = math.inf
     if inputs.trajectory is not None:
-        time_s = time_to_collision(inputs.snapshot, inputs.trajectory, inputs.time_s, params)
+        trajectory = inputs.trajectory
+        if inputs.front_enu_m is not None:
+            trajectory = _shifted(trajectory, inputs.time_s, inputs.front_enu_m)
+        time_s = time_to_collision(inputs.snapshot, trajectory, inputs.time_s, params)
     collision = math.isfinite(time_s)
     seq, on_seq = state.future_collision_seq, None
-    if inputs.trajectory is not None:  # a check that was restarted counts on from the plan's number
+    if inputs.trajectory is not None and not params.owns_sequence_numbers:
+        # A check that was restarted counts on from the plan's number.
         seq = max(seq, inputs.trajectory.future_collision_seq)
     if collision and inputs.trajectory is not None:
         on_seq = inputs.trajectory.trajectory_seq
@@ -92,6 +106,9 @@ def time_to_collision(
 
     Never too late, and early by no more than one or two spacings.
     """
+    farthest_m = params.farthest_m
+    if not params.refuses_far_waypoints:
+        trajectory, farthest_m = _castable(trajectory), math.inf
     points = np.empty((MAX_SAMPLES, 3))
     times_s = np.empty(MAX_SAMPLES)
     count, unflyable_s = sample_ahead(
@@ -99,15 +116,62 @@ def time_to_collision(
         trajectory.durations_s,
         time_s,
         params.spacing_m,
-        params.farthest_m,
+        farthest_m,
         points,
         times_s,
     )
+    if not params.refuses_far_waypoints:
+        unflyable_s = math.inf
     if not snapshot.payload:
         return float(unflyable_s)
     hit = _first_contact(snapshot, points[:count], params)
     # The sphere before was free: contact comes between the two, so not before its time.
     return float(times_s[max(hit - 1, 0)]) if hit is not None else float(unflyable_s)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of corrupted waypoints
+def _shifted(trajectory: Trajectory, time_s: float, front_enu_m: FloatArray) -> Trajectory:
+    """The trajectory moved rigidly until its reference at `time_s` is at the front (3,)."""
+    waypoints = trajectory.waypoints.copy()
+    waypoints[:, 0:3] += front_enu_m - reference_waypoint(trajectory, time_s)[0:3]
+    return replace(trajectory, waypoints=waypoints)
+
+
+def _castable(trajectory: Trajectory) -> Trajectory:
+    """The trajectory without what leaves every map.
+
+    A far waypoint is drawn in along the ray towards it, and a fast one slowed down. One that is
+    not finite is where the one before is, at rest.
+    """
+    waypoints = trajectory.waypoints
+    fine: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(waypoints), axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        far = np.abs(np.diff(waypoints[:, 0:3], axis=0)).max(axis=1, initial=0.0) > REACH_M
+        fast = np.abs(waypoints[:, 4:10]).max(axis=1, initial=0.0) > FASTEST_MPS
+    if fine.all() and not far.any() and not fast.any():
+        return trajectory
+    waypoints = waypoints.copy()
+    for row in range(len(waypoints)):
+        if not fine[row]:
+            waypoints[row, 4:10] = 0.0
+            waypoints[row, 0:4] = waypoints[row - 1, 0:4] if row else np.nan
+            continue
+        if row and np.isfinite(waypoints[row - 1, 0:3]).all():
+            before = waypoints[row - 1, 0:3]
+            waypoints[row, 0:3] = before + _within(waypoints[row, 0:3] - before, REACH_M)
+        waypoints[row, 4:7] = _within(waypoints[row, 4:7], FASTEST_MPS)
+        waypoints[row, 7:10] = _within(waypoints[row, 7:10], FASTEST_MPS)
+    return replace(trajectory, waypoints=waypoints)
+
+
+def _within(vector: FloatArray, limit: float) -> FloatArray:
+    """The vector (3,), no longer than the limit; safe where its square overflows."""
+    largest = float(np.abs(vector).max())
+    if largest <= limit / 2.0:
+        return vector
+    unit = vector / largest
+    norm = float(np.linalg.norm(unit))
+    return vector if largest * norm <= limit else unit * (limit / norm)
 
 
 class SphereProbe:

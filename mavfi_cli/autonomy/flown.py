@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from mavfi_cli.autonomy.trajectory import reference_waypoint, waypoint_index
+from mavfi_cli.autonomy.trajectory import end_of_waypoint, reference_waypoint, waypoint_index
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 SPEED_MIN_MPS = 0.5  # for the ramp: a slower plan's clock changes no faster
@@ -29,6 +29,8 @@ class FlownPlan:
         time_s: point on the trajectory, from its first waypoint.
         rate: trajectory seconds per second, 0..1.
         rate_change_per_s: how fast the rate changes.
+        pace: share of the planned speed that the command in force leaves, 0..1; the clock runs
+            that much slower.
     """
 
     def __init__(self, v_max_mps: float, brake_mps2: float) -> None:
@@ -46,6 +48,7 @@ class FlownPlan:
         self.time_s = time_s
         self.rate = rate
         self.rate_change_per_s = 0.0
+        self.pace = 1.0
 
     def advance(self, step_s: float, target_rate: float) -> None:
         """Run the clock for a step, ramping its rate towards the target."""
@@ -55,7 +58,12 @@ class FlownPlan:
         before = self.rate
         self.rate += change
         self.rate_change_per_s = change / step_s if step_s > 0.0 else 0.0
-        self.time_s += 0.5 * (before + self.rate) * step_s
+        self.time_s += 0.5 * (before + self.rate) * step_s * self.pace
+
+    def skip_waypoint(self) -> None:
+        """Go on with the next waypoint; over where there is none."""
+        if self.trajectory is not None:
+            self.time_s = end_of_waypoint(self.trajectory, self.waypoint)
 
     @property
     def over(self) -> bool:

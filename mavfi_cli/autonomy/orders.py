@@ -11,11 +11,12 @@ from mavfi_cli.core.types import FloatArray, Trajectory
 class Mode(Enum):
     """What the pilot is doing."""
 
+    TURNING = "turning"  # hovering, looking all round before the first plan
     WAITING = "waiting"  # hovering, a plan is wanted
     FLYING = "flying"  # on a trajectory, nothing foreseen on it
     EVADING = "evading"  # on a blocked trajectory, with time to go on while a new one is planned
     SLOWING = "slowing"  # the same, with less time: at reduced speed
-    STOPPING = "stopping"  # no time left: braking, then planning from a hover
+    STOPPING = "stopping"  # braking, then planning from a hover
     ARRIVED = "arrived"
     GAVE_UP = "gave_up"
 

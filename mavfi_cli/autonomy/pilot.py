@@ -4,8 +4,9 @@ It sees only messages: collision reports, planned trajectories, and the vehicle'
 puts out is a directive: which trajectory to track, at which point of it, how fast its clock runs,
 and whether a new plan is wanted.
 
-Slowing down and stopping run the trajectory's own clock slower, so the vehicle stays on the path
-that was checked: see `flown`.
+A vehicle that plans in motion slows down and stops by running the trajectory's own clock slower, so
+it stays on the path that was checked: see `flown`. One that stops on a report drops the trajectory
+and brakes where it is. A vehicle that does not plan in motion comes to rest before it plans.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ import numpy as np
 
 from mavfi_cli.autonomy.flown import FlownPlan
 from mavfi_cli.autonomy.orders import Directive, Mode, PlanFailure, PlanRequest
+from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
+
+TURN_S = 6.0  # one turn all round; the release's takes as long, its two pauses of 1 s included
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +43,22 @@ class PilotParams:
     attempts_max: int = 40  # failed plans in a row before giving up
     retry_s: float = 0.1  # pause after a failed plan
     look_round_after: int = 3  # failed plans in a row before looking all round
+    guards_tracking: bool = True
     tracking_error_max_m: float = 2.0  # farther than this from the reference: stop and plan anew
+    stops_on_report: bool = False  # a foreseen collision ends the plan
+    uses_time_to_collision: bool = True
+    acts_on_report_once: bool = False
+    owns_sequence_numbers: bool = False
+    plans_in_motion: bool = True
+    arrives_at_rest: bool = False
+    turns_before_departure: bool = False
+    rejected_plan_pause_s: float = 0.0
+    slows_where_blind: bool = False
+    sight_rad: float = (
+        math.pi / 4.0
+    )  # farther from its yaw the vehicle does not see; camera: 90 deg
+    rest_mps: float = 0.3  # a slower vehicle is at rest
+    start_error_max_m: float = 10.0  # a plan begins no farther than this from the vehicle
 
 
 @dataclass(slots=True)
@@ -92,6 +111,7 @@ class Pilot:
         self._failures = 0
         self._stamp_s = 0.0
         self._look_started_s: float | None = None
+        self._stop_s = math.inf  # when a report that was acted on stops the vehicle
 
     @np.errstate(over="ignore", invalid="ignore")
     def on_report(self, report: CollisionReport) -> bool:
@@ -106,6 +126,8 @@ class Pilot:
             return False
         if report.future_collision_seq > self._collision_seq:
             self.counters.collisions_foreseen += 1
+        elif self.params.acts_on_report_once:
+            return False
         self._collision_seq = report.future_collision_seq
         if self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.WAITING):
             return False
@@ -123,8 +145,13 @@ class Pilot:
     def _react(self, report: CollisionReport) -> None:
         """Go on, slow down or stop: whichever the time to the collision still allows."""
         p = self.params
-        left_s = report.time_to_collision_s - (self._stamp_s - report.stamp_s)
+        left_s = 0.0
+        if p.uses_time_to_collision:
+            left_s = report.time_to_collision_s - (self._stamp_s - report.stamp_s)
         brake_s = self.flown.stopping_s() + p.margin_s
+        if p.stops_on_report:
+            self._stop_s = self._stamp_s + (left_s - brake_s if left_s > brake_s else 0.0)
+            return
         if not left_s > brake_s:  # a NaN is no time at all
             mode = Mode.STOPPING
         elif left_s <= brake_s + p.plan_lead_s + p.late_plan_s:
@@ -169,15 +196,12 @@ class Pilot:
             self._plan_failed()
             return
         p = self.params
-        stale = (
-            result.trajectory_seq <= self._trajectory_seq
-            or result.future_collision_seq < self._collision_seq
-            or result.stamp_s != self._asked_s
-        )
+        stale = not self._is_new(result) or result.stamp_s != self._asked_s
         late = self.flown.rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
         if stale or late:
             self.counters.plans_ignored += 1
             self._wanted = True
+            self._not_before_s = max(self._not_before_s, self._stamp_s + p.rejected_plan_pause_s)
             if late:
                 self._brake()
             return
@@ -186,6 +210,18 @@ class Pilot:
         self._trajectory_seq = result.trajectory_seq
         self._collision_seq = max(self._collision_seq, result.future_collision_seq)
         self._next = result
+
+    def _is_new(self, plan: Trajectory) -> bool:
+        """Whether a plan's numbers are those of a new plan that knows of the newest collision.
+
+        A pilot that owns its numbers takes a plan's trajectory_seq over before it looks at the
+        other number, as the released follow_trajectory.cpp does.
+        """
+        if not self.params.owns_sequence_numbers:
+            newer = plan.trajectory_seq > self._trajectory_seq
+        elif newer := plan.trajectory_seq >= self._trajectory_seq:
+            self._trajectory_seq = plan.trajectory_seq
+        return newer and plan.future_collision_seq >= self._collision_seq
 
     def expects(self, result: Trajectory | PlanFailure) -> bool:
         """Whether a result answers a request that still stands."""
@@ -228,13 +264,16 @@ class Pilot:
         step_s = stamp_s - self._stamp_s if self._stamp_s else 0.0
         self._stamp_s = stamp_s
         if self._hold is None:
-            self._hold_here(state)
+            self._begin(state)
         if self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
-            self._advance(step_s)
+            if self.mode is Mode.TURNING:
+                self._turn(stamp_s)
+            self._stop_if_due(stamp_s, state)
+            self._advance(step_s, state)
+            self._settle(state)
             self._adopt_next(stamp_s)
             self._guard(state)
-            distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
-            if distance_m <= self.params.goal_tolerance_m:
+            if self._has_arrived(state):
                 self.mode = Mode.ARRIVED
                 self._hold, self._hold_yaw = self.goal_enu_m, state.yaw_rad
                 self.flown.stand()
@@ -251,6 +290,53 @@ class Pilot:
             plan=plan,
         )
 
+    def _begin(self, state: VehicleState) -> None:
+        """The first tick: hover here, and turn round first where that is asked for."""
+        self._hold_here(state)
+        if self.params.turns_before_departure:
+            self.mode = Mode.TURNING
+            self._look_started_s = self._stamp_s
+
+    def _turn(self, stamp_s: float) -> None:
+        """End the turn before departure when it is complete."""
+        assert self._look_started_s is not None
+        if stamp_s - self._look_started_s >= TURN_S:
+            self._look_started_s = None
+            self.mode = Mode.WAITING
+
+    def _has_arrived(self, state: VehicleState) -> bool:
+        distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
+        if not distance_m <= self.params.goal_tolerance_m:
+            return False
+        return not self.params.arrives_at_rest or (
+            self.flown.trajectory is None and self._at_rest(state)
+        )
+
+    def _at_rest(self, state: VehicleState) -> bool:
+        return float(np.linalg.norm(state.velocity_enu_mps)) <= self.params.rest_mps
+
+    def _stop_if_due(self, stamp_s: float, state: VehicleState) -> None:
+        """Drop the trajectory when the stop that a report has asked for is due."""
+        if stamp_s < self._stop_s:
+            return
+        self._stop_s = math.inf
+        if self.flown.trajectory is not None:
+            self.abandon(state)
+
+    def _hover(self, state: VehicleState) -> None:
+        """No trajectory any more: hover here, or where the vehicle has braked."""
+        self._hold_here(state)
+        self.flown.stand()
+        self._next = None
+        self.mode = Mode.WAITING if self.params.plans_in_motion else Mode.STOPPING
+
+    def _settle(self, state: VehicleState) -> None:
+        """While the vehicle brakes without a trajectory, the place to hover moves with it."""
+        if self.mode is Mode.STOPPING and self.flown.trajectory is None:
+            self._hold_here(state)
+            if self._at_rest(state):
+                self.mode = Mode.WAITING
+
     def _adopt_next(self, stamp_s: float) -> None:
         """Switch to the next trajectory once its start has come."""
         if self._next is None or stamp_s < self._next.stamp_s:
@@ -266,36 +352,56 @@ class Pilot:
             rate=min(1.0, self.flown.rate / self._asked_rate) if moving else 1.0,
         )
         self._next = None
+        self._stop_s = math.inf
         self.mode = Mode.FLYING
 
-    def _advance(self, step_s: float) -> None:
+    def _advance(self, step_s: float, state: VehicleState) -> None:
         """Run the trajectory's clock at the rate that the mode asks for; hover where it ends."""
         if self.flown.trajectory is None:
             return
         slower = {Mode.STOPPING: 0.0, Mode.SLOWING: self.params.slow_rate}
-        self.flown.advance(step_s, slower.get(self.mode, 1.0))
+        rate = slower.get(self.mode, 1.0)
+        if self.params.slows_where_blind and self._flies_blind(state):
+            rate = min(rate, self.params.slow_rate)
+        self.flown.advance(step_s, rate)
         stopped = self.mode is Mode.STOPPING and self.flown.rate <= 0.0
-        if stopped or (self.flown.over and self._next is None):
+        if not (stopped or (self.flown.over and self._next is None)):
+            return
+        if self.params.plans_in_motion:
             self._stop_here()
+        else:
+            self.want_plan()
+            self._hover(state)
+
+    def _flies_blind(self, state: VehicleState) -> bool:
+        """Whether the trajectory leads to where the camera does not look."""
+        east, north = self.flown.reference()[4:6]
+        if not math.hypot(east, north) > self.params.rest_mps:
+            return False
+        return abs(wrap_angle(math.atan2(north, east) - state.yaw_rad)) > self.params.sight_rad
 
     def _guard(self, state: VehicleState) -> None:
         """Too far from where the trajectory says it should be: stop and plan from here."""
-        if self.flown.trajectory is None:
+        if self.flown.trajectory is None or not self.params.guards_tracking:
             return
         reference_enu_m = self.flown.reference()[0:3]
         error_m = float(np.linalg.norm(state.position_enu_m - reference_enu_m))
         if not error_m <= self.params.tracking_error_max_m:
             self.abandon(state)
 
+    def control_lost(self, state: VehicleState) -> None:
+        """Control has started anew, without its queue; its counters, if it owns any, are at 0."""
+        if self.params.owns_sequence_numbers:
+            self._trajectory_seq = self._collision_seq = 0
+        if self.flown.trajectory is not None:
+            self.abandon(state)
+
     def abandon(self, state: VehicleState) -> None:
         """Give up the trajectory: hover here, and plan anew from here."""
         if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
             return
-        self._hold_here(state)
-        self.flown.stand()
-        self._next = None
+        self._hover(state)
         self._plan_anew()
-        self.mode = Mode.WAITING
         self.counters.stops += 1
 
     def _stop_here(self) -> None:
@@ -312,7 +418,9 @@ class Pilot:
 
     def _plan_request(self, stamp_s: float, state: VehicleState) -> PlanRequest | None:
         """A request where one is wanted, none is under way, and the pause is over."""
-        idle = self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.STOPPING)
+        idle = self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.STOPPING, Mode.TURNING)
+        if not self.params.plans_in_motion:
+            idle = idle or self.flown.trajectory is not None or not self._at_rest(state)
         if idle or not self._wanted or self._awaiting_plan or stamp_s < self._not_before_s:
             return None
         self._wanted = False
@@ -337,9 +445,12 @@ class Pilot:
         """Stamp, position, velocity and yaw at which the next trajectory takes over."""
         if self.flown.trajectory is None:
             assert self._hold is not None
-            return stamp_s, self._hold.copy(), np.zeros(3), state.yaw_rad
+            start = self._hold if self._near(self._hold, state) else state.position_enu_m
+            return stamp_s, start.copy(), np.zeros(3), state.yaw_rad
         lead_s = self.params.plan_lead_s
         waypoint = self.flown.reference(lead_s)
+        if not self._near(waypoint[0:3], state):
+            return stamp_s + lead_s, state.position_enu_m.copy(), np.zeros(3), state.yaw_rad
         return (
             stamp_s + lead_s,
             waypoint[0:3].copy(),
@@ -347,8 +458,14 @@ class Pilot:
             float(waypoint[3]),
         )
 
+    def _near(self, place_enu_m: FloatArray, state: VehicleState) -> bool:
+        """Whether a place (3,) can be where a plan begins; a corrupted waypoint may be anywhere."""
+        distance_m = float(np.linalg.norm(place_enu_m - state.position_enu_m))
+        return distance_m <= self.params.start_error_max_m
+
     def _look_round_angle(self, stamp_s: float) -> float:
         """Angle of the look round that failed plans have started, rad: one turn in 6 s."""
-        if self._look_started_s is None or self.mode is not Mode.WAITING:
+        if self._look_started_s is None or self.mode not in (Mode.WAITING, Mode.TURNING):
             return 0.0
-        return min(2.0 * math.pi, (stamp_s - self._look_started_s) * 2.0 * math.pi / 6.0)
+        turn_s = stamp_s - self._look_started_s
+        return min(2.0 * math.pi, turn_s * 2.0 * math.pi / TURN_S)

@@ -6,6 +6,13 @@
 The reference is the trajectory's (see `trajectory`), run at `rate`: slowed down by a rate r that
 changes by dr/dt, it has the velocity r v and the acceleration r^2 a + dr/dt v.
 
+A command that the limit clips to a share of its speed has that share as its `pace`, where the
+follower's clock is stretched: then the trajectory's clock runs that much slower while the command
+is in force, so that a waypoint is flown until its distance is flown (the released common.cpp).
+There a waypoint is flown in slices of 10 ms, and a stretched slice is slept through. The release's
+C++ library (ROS Kinetic, GCC 5) hands a slice of 2^63 s or more to nanosleep as a negative number
+of seconds, which nanosleep refuses: such a slice, and with it the waypoint, is over at once.
+
 A corrupted reference: a term that is not finite is left out (the position error, the velocity or
 the acceleration of that axis counts as zero, a yaw as the last one). As position and velocity
 between waypoints depend on acceleration, a NaN there takes the whole axis out. Anything finite is
@@ -23,12 +30,16 @@ from mavfi_cli.autonomy.trajectory import angle_between, reference
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import Command, FloatArray, Trajectory
 
+SLICE_S = 0.01  # of a waypoint, in the released common.cpp
+ENDLESS_S = 2.0**63  # a slice that is stretched so far does not fit into a count of seconds
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingParams:
     """Gains and limits. v_max, a_max and the yaw rate are the reference's (facts, section 4.1)."""
 
     kp_per_s: float = 0.8
+    kp_climb_per_s: float = 0.8
     ki_per_s2: float = 0.05
     kd: float = 0.1
     integral_max_mps: float = 0.5  # limit of the integral term, each axis
@@ -36,6 +47,8 @@ class TrackingParams:
     a_max_mps2: float = 5.0
     yaw_rate_max_radps: float = math.pi / 2.0
     step_max_s: float = 0.1  # longer pauses between calls count as this long
+    stretches_clock: bool = False
+    skips_endless_slices: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,8 +86,11 @@ def step(
     else:
         trajectory = inputs.trajectory
         reference(trajectory.waypoints, trajectory.durations_s, inputs.time_s, target)
-    out = np.empty(10)
-    track(
+    if params.kp_climb_per_s != params.kp_per_s:  # one gain for all axes, so the error is scaled
+        height_m = inputs.position_enu_m[2]
+        share = params.kp_climb_per_s / params.kp_per_s
+        target[2] = height_m + share * (target[2] - height_m)
+    law = (
         target,
         inputs.rate,
         inputs.rate_change_per_s,
@@ -87,18 +103,21 @@ def step(
         params.ki_per_s2,
         params.kd,
         params.integral_max_mps,
-        params.v_max_mps,
-        params.a_max_mps2,
-        params.yaw_rate_max_radps,
-        params.step_max_s,
-        out,
     )
+    limits = (params.a_max_mps2, params.yaw_rate_max_radps, params.step_max_s)
+    out = np.empty(10)
+    track(*law, params.v_max_mps, *limits, out)
+    stretch = 1.0
+    if params.stretches_clock:
+        stretch = max(1.0, demanded_mps(*law, *limits) / params.v_max_mps)
     yaw_rad = float(out[9])
     command = Command(
         stamp_s=inputs.stamp_s,
         velocity_enu_mps=out[0:3].copy(),
         yaw_rad=yaw_rad,
         acceleration_enu_mps2=out[3:6].copy(),
+        pace=1.0 / stretch,
+        skips_waypoint=params.skips_endless_slices and SLICE_S * stretch >= ENDLESS_S,
     )
     return (
         TrackingState(integral_mps=out[6:9].copy(), yaw_rad=yaw_rad, stamp_s=inputs.stamp_s),
@@ -149,6 +168,37 @@ def track(
     turn = finite_or(angle_between(last_yaw, target[3]), 0.0)
     reach = yaw_rate_max * step_s
     out[9] = angle_between(0.0, last_yaw + min(max(turn, -reach), reach))
+
+
+@compiled
+def demanded_mps(
+    target: FloatArray,
+    rate: float,
+    rate_change_per_s: float,
+    position: FloatArray,
+    velocity: FloatArray,
+    integral: FloatArray,
+    last_yaw: float,
+    elapsed_s: float,
+    kp: float,
+    ki: float,
+    kd: float,
+    integral_max: float,
+    a_max: float,
+    yaw_rate_max: float,
+    step_max_s: float,
+) -> float:
+    """Speed that the controller would command without its speed limit, m/s; inf at an overflow."""
+    out = np.empty(10)
+    track(
+        target, rate, rate_change_per_s, position, velocity, integral, last_yaw, elapsed_s,
+        kp, ki, kd, integral_max, math.inf, a_max, yaw_rate_max, step_max_s, out,
+    )  # fmt: skip
+    largest = max(abs(out[0]), abs(out[1]), abs(out[2]))
+    if largest == 0.0:
+        return 0.0
+    x, y, z = out[0] / largest, out[1] / largest, out[2] / largest
+    return float(largest * math.sqrt(x * x + y * y + z * z))
 
 
 @compiled

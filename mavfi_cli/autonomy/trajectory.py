@@ -38,6 +38,12 @@ def waypoint_index(trajectory: Trajectory, time_s: float) -> int:
     return max(0, int(locate(trajectory.durations_s, time_s)[0]))
 
 
+def end_of_waypoint(trajectory: Trajectory, index: int) -> float:
+    """When a waypoint is over, s after the first one begins."""
+    durations_s = trajectory.durations_s[: index + 1]
+    return float(durations_s[durations_s > 0.0].sum())
+
+
 def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
     """The trajectory with one waypoint dropped and its time filled from the next.
 

@@ -67,4 +67,4 @@ def _check_and_track(snapshot: MapSnapshot, trajectory: Trajectory | None) -> No
         hold_yaw_rad=0.0,
     )
     state = tracking.TrackingState(yaw_rad=0.0, stamp_s=0.0)
-    tracking.step(state, tracked, tracking.TrackingParams())
+    tracking.step(state, tracked, tracking.TrackingParams(stretches_clock=True))

@@ -19,14 +19,17 @@ from mavfi_cli.campaign.missions import (
     naming,
 )
 from mavfi_cli.campaign.preflight import ask_vehicle
-from mavfi_cli.campaign.run import store_plan
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options, store_plan
 from mavfi_cli.campaign.specification.changes import replaced
 from mavfi_cli.campaign.specification.difference import differences
 from mavfi_cli.campaign.specification.factors import check_names
+from mavfi_cli.campaign.specification.fixed_world import FixedWorld
 from mavfi_cli.campaign.specification.spec import Spec, load_spec, parse_spec, presets
 from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.campaign.stopping import Gate
 from mavfi_cli.campaign.unchanged import require_unchanged
+from mavfi_cli.campaign.world_search import with_worlds
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.config import MissionConfig
@@ -151,21 +154,40 @@ def stopped(ledger: Ledger) -> list[str]:
     return [label_text(cells[cell]) for cell in sorted(gate.stopped)]
 
 
-def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool = False) -> Ledger:
+def begin(
+    spec: Spec,
+    folder: Path,
+    *,
+    append: bool = False,
+    missing_only: bool = False,
+    options: Options | None = None,
+    spectator: Spectator | None = None,
+) -> Ledger:
     """Open the folder of a campaign for flying, its list stored.
+
+    Args:
+        options, spectator: of the flights by which fixed worlds are found, where there are any.
 
     Raises:
         ConfigError: the folder holds another campaign, or none with `missing_only`.
-        MavfiError: a world, vehicle, planner ... that no mission could be flown with.
+        MavfiError: a world, vehicle, planner ... that no mission could be flown with; no world
+            fits the rule of fixed worlds.
     """
-    if missing_only and not (folder / LEDGER).is_file():
+    begun = (folder / LEDGER).is_file()
+    if missing_only and not begun:
         raise ConfigError("no campaign was begun there", path=folder)
-    text, missions = to_toml(spec), None
-    if not (folder / LEDGER).is_file():
-        missions = flyable(spec)  # before there is a folder
+    if begun:
+        spec = _with_stored_worlds(spec, folder, append=append)
+    missions = None if begun else flyable(spec)  # before there is a folder
+    if spec.fixed_world is not None and (append or not begun):
+        spec = with_worlds(
+            spec, missions or flyable(spec), folder, options or Options(), spectator or Spectator()
+        )
+        missions = flyable(spec)
+    text = to_toml(spec)
     with contextlib.ExitStack() as undo:
         ledger = undo.enter_context(Ledger(folder, writing=True))
-        if missions is None and ledger.meta("spec") == text:  # the list is what it would expand to
+        if begun and ledger.meta("spec") == text:  # the list is what it would expand to
             require_unchanged(ledger)
         else:
             store_plan(
@@ -179,6 +201,35 @@ def begin(spec: Spec, folder: Path, *, append: bool = False, missing_only: bool 
             write_text(ledger.folder / SPEC, text)
         undo.pop_all()
     return ledger
+
+
+def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
+    """The specification with the world seeds that its campaign was begun with.
+
+    Raises:
+        ConfigError: missions are to be appended, and their worlds would follow another rule.
+    """
+    with Ledger(folder) as ledger:
+        told = ledger.meta("spec") is not None
+        there = _stored_spec(ledger).fixed_world if told else None
+    here = spec.fixed_world
+    if append and told and (here and here.rule()) != (there and there.rule()):
+        raise ConfigError(
+            "holds a campaign with another [fixed_world]; another folder starts anew", path=folder
+        )
+    if here is None or there is None or here.rule() != there.rule():
+        return spec
+    known = replace(
+        here,
+        world_seed={**there.world_seed, **here.world_seed},
+        flown={**there.flown, **here.flown},
+    )
+    return replace(spec, fixed_world=known)
+
+
+def fixed_world(ledger: Ledger) -> FixedWorld | None:
+    """The rule of fixed worlds that the campaign follows, with what it has found."""
+    return None if ledger.meta("spec") is None else _stored_spec(ledger).fixed_world
 
 
 def flyable(spec: Spec) -> list[PlannedMission]:
@@ -200,7 +251,7 @@ def _check(missions: list[PlannedMission]) -> None:
     def vehicle(config: MissionConfig) -> None:
         """Have the vehicle process judge a mission's world, vehicle and places, once a kind."""
         simple = replace(golden_of(config), seed=0)
-        key = canonical({**changes_of(simple), "planner": None, "platform": None})
+        key = canonical({**changes_of(simple), "planner": None, "platform": None, "stack": None})
         if key not in asked:
             asked.add(key)
             ask_vehicle(config)

@@ -25,6 +25,7 @@ from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.record.plan_file import read_plans
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.stack import load_stack
 
 WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
 FLIGHTS = 25  # of each world
@@ -89,10 +90,11 @@ def fly_training(
 
     Raises:
         ModelError: no flight can be used.
-        ConfigError: the folder holds the flights of another plan.
+        UnknownName: there is no such stack.
+        ConfigError: the folder holds the flights of another plan; the stack makes no sense.
         RecordError: a file cannot be written.
     """
-    missions = plan.missions()
+    missions, stack = plan.missions(), load_stack(plan.base.stack).mark
     ledger = run_campaign(
         missions, folder / FLIGHTS_FOLDER, replace(options, keep=Keep.ALL), spectator
     )
@@ -109,7 +111,7 @@ def fly_training(
                 flights.append(flight_of(columns, config.world, config.seed, preprocess, plans))
     if not flights:
         raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
-    dataset = Dataset(flights=tuple(flights), preprocess=preprocess)
+    dataset = Dataset(flights=tuple(flights), preprocess=preprocess, stack=stack)
     dataset.save(folder / DATASET)
     return dataset, len(missions) - len(flights)
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
 
@@ -42,7 +41,7 @@ def require_unchanged(ledger: Ledger) -> None:
 def note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
     """Note what the files hold that missions name, for `require_unchanged`."""
     noted = _noted(ledger)
-    named = {name for mission in missions for name in _files(mission.config)}
+    named = {name for mission in missions for name in mission.config.files}
     new = {name: _digest(name) for name in sorted(named - noted.keys())}
     if new:
         ledger.set_meta({_FILES: canonical({**noted, **new})})
@@ -51,15 +50,6 @@ def note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
 def _noted(ledger: Ledger) -> dict[str, str]:
     found: dict[str, str] = json.loads(ledger.meta(_FILES) or "{}")
     return found
-
-
-def _files(config: MissionConfig) -> Iterator[str]:
-    """The users' files that a mission reads."""
-    for name in (config.world, config.platform, config.vehicle):
-        if name.endswith(".toml"):
-            yield name
-    if config.detector is not None and config.detector.model is not None:
-        yield config.detector.model
 
 
 def _digest(name: str) -> str:

@@ -25,6 +25,7 @@ _COMMANDS = {
     "compare": ("mavfi_cli.cli.compare", "The same missions on several computers."),
     "vpm": ("mavfi_cli.cli.vpm", "What DMR and TMR cost in speed, time and energy."),
     "platforms": ("mavfi_cli.cli.platforms", "Compute platforms and their latencies."),
+    "stacks": ("mavfi_cli.cli.stacks", "Stacks: how the companion can be wired."),
     "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),
     "show": ("mavfi_cli.cli.show", "Read a run and say what happened."),
     "doctor": ("mavfi_cli.cli.doctor", "Test this machine: what works here, and why not."),

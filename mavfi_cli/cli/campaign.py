@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _SET = click.option("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
                     help="Replace a factor of the preset or file, as world=dense; repeat it. "
+                         "A value with a comma is quoted, or all are a TOML list. "
                          "The folder's name tells it.")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
 
@@ -24,9 +25,10 @@ _KEEP = ("none", "failures", "sampled", "all")
 def campaign() -> None:
     """Thousands of missions: planned, paired, resumable, counted.
 
-    WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16 speeds), a campaign.toml, or
-    the folder of a campaign that was begun. Presets and files fly into campaigns/NAME, and that
-    is where status, draw and export look for them. A folder with a preset's name is ./NAME.
+    WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16 speeds hardening ablation), a
+    campaign.toml, or the folder of a campaign that was begun. Presets and files fly into
+    campaigns/NAME, and that is where status, draw and export look for them. A folder with a
+    preset's name is ./NAME.
     """
 
 
@@ -68,22 +70,23 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.cli.missions_view import missions_view
 
     spec, folder = chosen(what, options["out"], options["scale"], options["changes"])
+    flying = Options(
+        jobs=options["jobs"] or 0,
+        keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
+        limit_s=options["limit_s"],
+        errors=options["retry_errors"],
+        cluster=options["cluster"],
+        fork=not options["no_fork"],
+        branch=not options["no_branch"],
+    )
     with (
-        begin(
-            spec, folder, append=options["append"], missing_only=options["missing_only"]
-        ) as ledger,
         missions_view(quiet=quiet) as view,
-    ):
+        begin(
+            spec, folder, append=options["append"], missing_only=options["missing_only"],
+            options=flying, spectator=view,
+        ) as ledger,
+    ):  # fmt: skip
         view.on_note(f"{ledger.meta('name')} in {ledger.folder}")
-        flying = Options(
-            jobs=options["jobs"] or 0,
-            keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
-            limit_s=options["limit_s"],
-            errors=options["retry_errors"],
-            cluster=options["cluster"],
-            fork=not options["no_fork"],
-            branch=not options["no_branch"],
-        )
         fly_missing(ledger, flying, view, spec.stop)
         _show(ledger, as_json=as_json)
 
@@ -231,9 +234,11 @@ def _planned(what: str, scale: float | None, changes: Sequence[str]) -> dict[str
     spec = chosen_spec(what, scale, changes)
     missions = flyable(spec)
     cells = Counter(label_text(mission.labels) for mission in missions)
+    rule = spec.fixed_world
     return {
         "name": spec.name,
         "about": spec.about,
+        "fixed_world": None if rule is None else rule.told(),
         "missions": len(missions),
         "pairs": len({mission.pair for mission in missions}),
         "settings": dict(cells),
@@ -257,6 +262,7 @@ def _plan_lines(told: dict[str, Any], options: dict[str, Any]) -> list[str]:
     if "campaign" in told:
         found = told["campaign"]
         lines.append(f"{found['name']}: {found['about']}" if found["about"] else found["name"])
+        lines += [found["fixed_world"]] if found["fixed_world"] else []
         lines += [f"{count:>7}  {labels}" for labels, count in found["settings"].items()]
         pairs = f"{found['pairs']} pair{'s' if found['pairs'] != 1 else ''}"
         lines.append(f"{found['missions']:>7}  missions of {pairs}")
@@ -271,14 +277,19 @@ def _show(
     as_json: bool,
     more: Mapping[str, Any] | None = None,
 ) -> None:
-    from mavfi_cli.campaign.begin import stopped
+    from dataclasses import asdict
+
+    from mavfi_cli.campaign.begin import fixed_world, stopped
     from mavfi_cli.campaign.findings.summary import summarise, table
     from mavfi_cli.core.files import plain
 
     summary = summarise(ledger, by or [], confidence)
-    ended = stopped(ledger)
+    ended, worlds = stopped(ledger), fixed_world(ledger)
     told = {**summary.to_dict(), "stopped": ended}
     lines = [f"{summary.name}: {summary.over} of {summary.missions} missions"]
+    if worlds is not None:
+        told["fixed_world"] = asdict(worlds)
+        lines.append(worlds.told())
     lines += [f"known well enough, so not flown on: {text}" for text in ended]
     lines += table(summary)
     if more is not None:

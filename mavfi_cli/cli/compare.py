@@ -13,6 +13,8 @@ import click
 @click.option("--platform", "platforms", multiple=True, metavar="NAME|FILE",
               help="A computer; repeat it. The others are held against the first  "
                    "[x86, tx2].")  # fmt: skip
+@click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+              help="How the companion is wired; the same on all platforms.")  # fmt: skip
 @click.option("--world", default="sparse", show_default=True, metavar="NAME|FILE",
               help="Where to fly.")  # fmt: skip
 @click.option("--inject", metavar="TARGET,TARGET",
@@ -74,8 +76,8 @@ def _plan(options: dict[str, Any]) -> Any:
     from mavfi_cli.campaign.compare.plan import ComparePlan
     from mavfi_cli.core.errors import ConfigError
 
-    chosen: dict[str, Any] = {name: options[name] for name in ("world", "field", "missions",
-                                                               "first_seed", "seed")}  # fmt: skip
+    names = ("world", "field", "missions", "first_seed", "seed", "stack")
+    chosen: dict[str, Any] = {name: options[name] for name in names}
     if options["platforms"]:
         chosen["platforms"] = options["platforms"]
     if options["inject"] is not None:

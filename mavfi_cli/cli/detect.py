@@ -20,7 +20,7 @@ def detect() -> None:
 @click.option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
 @click.option("--json", "as_json", is_flag=True, help="Print with the whole provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
-    """Detectors, their model files and thresholds, and where they come from."""
+    """Detectors, their model files, stacks and thresholds, and where they come from."""
     from mavfi_cli.campaign.evaluation.listing import listing
 
     rows = listing(models)
@@ -29,7 +29,10 @@ def list_(models: Path | None, as_json: bool) -> None:
         return
     for row in rows:
         threshold = "-" if row["threshold"] is None else f"{row['threshold']:.6g}"
-        click.echo(f"{row['name']:<9} threshold {threshold:<9} {row['model'] or 'no model file'}")
+        stack = f"{row['stack']}: " if row["stack"] else ""
+        click.echo(
+            f"{row['name']:<9} threshold {threshold:<9} {stack}{row['model'] or 'no model file'}"
+        )
         click.echo(f"{'':<9} {row['told']}")
 
 
@@ -59,6 +62,9 @@ def list_(models: Path | None, as_json: bool) -> None:
               help="Bit fields that are struck at the source level; integer: states that have none "
                    "of the others.")  # fmt: skip
 @click.option("--platform", metavar="NAME|FILE", help="The companion computer  [x86].")
+@click.option("--stack", metavar="NAME|FILE",
+              help="How the companion is wired; its shipped models are taken  "
+                   "[mavbench].")  # fmt: skip
 @click.option("--jobs", type=click.IntRange(min=1),
               help="Missions at the same time  [one a core].")  # fmt: skip
 @click.option("--out", type=_FOLDER, default=Path("evaluation"), show_default=True,
@@ -103,7 +109,7 @@ def _plan(options: dict[str, Any]) -> Any:
     from mavfi_cli.campaign.evaluation.plan import DETECTORS, WORLDS, EvaluationPlan
     from mavfi_cli.mission.config import MissionConfig
 
-    base = {} if options["platform"] is None else {"platform": options["platform"]}
+    base = {key: options[key] for key in ("platform", "stack") if options[key] is not None}
     named = options["detectors"]
     return EvaluationPlan(
         worlds=options["worlds"] or WORLDS,

@@ -20,7 +20,7 @@ _FAULT_OPTIONS = (
     "together",
 )  # fmt: skip
 _INSTRUCTION_OPTIONS = ("sampling", "sites", "roles", "compat", "null")
-_DETECTOR_OPTIONS = ("protect", "threshold", "model", "alarms_max")
+_DETECTOR_OPTIONS = ("protect", "threshold", "model", "any_stack", "alarms_max", "watch")
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
@@ -60,12 +60,16 @@ class _Size(click.ParamType[Any]):
 @click.option("--world", default="dense", show_default=True, metavar="NAME|FILE",
               help="A world, or a TOML file of boxes; `mavfi world list` shows them.")  # fmt: skip
 @click.option("--seed", default=3, show_default=True, help="Root seed of everything random.")
+@click.option("--world-seed", type=int, help="Seed of the world alone  [that of --seed].")
 @click.option("--planner", default="rrtstar", show_default=True,
               help="rrtstar, rrt, rrtconnect, or a plug-in's name.")  # fmt: skip
 @click.option("--platform", default="x86", show_default=True,
               metavar="NAME|FILE|measured:FACTOR",
               help="The companion computer whose latencies the flight feels; measured: this "
                    "host's own kernel times, times the factor, with --realtime.")  # fmt: skip
+@click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+              help="How the companion is wired and what it checks; `mavfi stacks` shows "
+                   "them.")  # fmt: skip
 @click.option("--vehicle", default="solo", show_default=True, metavar="NAME|FILE",
               help="solo, spark, or a TOML profile.")  # fmt: skip
 @click.option("--start", type=_Place(),
@@ -79,8 +83,8 @@ class _Size(click.ParamType[Any]):
 @click.option("--v-max", "v_max_mps", default=3.0, show_default=True, help="Speed limit, m/s.")
 @click.option("--a-max", "a_max_mps2", default=5.0, show_default=True,
               help="Acceleration limit, m/s^2.")  # fmt: skip
-@click.option("--tolerance", "goal_tolerance_m", default=1.0, show_default=True,
-              help="How near the goal counts as reached, m.")  # fmt: skip
+@click.option("--tolerance", "goal_tolerance_m", type=float,
+              help="How near the goal counts as reached, m  [the stack's own].")  # fmt: skip
 @click.option("--time-limit", "time_limit_s", default=300.0, show_default=True,
               help="Simulated seconds after take-off.")  # fmt: skip
 @click.option("--camera", type=_Size(), default="64x48", show_default=True,
@@ -93,7 +97,10 @@ class _Size(click.ParamType[Any]):
 @click.option("--inject", metavar="STAGE|STATE|GROUP",
               help="Corrupt a state: perception, planning or control draws one of that stage; "
                    "or name a state or group, as `mavfi states` lists them; or detector, "
-                   "detector.threshold ...: what the detector itself keeps.")  # fmt: skip
+                   "detector.threshold ...: what the detector itself keeps; or process.NODE: the "
+                   "node's process is killed.")  # fmt: skip
+@click.option("--restart", "node_restart_s", default=1.0, show_default=True,
+              help="Time until a node that died works again, s; 3600 is never.")  # fmt: skip
 @click.option("--at", default="random", show_default=True,
               metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
               help="When the fault strikes, counted from the companion's taking over.")  # fmt: skip
@@ -111,9 +118,8 @@ class _Size(click.ParamType[Any]):
               help="Time between the strikes of an intermittent fault, s.")  # fmt: skip
 @click.option("--all-components", "together", is_flag=True,
               help="Strike all states of the group, each with its own bits.")  # fmt: skip
-@click.option(  # by default one that costs time in the README's flight, and is caught there
-    "--fault-seed", default=25, show_default=True, help="Seed of all that is drawn for the fault."
-)
+@click.option("--fault-seed", default=1, show_default=True,
+              help="Seed of all that is drawn for the fault.")  # fmt: skip
 @click.option("--level", type=click.Choice(["source", "instruction"]), default="source",
               show_default=True,
               help="Corrupt a state between kernels, or an operand of one machine instruction of "
@@ -138,7 +144,13 @@ class _Size(click.ParamType[Any]):
               help="Of the detector: alarm above this score; for gad the number of sigmas "
                    "[the model's own].")  # fmt: skip
 @click.option("--model", type=click.Path(exists=True, dir_okay=False),
-              help="A model file of the detector's  [the one that comes with it].")  # fmt: skip
+              help="A model file of the detector's  [the one shipped for the stack].")  # fmt: skip
+@click.option("--any-stack-model", "any_stack", is_flag=True,
+              help="Let the detector fly with a model of another stack; without --model that of "
+                   "the stack which this one is based on.")  # fmt: skip
+@click.option("--watch", default="paper", show_default=True, metavar="paper|extended",
+              help="Which states the detector's gate watches: the paper's 13, or also collision "
+                   "and the sequence numbers of plans.")  # fmt: skip
 @click.option("--alarms-max", default=5, show_default=True,
               help="The alarm in a row of one stage at which the vehicle holds and plans "
                    "anew.")  # fmt: skip
@@ -238,8 +250,7 @@ def _fault(options: dict[str, Any]) -> tuple[FaultConfig | None, InstructionConf
 
 def _detector(options: dict[str, Any]) -> DetectorConfig | None:
     """The detector that is asked for, taken out of the options; says now what is wrong with it."""
-    from mavfi_cli.detect.registry import find
-    from mavfi_cli.mission.detector_config import DetectorConfig
+    from mavfi_cli.mission.detector_config import DetectorConfig, detector_of
 
     name = options.pop("detector")
     asked = {option: options.pop(option) for option in _DETECTOR_OPTIONS}
@@ -248,7 +259,7 @@ def _detector(options: dict[str, Any]) -> DetectorConfig | None:
         return None
     stages = tuple(part.strip() for part in asked.pop("protect").split(",") if part.strip())
     detector = DetectorConfig(name=name, protect=stages, **asked)
-    find(name, model=detector.model_path, threshold=detector.threshold)
+    detector_of(detector, options["stack"])
     return detector
 
 

@@ -61,7 +61,8 @@ def _plan(
     from mavfi_cli.campaign.kernels.runs import Plan
     from mavfi_cli.mission.config import MissionConfig
 
-    config = MissionConfig(world=options["world"], seed=options["world_seed"])
+    # Check, planner and tracker are attacked with the parameters of `hardened`.
+    config = MissionConfig(world=options["world"], seed=options["world_seed"], stack="hardened")
     click.echo(f"inputs: world {config.world}, seed {config.seed}", err=True)
     path, flight, sha256 = inputs_of_flight(config, folder)
     return Plan(

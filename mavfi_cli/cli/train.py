@@ -11,6 +11,8 @@ import click
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
               show_default=True, help="Where flights, data set and models go.")  # fmt: skip
+@click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+              help="What is flown, and what the models are for; see `mavfi stacks`.")  # fmt: skip
 @click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
               help="Where to fly; may be repeated  [the paper's four: two densities, two "
                    "sizes].")  # fmt: skip
@@ -27,6 +29,7 @@ import click
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def train(
     out: Path,
+    stack: str,
     worlds: tuple[str, ...],
     flights: int,
     first_seed: int,
@@ -47,6 +50,7 @@ def train(
     from mavfi_cli.campaign.training import train as run
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.detect.fit import KINDS
+    from mavfi_cli.mission.config import MissionConfig
     from mavfi_cli.report.training_plot import write_loss_curve
 
     plan = TrainingPlan(
@@ -56,6 +60,7 @@ def train(
         seed=seed,
         n_sigma=n_sigma,
         kinds=kinds or KINDS,
+        base=MissionConfig(stack=stack),
     )
     with missions_view(quiet=quiet) as view:
         trained = run(plan, out, Options(jobs=jobs or 0), view, view.on_note)
@@ -68,7 +73,7 @@ def train(
         return
     samples = sum(len(flight.deltas) for flight in trained.dataset.flights)
     click.echo(
-        f"Data set    {len(trained.dataset)} flights, {samples} samples"
+        f"Data set    {len(trained.dataset)} flights of {stack}, {samples} samples"
         + (f"; {trained.failed} flights failed and are left out" if trained.failed else "")
     )
     for kind, (model, path) in trained.models.items():

@@ -21,7 +21,7 @@ class _Positive(click.FloatRange):
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 
-_FLYING = ("worlds", "missions", "first_seed", "models", "train", "jobs", "quiet")
+_FLYING = ("worlds", "stack", "missions", "first_seed", "models", "train", "jobs", "quiet")
 _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
 
 
@@ -52,6 +52,8 @@ _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
                    "flight side by side.")  # fmt: skip
 @click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
               help="With --fly: where; may be repeated  [sparse, dense].")  # fmt: skip
+@click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+              help="With --fly: how the companion is wired.")  # fmt: skip
 @click.option("--missions", type=click.IntRange(1, 100_000), default=10, show_default=True,
               help="With --fly: of each scheme in each world.")  # fmt: skip
 @click.option("--first-seed", type=click.IntRange(0, 2**31 - 200_000), default=1,
@@ -159,6 +161,7 @@ def _flown(
         folder=out,
         models=options["models"],
         train=options["train"],
+        stack=options["stack"],
     )
     with missions_view(quiet=options["quiet"]) as view:
         return fly_and_report(ask, known, Options(jobs=options["jobs"] or 0), view)

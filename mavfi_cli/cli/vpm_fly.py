@@ -19,7 +19,9 @@ from mavfi_cli.campaign.training import TrainingPlan, train
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.detector_config import detector_of
 from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.stack import DEFAULT
 from mavfi_cli.vpm.flight_plan import FlightPlan, flight_plan, of_world, write_files
 from mavfi_cli.vpm.overhead import Overhead, overheads_of
 from mavfi_cli.vpm.report import CHAINS, Choices, report, setting_of
@@ -44,6 +46,7 @@ class Ask:
         models: of the detectors; None takes those that come with them.
         train: flights of each training world to which detectors are fitted for each vehicle; 0
             fits none.
+        stack: of all flights.
     """
 
     vehicles: Sequence[Vehicle]
@@ -54,6 +57,7 @@ class Ask:
     folder: Path
     models: Path | None = None
     train: int = 0
+    stack: str = DEFAULT
 
 
 def fly_and_report(
@@ -94,6 +98,7 @@ def fly_and_report(
         "worlds": list(ask.worlds),
         "missions_each": ask.missions,
         "first_seed": ask.first_seed,
+        "stack": ask.stack,
         "detectors": _models_told(ask),
         **side_by_side(as_flown, plans, flown, paired_ratio, measured),
     }
@@ -119,14 +124,17 @@ def make_plans(
         options, spectator: of the flights to which detectors are fitted, where that is asked for.
 
     Raises:
-        UnknownName, VehicleProcessError: a world or a simulated vehicle that does not exist.
+        UnknownName, VehicleProcessError: a world, a stack or a simulated vehicle that does not
+            exist.
         CannotLift: a vehicle that does not lift one board.
+        ModelError: a detector's model that cannot be used.
     """
     require_distinct(ask.worlds, "world")
     if ask.train:
         _require_held_out(ask)
     for world in ask.worlds:
-        check_names(MissionConfig(world=world, seed=ask.first_seed), ask_vehicle)
+        named = MissionConfig(world=world, seed=ask.first_seed, stack=ask.stack)
+        check_names(named, ask_vehicle)
     platform = ask.choices.platform or load_platform(PLATFORM)
     chain = CHAINS[ask.choices.chain][0]
     chain_s = chain([kernel.latency_s for kernel in platform.kernels.values()])
@@ -139,12 +147,14 @@ def make_plans(
         for scheme in schemes:  # one board without protection comes first
             key = (vehicle.name, scheme.name)
             try:
-                plan = flight_plan(setting, scheme, platform, chain_s, folder, models)
+                plan = flight_plan(setting, scheme, platform, chain_s, folder, models, ask.stack)
             except CannotLift as error:
                 if scheme.name == BARE:
                     raise
                 plans[key] = str(error)
                 continue
+            if plan.mission.detector is not None:
+                detector_of(plan.mission.detector, plan.mission.stack)
             write_files(plan)
             if scheme.copies not in refused:
                 refused[scheme.copies] = _refusal(plan, ask, bare=scheme.name == BARE)

@@ -13,6 +13,7 @@ MavfiError                      one known error, one line, exit code 1
 ├── CannotLift                  a vehicle whose rotors do not lift its compute; with the numbers
 ├── VehicleProcessError         the simulated vehicle could not start or ended early
 ├── ModelError                  a detector's model or data set that cannot be used or made
+│   └── OtherStack              a model of another stack than the mission's
 ├── RecordError                 a run folder that cannot be written or read
 ├── FaultError                  a fault that cannot be described, placed or repeated
 │   ├── FaultSpecError          a fault description that makes no sense
@@ -27,6 +28,7 @@ MavfiError                      one known error, one line, exit code 1
 from __future__ import annotations
 
 import difflib
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -141,6 +143,18 @@ class ModelError(MavfiError):
 
     def __init__(self, problem: str, *, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
+
+
+class OtherStack(ModelError):
+    """A detector's model that was fitted to flights of another stack; says how to get one."""
+
+    def __init__(self, detector: str, *, made_for: str, flown: str, path: Path | None) -> None:
+        super().__init__(
+            f"{detector}: this model is for the stack {made_for!r}, the mission flies {flown!r}; "
+            f"fit one with mavfi train --stack {shlex.quote(flown)} and name it with --model, or "
+            "ask for this one with --any-stack-model, or any_stack = true in a campaign",
+            path=path,
+        )
 
 
 class RecordError(MavfiError):

@@ -101,3 +101,5 @@ class Command:
     velocity_enu_mps: FloatArray  # (3,)
     yaw_rad: float
     acceleration_enu_mps2: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,)
+    pace: float = 1.0  # how fast the trajectory's clock runs while it is in force, 0..1
+    skips_waypoint: bool = False  # the waypoint that it is of is over

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,6 +11,19 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect.preprocess import Codes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StackMark:
+    """The companion's stack, as far as detection knows one: flights of another may look otherwise.
+
+    Attributes:
+        name: what people call it.
+        digest: SHA-256 of its settings; equal digests mean equal stacks.
+    """
+
+    name: str
+    digest: str
 
 
 class Detector(Protocol):

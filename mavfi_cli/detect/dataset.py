@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.detect.base import StackMark
 from mavfi_cli.detect.preprocess import COUNT, NAMES, Codes, PreprocessParams, states_digest
+from mavfi_cli.detect.watch import EXTENDED
 
-SCHEMA = "1"
+SCHEMA = "2"
 _FLAGS = ("reports", "plan_steps", "new_waypoint")
 _META = (b"mavfi_samples", b"mavfi_states", b"mavfi_preprocess")
+_STACK = (b"mavfi_stack", b"mavfi_stack_digest")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +38,7 @@ class Flight:
     plan_steps: NDArray[np.bool_]  # (n,) a step of a plan; what is neither is a control tick
     new_waypoint: NDArray[np.bool_]  # (n,) a control tick with a new sample of planning's states
     deltas: Codes  # (n, COUNT)
+    extended: Codes  # (n, 3) of the extended states; a plan's are in the row of its first step
 
     def of_stage(self, stage: Stage) -> Codes:
         """Deltas (m, COUNT) of the samples that bring something new of a stage."""
@@ -51,6 +55,7 @@ class Dataset:
 
     flights: tuple[Flight, ...]
     preprocess: PreprocessParams
+    stack: StackMark  # of all flights
 
     def __post_init__(self) -> None:
         keys = [(flight.world, flight.seed) for flight in self.flights]
@@ -77,13 +82,16 @@ class Dataset:
         deltas = np.concatenate([np.zeros((0, COUNT), np.int16), *(f.deltas for f in flights)])
         for place, name in enumerate(NAMES):
             columns[name] = pa.array(deltas[:, place], pa.int16())
+        extended = np.concatenate(
+            [np.zeros((0, len(EXTENDED)), np.int16), *(f.extended for f in flights)]
+        )
+        for place, state in enumerate(EXTENDED):
+            columns[state.name] = pa.array(extended[:, place], pa.int16())
+        stack = self.stack.name.encode(), self.stack.digest.encode()
         table = pa.table(columns).replace_schema_metadata(
-            dict(zip(_META, self._signature(), strict=True))
+            dict(zip((*_META, *_STACK), (*_signature(self.preprocess), *stack), strict=True))
         )
         write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
-
-    def _signature(self) -> tuple[bytes, ...]:
-        return SCHEMA.encode(), states_digest().encode(), self.preprocess.digest().encode()
 
     @classmethod
     def load(cls, path: Path, preprocess: PreprocessParams | None = None) -> Dataset:
@@ -100,7 +108,6 @@ class Dataset:
         import pyarrow.parquet as pq
 
         params = preprocess or PreprocessParams()
-        empty = cls(flights=(), preprocess=params)
         try:
             table = pq.read_table(path)
         except (OSError, pa.ArrowException) as error:
@@ -109,11 +116,17 @@ class Dataset:
         found = tuple(metadata.get(key) for key in _META)
         if found[0] is None:
             raise ModelError("is no data set of mavfi", path=path)
-        if found != empty._signature():
+        if found != _signature(params) or not set(_STACK) <= set(metadata):
             raise ModelError(
                 "made for another version, table of states or preprocessing; fly it anew", path=path
             )
-        return cls(flights=tuple(_flights(table)), preprocess=params)
+        name, digest = (metadata[key].decode() for key in _STACK)
+        stack = StackMark(name=name, digest=digest)
+        return cls(flights=tuple(_flights(table)), preprocess=params, stack=stack)
+
+
+def _signature(preprocess: PreprocessParams) -> tuple[bytes, ...]:
+    return SCHEMA.encode(), states_digest().encode(), preprocess.digest().encode()
 
 
 def _line(error: BaseException) -> str:
@@ -133,6 +146,7 @@ def _flights(table: object) -> Iterable[Flight]:
     changed = (worlds[1:] != worlds[:-1]) | (seeds[1:] != seeds[:-1])
     edges = [0, *(np.flatnonzero(changed) + 1).tolist(), rows]
     deltas = np.column_stack([columns[name] for name in NAMES]).astype(np.int16)
+    extended = np.column_stack([columns[state.name] for state in EXTENDED]).astype(np.int16)
     for start, end in itertools.pairwise(edges):
         yield Flight(
             world=str(worlds[start]),
@@ -140,4 +154,5 @@ def _flights(table: object) -> Iterable[Flight]:
             stamps_s=columns["stamp_s"][start:end],
             **{flag: columns[flag][start:end].astype(np.bool_) for flag in _FLAGS},
             deltas=deltas[start:end],
+            extended=extended[start:end],
         )

@@ -28,6 +28,7 @@ from mavfi_cli.detect.model import Model, checked_threshold
 from mavfi_cli.detect.norm import NormDetector
 from mavfi_cli.detect.preprocess import DETECTED, NAMES, Codes
 from mavfi_cli.detect.span import RangeDetector
+from mavfi_cli.detect.watch import ranges_of
 
 FLIGHTS_MIN = 10
 # Whose turn it is, over and over: of ten flights five train, one validates, four set thresholds.
@@ -153,6 +154,8 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     return Model(
         detector=kind,
         arrays=arrays,
+        stack=dataset.stack,
+        extended=ranges_of(np.concatenate([flight.extended for flight in flights])),
         preprocess=dataset.preprocess,
         provenance=_provenance(dataset, parts, seed, detector.threshold, told),
     )

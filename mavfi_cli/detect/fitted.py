@@ -15,6 +15,8 @@ import numpy as np
 
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.base import StackMark
+from mavfi_cli.detect.watch import Ranges
 
 Shapes = dict[str, tuple[int, ...]]
 # (memory, work, waypoints, row, velocity, yaw, keep_report) -> score, and whose it is.
@@ -32,6 +34,8 @@ class FittedDetector:
             single number, is the threshold.
         divisors: pieces besides the threshold of which every number must be above 0.
         scratch: numbers that compiled code wants for itself, after the pieces.
+        stack: that of the flights which the model was fitted to; None without a model file.
+        extended: ranges of the extended states in these flights; None without a model file.
         tick_judge: `preprocess.take_tick`, then score and learn as the gate does, in one call.
         plan_judge: `preprocess.plan_deltas`, and the score of each step that it finds.
     """
@@ -46,6 +50,8 @@ class FittedDetector:
     def __init__(self, arrays: Mapping[str, FloatArray]) -> None:
         pieces = [np.asarray(arrays[name], np.float64).ravel() for name in self.shapes]
         self._flat: FloatArray = np.concatenate([*pieces, np.zeros(self.scratch)])
+        self.stack: StackMark | None = None
+        self.extended: Ranges | None = None
         self._views()
 
     def _views(self) -> None:
@@ -74,17 +80,22 @@ class FittedDetector:
 
     @classmethod
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
-        """The detector of a model file; None takes the shipped one. See `base.Factory`."""
+        """The detector of a model file; None takes that shipped for the default stack.
+
+        See `base.Factory`.
+        """
         path = model_file.shipped(cls.name) if model is None else model
         positive = (next(iter(cls.shapes)), *cls.divisors)
-        detector = cls(model_file.load(path, cls.name, cls.shapes, positive).arrays)
+        loaded = model_file.load(path, cls.name, cls.shapes, positive)
+        detector = cls(loaded.arrays)
+        detector.stack, detector.extended = loaded.stack, loaded.extended
         if threshold is not None:
             detector._flat[0] = model_file.checked_threshold(threshold)
         return detector
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"flat": self._flat}
+        return {"flat": self._flat, "stack": self.stack, "extended": self.extended}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._flat = state["flat"]
+        self._flat, self.stack, self.extended = state["flat"], state["stack"], state["extended"]
         self._views()

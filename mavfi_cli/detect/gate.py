@@ -10,6 +10,9 @@ over all stages sees one vector: of a report on its arrival, and of each tick to
 report that arrived since the tick before. Its alarm always names control (paper, section V-D).
 
 A plan is looked through as a whole, too; an alarm then also names the waypoint to drop.
+
+An extended watch judges further states of reports and plans one by one, before the detector judges
+the message. Its alarm names the stage of the message, whatever the detector.
 """
 
 from __future__ import annotations
@@ -40,6 +43,8 @@ from mavfi_cli.detect.preprocess import (
     take_tick,
     working_array,
 )
+from mavfi_cli.detect.span import MARGIN
+from mavfi_cli.detect.watch import ExtendedWatch, Finding
 
 _NO_WAYPOINTS = np.zeros((0, 10))
 _TICK, _TICK_AND_WAYPOINT = (Stage.CONTROL,), (Stage.PLANNING, Stage.CONTROL)
@@ -56,6 +61,7 @@ class Alarm:
     threshold: float
     states: tuple[str, ...]  # what looks wrong, worst first
     waypoint: int | None = None  # of a plan that was looked through: the one to drop
+    mended: Trajectory | None = None  # of an extended watch: the flown plan as it was accepted
 
 
 class Gate:
@@ -65,6 +71,7 @@ class Gate:
         detector: fresh, for this mission alone: it learns.
         protect: the stages whose states are watched; others are as if they never changed.
         params: how states become deltas; must be those the detector's model was made with.
+        watch: judges the extended states; None: they are not watched.
 
     Attributes:
         fresh: stages of which the last judged message brought a new sample.
@@ -75,8 +82,11 @@ class Gate:
         detector: Detector,
         protect: frozenset[Stage] = ALL_STAGES,
         params: PreprocessParams | None = None,
+        watch: ExtendedWatch | None = None,
     ) -> None:
         self.detector = detector
+        self._watch = watch
+        self._report: CollisionReport | None = None  # judged last
         self.protect = protect
         self.fresh: tuple[Stage, ...] = ()
         self._per_stage = detector.per_stage
@@ -104,7 +114,8 @@ class Gate:
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
         """All that decides, the gate's own part included: a fault in there takes effect."""
-        return {"gate": self._work, **self.detector.memory}
+        own = {"gate": self._work} | ({} if self._watch is None else {"watch": self._watch.memory})
+        return {**own, **self.detector.memory}
 
     def judge_report(self, report: CollisionReport) -> Alarm | None:
         """Perception's message has arrived."""
@@ -114,21 +125,46 @@ class Gate:
         if Stage.PERCEPTION not in self.protect:
             self._deltas[:] = 0
             return None
+        self._report = report
+        if self._watch is not None and (finding := self._watch.judge(report)) is not None:
+            self._watch.lose(CollisionReport)
+            self._reject(Stage.PERCEPTION)
+            return _watch_alarm(finding, Stage.PERCEPTION)
         score, threshold = self.detector.score(self._deltas, Stage.PERCEPTION), self.threshold
         if not score <= threshold:
             self._reject(Stage.PERCEPTION)
+            if self._watch is not None:
+                self._watch.lose(CollisionReport)
             return self._alarm(Stage.PERCEPTION, score, threshold, self._deltas)
         self.detector.learn(self._deltas, Stage.PERCEPTION)
+        if self._watch is not None:
+            self._watch.accept(report)
         self._pending = not self._per_stage
         return None
 
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
-        """A plan was published: all its steps from waypoint to waypoint.
+        """A plan was published: all its steps from waypoint to waypoint, and its extended states.
 
-        For detectors that judge each stage alone; for one over all stages control is what an
-        alarm recomputes, and there is nothing to recompute yet: see `judge_ahead`.
+        The steps are for detectors that judge each stage alone; for one over all stages control is
+        what an alarm recomputes, and there is nothing to recompute yet: see `judge_ahead`.
         """
-        return self.judge_ahead(trajectory, 0) if self._per_stage else None
+        if self._watch is None or Stage.PLANNING not in self.protect:
+            return self._judge_steps(trajectory, 0) if self._per_stage else None
+        finding = self._watch.judge(trajectory)
+        if finding is not None:
+            alarm: Alarm | None = _watch_alarm(finding, Stage.PLANNING)
+        else:
+            alarm = self._judge_steps(trajectory, 0) if self._per_stage else None
+        if alarm is None:
+            self._watch.accept(trajectory)
+        else:
+            self._watch.lose(Trajectory)
+        return alarm
+
+    def lose_plan(self) -> None:
+        """The planner has failed, or its plan comes for nothing: there is nothing to judge."""
+        if self._watch is not None:
+            self._watch.lose(Trajectory)
 
     def judge_ahead(self, trajectory: Trajectory, first: int) -> Alarm | None:
         """Look through the steps of the plan that is flown, from the present waypoint on.
@@ -141,8 +177,17 @@ class Gate:
             first: the waypoint that is followed now.
 
         Returns:
-            The alarm of the first bad step, which names the waypoint to drop.
+            The alarm of the first bad step, which names the waypoint to drop; or that of extended
+            states that are not those of the plan as it was accepted.
         """
+        if self._watch is not None and Stage.PLANNING in self.protect:
+            finding = self._watch.judge_flown(trajectory)
+            if finding is not None:
+                mended = self._watch.mended(trajectory)
+                return _watch_alarm(finding, Stage.PLANNING, mended)
+        return self._judge_steps(trajectory, first)
+
+    def _judge_steps(self, trajectory: Trajectory, first: int) -> Alarm | None:
         if Stage.PLANNING not in self.protect or len(trajectory.waypoints) < 2:
             return None
         rows = len(trajectory.waypoints)
@@ -258,6 +303,13 @@ class Gate:
     def accept_report(self) -> None:
         """The report judged last passes in spite of its alarm: it becomes the reference."""
         self._confirm(Stage.PERCEPTION)
+        if self._watch is not None and self._report is not None:
+            self._watch.accept(self._report)
+
+    def accept_plan(self, trajectory: Trajectory) -> None:
+        """A published plan passes in spite of its alarm."""
+        if self._watch is not None:
+            self._watch.accept(trajectory)
 
     def accept_tick(self) -> None:
         """The waypoint and command judged last pass in spite of an alarm."""
@@ -318,3 +370,14 @@ class Gate:
         alone.sort(key=lambda entry: (-entry[0], entry[1]))
         above = [place for score, place in alone if score > threshold]
         return tuple(NAMES[place] for place in above or [place for _, place in alone])
+
+
+def _watch_alarm(finding: Finding, stage: Stage, mended: Trajectory | None = None) -> Alarm:
+    return Alarm(
+        stage=stage,
+        detector="extended watch",
+        score=finding.distance,
+        threshold=MARGIN,
+        states=finding.states,
+        mended=mended,
+    )

@@ -1,9 +1,9 @@
 """Artefacts: what was fitted, in one JSON file, with where it came from.
 
 A file holds the schema's and mavfi's version, digests of the states table and of the
-preprocessing parameters, the detector's kind, its arrays, and the provenance: worlds, seeds,
-split, versions, threshold, loss curve. It is read strictly: what does not fit is refused in one
-line, and nothing is guessed.
+preprocessing parameters, the stack that was flown, the detector's kind, its arrays, the ranges of
+the extended states, and the provenance: worlds, seeds, split, versions, threshold, loss curve. It
+is read strictly: what does not fit is refused in one line, and nothing is guessed.
 """
 
 from __future__ import annotations
@@ -23,14 +23,17 @@ from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.detect.preprocess import PreprocessParams, states_digest
+from mavfi_cli.detect.base import StackMark
+from mavfi_cli.detect.preprocess import LIMIT, PreprocessParams, states_digest
+from mavfi_cli.detect.watch import EXTENDED, Ranges
 
-SCHEMA = 1
+SCHEMA = 2
 _KEYS = frozenset(
-    {"schema", "mavfi", "states", "preprocess", "preprocess_digest", "detector", "arrays",
-     "provenance"}
+    {"schema", "mavfi", "states", "preprocess", "preprocess_digest", "stack", "detector", "arrays",
+     "extended", "provenance"}
 )  # fmt: skip
-SHIPPED = Path(__file__).parent / "models"
+SHIPPED = Path(__file__).parent / "models"  # a folder a stack
+DEFAULT_STACK = "mavbench"  # whose models are taken where no stack is named
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,14 +42,21 @@ class Model:
 
     detector: str  # kind: gad, aad, range, l2
     arrays: Mapping[str, FloatArray]
+    stack: StackMark  # of the flights it was fitted to
+    extended: Ranges  # what these flights have shown of the extended states
     preprocess: PreprocessParams = field(default_factory=PreprocessParams)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     mavfi: str = field(default_factory=lambda: version("mavfi"))
 
 
-def shipped(detector: str) -> Path:
-    """Where the default model of one of our detectors lies."""
-    return SHIPPED / f"{detector}.json"
+def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
+    """Where the shipped model of one of our detectors for one of `shipped_stacks` lies."""
+    return SHIPPED / stack / f"{detector}.json"
+
+
+def shipped_stacks() -> list[str]:
+    """The stacks that models are shipped for, in alphabetical order."""
+    return sorted(folder.name for folder in SHIPPED.iterdir() if folder.is_dir())
 
 
 def save(path: Path, model: Model) -> None:
@@ -67,8 +77,10 @@ def save(path: Path, model: Model) -> None:
             "states": states_digest(),
             "preprocess": asdict(model.preprocess),
             "preprocess_digest": model.preprocess.digest(),
+            "stack": asdict(model.stack),
             "detector": model.detector,
             "arrays": dict(model.arrays),
+            "extended": {name: list(limits) for name, limits in model.extended.items()},
             "provenance": dict(model.provenance),
         },
     )
@@ -85,16 +97,19 @@ def load(
     Args:
         positive: arrays of which every number must be above 0.
 
+    Returns:
+        The model, whatever its stack: who flies it compares that with the mission's.
+
     Raises:
         ModelError: the file cannot be read or is corrupt; it is of another schema or mavfi
             version, states table, preprocessing or kind; an array is missing, unknown, of another
             shape, not finite, or out of range.
     """
     data = _read(path)
+    _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
     if set(data) != _KEYS:
         odd = sorted(set(data) ^ _KEYS)
         raise ModelError(f"corrupt model file: keys {', '.join(odd)}", path=path)
-    _refuse_other(path, "model schema", data["schema"], SCHEMA)
     _refuse_other(path, "mavfi", data["mavfi"], version("mavfi"))
     _refuse_other(path, "detector", data["detector"], detector)
     if data["states"] != states_digest():
@@ -111,6 +126,8 @@ def load(
     return Model(
         detector=detector,
         arrays=arrays,
+        stack=_stack(path, data["stack"]),
+        extended=_ranges(path, data["extended"]),
         preprocess=preprocess,
         provenance=data["provenance"],
         mavfi=data["mavfi"],
@@ -132,7 +149,8 @@ def provenance(path: Path) -> dict[str, Any]:
     told = data.get("provenance")
     if not isinstance(told, dict):
         raise ModelError("corrupt model file: provenance is no object", path=path)
-    return {"mavfi": data.get("mavfi"), "detector": data.get("detector"), **told}
+    header = {key: data.get(key) for key in ("mavfi", "detector", "stack")}
+    return {**header, **told}
 
 
 def checked_threshold(value: float, key: str = "threshold") -> float:
@@ -169,6 +187,27 @@ def _preprocess(path: Path, data: Mapping[str, Any]) -> PreprocessParams:
     if set(values) != set(asdict(params)):
         raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
     return params
+
+
+def _stack(path: Path, data: object) -> StackMark:
+    if not (
+        isinstance(data, dict)
+        and set(data) == {"name", "digest"}
+        and all(isinstance(value, str) for value in data.values())
+    ):
+        raise ModelError("corrupt model file: stack must be a name and a digest", path=path)
+    return StackMark(**data)
+
+
+def _ranges(path: Path, data: object) -> Ranges:
+    names = [state.name for state in EXTENDED]
+    if not isinstance(data, dict) or set(data) != set(names):
+        raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
+    for name, limits in data.items():
+        whole = isinstance(limits, list) and [type(limit) for limit in limits] == [int, int]
+        if not (whole and -LIMIT <= limits[0] <= 0 <= limits[1] <= LIMIT):
+            raise ModelError(f"corrupt model file: extended: {name} is no range", path=path)
+    return {name: (data[name][0], data[name][1]) for name in names}
 
 
 def _refuse_other(path: Path, what: str, found: object, wanted: object) -> None:

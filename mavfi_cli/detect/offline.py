@@ -33,6 +33,7 @@ from mavfi_cli.detect.preprocess import (
     plan_deltas,
     working_array,
 )
+from mavfi_cli.detect.watch import EXTENDED, changes
 
 Columns = Mapping[str, NDArray[Any]]
 _WAYPOINT = [s.name for s in STATES if s.group.startswith("waypoint_") and s.unit != "s"]
@@ -178,6 +179,12 @@ def flight_of(
     steps = [step for plan in plans for step in plan_steps(plan, params)]
     stamps = [plan.stamp_s for plan in plans for _ in range(len(plan.waypoints) - 1)]
     messages = [False] * len(judged)
+    extended = np.zeros((len(judged) + len(steps), len(EXTENDED)), np.int16)
+    extended[np.flatnonzero([each.report for each in judged])] = changes(_Messages(trace).reports)
+    firsts = np.cumsum([len(judged), *(len(plan.waypoints) - 1 for plan in plans)])[:-1]
+    for first, plan, row in zip(firsts.tolist(), plans, changes(plans), strict=True):
+        if len(plan.waypoints) > 1:
+            extended[first] = row
     return Flight(
         world=world,
         seed=seed,
@@ -188,6 +195,7 @@ def flight_of(
             [each.new_waypoint for each in judged] + [False] * len(steps), np.bool_
         ),
         deltas=np.array([each.deltas for each in judged] + steps, np.int16).reshape(-1, COUNT),
+        extended=extended,
     )
 
 
@@ -265,6 +273,14 @@ class _Messages:
             | ~np.concatenate([[False], self._has_waypoint[:-1]])
         )
         self._trajectory: Trajectory | None = None
+        told = trace.get("collision")  # else a collision is what has a time
+        self._collisions = np.isfinite(self._reports[:, 0]) if told is None else told
+
+    @property
+    def reports(self) -> list[CollisionReport]:
+        """All reports, oldest first."""
+        found = (self.report(row) for row in range(len(self.stamps_s)))
+        return [report for report in found if report is not None]
 
     def report(self, row: int) -> CollisionReport | None:
         """The report that took effect in this tick, if any did."""
@@ -273,7 +289,7 @@ class _Messages:
         time_s, seq = self._reports[row].tolist()
         return CollisionReport(
             stamp_s=self.stamps_s[row],
-            collision=bool(np.isfinite(time_s)),
+            collision=bool(self._collisions[row]),
             time_to_collision_s=time_s,
             future_collision_seq=int(seq),
         )

@@ -75,8 +75,9 @@ def span(stage: Stage) -> tuple[int, int]:
 class PreprocessParams:
     """Exponents that count as zero, by group of states, and the ceiling of the only endless one.
 
-    A floor is about the largest change between two samples of the group in fault-free flight:
-    a waypoint is at most 1.5 m from the next, a command 0.1 m/s from the one 20 ms before.
+    A floor is about the largest change between two samples of the group in fault-free flight: a
+    waypoint is at most 1.5 m from the next, a command 0.1 m/s from the one 20 ms before. A command
+    changes by more only where a plan begins or ends.
     """
 
     time_to_collision_floor: int = 0

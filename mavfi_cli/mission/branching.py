@@ -33,7 +33,7 @@ def can_branch(config: MissionConfig) -> bool:
     """Whether a mission may fly with others up to its fault, or as the one without a fault.
 
     Not with nodes in processes of their own, nor by the wall clock; and a fault in a detector's
-    memory has none to watch.
+    memory, in a process or in control's copy of a plan has no message to watch.
     """
     fault = config.fault
     return (
@@ -41,7 +41,10 @@ def can_branch(config: MissionConfig) -> bool:
         and config.link is None
         and not config.realtime
         and not config.isolate
-        and (fault is None or not fault.attacks_detector)
+        and (
+            fault is None
+            or not (fault.attacks_detector or fault.killed_node or fault.strikes_queue)
+        )
     )
 
 

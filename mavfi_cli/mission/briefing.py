@@ -70,17 +70,21 @@ def of_config(config: MissionConfig) -> Briefing:
     )
 
 
-def require_flyable(briefing: Briefing, config: MissionConfig) -> None:
+def require_flyable(briefing: Briefing, takeoff_height_m: float, tolerance_m: float) -> None:
     """Refuse a goal that is no flight, or none that the planner's maps can hold.
+
+    Args:
+        takeoff_height_m: above the start.
+        tolerance_m: how near the goal counts as reached.
 
     Raises:
         ConfigError: names what is wrong with the goal.
     """
     start, goal = briefing.start_enu_m, briefing.goal_enu_m
-    takeoff = np.add(start, (0.0, 0.0, config.takeoff_height_m))
+    takeoff = np.add(start, (0.0, 0.0, takeoff_height_m))
     problem = ""
-    if float(np.linalg.norm(goal - takeoff)) <= config.goal_tolerance_m:
-        problem = f"is within {config.goal_tolerance_m:g} m of the take-off point"
+    if float(np.linalg.norm(goal - takeoff)) <= tolerance_m:
+        problem = f"is within {tolerance_m:g} m of the take-off point"
     elif not LOWEST_M <= float(goal[2]) <= HIGHEST_M:
         problem = f"is {goal[2]:g} m high; flight levels are {LOWEST_M:g} to {HIGHEST_M:g} m"
     elif float(np.linalg.norm(goal[:2] - start[:2])) > FARTHEST_M:

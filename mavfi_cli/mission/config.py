@@ -12,6 +12,7 @@ from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.platform import measured_factor
+from mavfi_cli.mission.stack import DEFAULT, Stack, load_stack, with_tolerance
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 Vector3 = tuple[float, float, float]
@@ -37,7 +38,10 @@ class MissionConfig:
         world: name of a world, or the path of a TOML file of boxes.
         planner: its name; of our own any spelling is taken, and the one name kept.
         seed: the root seed; world, planner, latency and sensor streams derive from it.
+        stack: how the companion is wired and what it checks.
         start, goal: None leaves the world's own.
+        goal_tolerance_m: None leaves the stack's own.
+        world_seed: of a generated world, and of start and goal in a scene; None is `seed`.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
         realtime: pace the simulated vehicle by the wall clock.
         land: land and disarm after the goal was reached.
@@ -53,13 +57,14 @@ class MissionConfig:
     seed: int = 3
     planner: str = "rrtstar"
     platform: str = "x86"
+    stack: str = DEFAULT
     vehicle: str = "solo"
     start: Vector3 | None = None
     goal: Vector3 | None = None
     takeoff_height_m: float = 5.0
     v_max_mps: float = 3.0
     a_max_mps2: float = 5.0
-    goal_tolerance_m: float = 1.0
+    goal_tolerance_m: float | None = None
     time_limit_s: float = 300.0
     map_resolution_m: float = 0.2
     map_range_m: float = 7.0
@@ -75,11 +80,14 @@ class MissionConfig:
     instruction: InstructionConfig | None = None
     detector: DetectorConfig | None = None
     isolate: tuple[str, ...] = ()
+    world_seed: int | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "planner", canonical(self.planner))
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
+            if value is None:
+                continue
             if not (math.isfinite(value) and low <= value <= high):
                 raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
         for name, place in (("start", self.start), ("goal", self.goal)):
@@ -87,18 +95,24 @@ class MissionConfig:
                 raise ConfigError("must be three finite numbers", key=name)
         if self.fault is not None and self.instruction is not None:
             raise ConfigError("one mission takes one fault", key="instruction")
+        if self.fault is not None:
+            self.fault.check_within(self.time_limit_s)
         self._check_platform()
         for node in self.isolate:
             if node not in ISOLATABLE:
                 raise UnknownName("node", node, ISOLATABLE)
-        if not 0 <= self.seed < 2**31:
-            raise ConfigError(f"must be within 0 and 2^31 - 1, got {self.seed}", key="seed")
+        self._check_seeds()
         for name, size in (
             ("camera_columns", self.camera_columns),
             ("camera_rows", self.camera_rows),
         ):
             if not 4 <= size <= 1024:
                 raise ConfigError(f"must be within 4 and 1024 pixels, got {size}", key=name)
+
+    def _check_seeds(self) -> None:
+        for name, seed in (("seed", self.seed), ("world_seed", self.world_seed)):
+            if seed is not None and not 0 <= seed < 2**31:
+                raise ConfigError(f"must be within 0 and 2^31 - 1, got {seed}", key=name)
 
     def _check_platform(self) -> None:
         if measured_factor(self.platform) is None:
@@ -121,3 +135,21 @@ class MissionConfig:
         values = asdict(self)
         del values["isolate"]
         return values
+
+    @property
+    def seed_of_world(self) -> int:
+        """The seed from which the world is made."""
+        return self.seed if self.world_seed is None else self.world_seed
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """What may be the users' own files, by name: a mission depends on what they hold."""
+        model = None if self.detector is None else self.detector.model
+        stack = self.stack.partition(":")[0]  # a variant's changes are not in the file
+        named = (self.world, self.platform, stack, self.vehicle)
+        return tuple(name for name in named if name.endswith(".toml")) + ((model,) if model else ())
+
+
+def stack_of(config: MissionConfig) -> Stack:
+    """The stack that a mission flies, its goal's tolerance resolved; raises as `load_stack`."""
+    return with_tolerance(load_stack(config.stack), config.goal_tolerance_m)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.pilot import TURN_S
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
@@ -30,7 +31,12 @@ from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.protection import gate_of, protection_of
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.injection import DetectorInjection, Injection, NoInjection
+from mavfi_cli.mission.injection import (
+    DetectorInjection,
+    Injection,
+    NoInjection,
+    ProcessInjection,
+)
 from mavfi_cli.mission.instruction.injection import InstructionInjection
 from mavfi_cli.mission.instruction.plan import Recorder
 from mavfi_cli.mission.instruction.server import Setup
@@ -40,6 +46,7 @@ from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.events import EventLog
 from mavfi_cli.mission.record.trace import Trace
+from mavfi_cli.mission.stack import Stack
 
 SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
 IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing
@@ -56,6 +63,7 @@ class Flight:
     def __init__(
         self,
         config: MissionConfig,
+        stack: Stack,
         transport: Transport,
         platform: PlatformProfile,
         planner: Planner,
@@ -63,6 +71,7 @@ class Flight:
         interrupts: Sequence[int],
     ) -> None:
         self._config = config
+        self._stack = stack
         self._platform = platform
         self._planner = planner
         self._interrupts = interrupts
@@ -112,11 +121,13 @@ class Flight:
 
     def brief(self, briefing: Briefing) -> None:
         """Tell where the goal is and how the camera is mounted; makes the companion ready."""
-        require_flyable(briefing, self._config)
+        require_flyable(briefing, self._config.takeoff_height_m, self._stack.goal_tolerance_m)
         self._briefing = briefing
         fault, shortest_s = self._config.fault, self._shortest_flight_s(briefing)
-        protection = protection_of(self._config.detector, self.wall)
-        if fault is not None and fault.attacks_detector:
+        protection = protection_of(self._config.detector, self._config.stack, self.wall)
+        if fault is not None and fault.killed_node is not None:
+            self.injection = ProcessInjection(fault, shortest_s)
+        elif fault is not None and fault.attacks_detector:
             self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
         elif fault is not None:
             self.injection = Injection(fault, shortest_s)
@@ -124,6 +135,7 @@ class Flight:
             self.injection.prepare(shortest_s)
         self.companion = Companion(
             self._config,
+            self._stack,
             self._platform,
             self._planner,
             briefing,
@@ -139,10 +151,14 @@ class Flight:
         self.companion.executor.on_start = recorder.on_start
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """No flight takes less: straight to the edge of the goal's tolerance at full speed."""
+        """No flight takes less: a turn round where one comes first, then straight to the goal.
+
+        Straight to the edge of the goal's tolerance, at full speed.
+        """
         start = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
         distance_m = float(np.linalg.norm(briefing.goal_enu_m - start))
-        return max(0.0, distance_m - self._config.goal_tolerance_m) / self._config.v_max_mps
+        shortest_s = max(0.0, distance_m - self._stack.goal_tolerance_m) / self._config.v_max_mps
+        return shortest_s + (TURN_S if self._stack.turns_before_departure else 0.0)
 
     @contextlib.contextmanager
     def isolated_nodes(self) -> Iterator[None]:
@@ -150,9 +166,9 @@ class Flight:
         assert self.companion is not None
         executor = self.companion.executor
         try:
-            attacked = self._arm()
+            self._arm()
             for name in self._config.isolate:
-                if name != attacked:
+                if executor.nodes[name].process is None:
                     executor.isolate(name)
             yield
             if not self._interrupts:
@@ -160,17 +176,20 @@ class Flight:
         finally:
             executor.close()
 
-    def _arm(self) -> str | None:
-        """Put the node that an instruction-level fault attacks into its process."""
+    def _arm(self) -> None:
+        """Put the node that a fault attacks into its process."""
         injection = self.injection
-        if not isinstance(injection, InstructionInjection):
-            return None
         assert self.companion is not None
         assert self._briefing is not None
-        executor, name = self.companion.executor, injection.node
-        setup = Setup(config=self._config, briefing=self._briefing, node=name)
-        executor.isolate(name, injection.start(setup, lambda: executor.nodes[name].finished))
-        return name
+        executor = self.companion.executor
+        if isinstance(injection, ProcessInjection):
+            executor.isolate(injection.node)
+            injection.kill = executor.kill
+        elif isinstance(injection, InstructionInjection):
+            name = injection.node
+            setup = Setup(config=self._config, briefing=self._briefing, node=name)
+            process = injection.start(setup, lambda: executor.nodes[name].finished)
+            executor.isolate(name, process)
 
     def fly(self, tlog: Path) -> None:
         """Fly until the mission has an outcome.
@@ -377,6 +396,11 @@ class Flight:
     def goal_enu_m(self) -> FloatArray | None:
         """(3,), m; None before the briefing."""
         return None if self._briefing is None else self._briefing.goal_enu_m
+
+    @property
+    def goal_tolerance_m(self) -> float:
+        """How near the goal counts as reached: the mission's own, or the stack's."""
+        return self._stack.goal_tolerance_m
 
     def own_quality(self) -> quality.QualityOfFlight:
         """Quality of flight as far as the companion itself knows it."""

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
 from mavfi_cli.core.files import write_json
+from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
 from mavfi_cli.detect.gate import Gate
 from mavfi_cli.fi.source.activation import Follower, Reader
 from mavfi_cli.fi.source.fault import SourceFault, Trigger
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
 from mavfi_cli.fi.source.memory import MemoryInjector
-from mavfi_cli.fi.source.schedule import Moment
-from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.fi.source.schedule import Moment, Schedule
+from mavfi_cli.mission.fault_config import PROCESS, FaultConfig
 
 M = TypeVar("M", CollisionReport, Trajectory, Command)
 
@@ -27,9 +29,11 @@ class NoInjection:
 
     Attributes:
         follower: hears who works with which message.
+        in_queue: control's own copy of the plan is struck, not the plan.
     """
 
     follower: Follower | None = None
+    in_queue = False
 
     def watch(self, moment: Moment) -> None:
         """Where the mission stands: said once a control tick, and before every report goes on."""
@@ -43,7 +47,7 @@ class NoInjection:
         return trajectory
 
     def strike_memory(self, moment: Moment) -> None:
-        """Nothing is attacked."""
+        """Nothing that a process keeps is attacked."""
 
     def begin(self, path: Path) -> None:
         """Nothing to record."""
@@ -133,6 +137,7 @@ class Injection(_Recorded):
             listener=self._on_strike,
         )
         self.follower: Follower = Follower()
+        self.in_queue = config.strikes_queue
 
     def watch(self, moment: Moment) -> None:
         """Let the trigger see where the mission stands."""
@@ -231,6 +236,68 @@ class DetectorInjection(_Recorded):
         return asdict(Reader(name="detector", stamp_s=stamp_s, state=self._injector.array))
 
 
+class ProcessInjection(_Recorded):
+    """The process of a node is killed once.
+
+    Args:
+        config: as asked for; its target is `process.NODE`.
+        shortest_flight_s: the time over which a random trigger is drawn.
+
+    Attributes:
+        node: whose process it is.
+        kill: ends the process of a node at a stamp, s; set before the flight.
+    """
+
+    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
+        super().__init__(config)
+        assert config.killed_node is not None
+        self.node = config.killed_node
+        self.kill: Callable[[str, float], None] = lambda _node, _stamp_s: None
+        rng = generator(config.seed, Stream.FAULT, "process")
+        self._drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
+        self._schedule = Schedule(config.trigger(), config.corruption(), self._drawn_time_s)
+
+    def watch(self, moment: Moment) -> None:
+        """Let the trigger see where the mission stands."""
+        self._schedule.watch(moment)
+
+    def _missed(self) -> str:
+        return self._schedule.missed("control tick")
+
+    def strike_memory(self, moment: Moment) -> None:
+        """Kill the process if the moment has come."""
+        if not self._schedule.due(moment):
+            return
+        self._schedule.acted(moment)
+        strike = Strike(
+            stamp_s=moment.stamp_s, tick=moment.tick, phase=moment.phase, invocation=moment.tick,
+            changes=(),
+        )  # fmt: skip
+        self._on_strike(strike)
+        self.kill(self.node, moment.stamp_s)
+
+    def record(self) -> dict[str, Any]:
+        """What was asked for, what was drawn, what was killed."""
+        strike = self._strike
+        reader = None
+        if strike is not None:
+            target = self._config.target
+            reader = asdict(Reader(name=self.node, stamp_s=strike.stamp_s, state=target))
+        return {
+            **super().record(),
+            "stage": PROCESS,
+            "states": [self._config.target],
+            "units": [""],
+            "trigger": trigger_record(self._config.trigger(), self._drawn_time_s),
+            "strikes": [] if strike is None else [asdict(strike)],
+            "strike_count": int(strike is not None),
+            "activation": {
+                "activation": "not_injected" if strike is None else "read",
+                "first_reader": reader,
+            },
+        }
+
+
 def trigger_record(trigger: Trigger, drawn_time_s: float) -> dict[str, Any]:
     """A trigger as plain values."""
     return {
@@ -243,6 +310,8 @@ def trigger_record(trigger: Trigger, drawn_time_s: float) -> dict[str, Any]:
 
 def strike_text(strike: Strike) -> str:
     """What a strike changed, in one line."""
+    if not strike.changes:
+        return "fault: the process is killed"
     changes = [
         f"{c.state}: {_value(c.before)} -> {_value(c.after)} "
         f"(bit{'s' if len(c.bits) != 1 else ''} {', '.join(map(str, c.bits)) or 'none'})"

@@ -26,7 +26,7 @@ from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.branching import Branching
 from mavfi_cli.mission.companion.response import response_times
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction.injection import InstructionInjection, require_possible
 from mavfi_cli.mission.instruction.plan import PlannedFault, Recorder, plan_fault, planned_of
@@ -75,7 +75,7 @@ def fly_mission(
         MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
             or its record could not be written.
     """
-    platform = load_platform(config.platform)
+    platform, stack = load_platform(config.platform), stack_of(config)
     planner = planners.find(config.planner)
     begun_s = time.perf_counter()
     with (
@@ -83,7 +83,7 @@ def fly_mission(
         interruptible() as interrupt,
         other_end(config, vehicles, watcher, patient=branching is not None) as end,
     ):
-        flight = Flight(config, end.transport, platform, planner, watcher, interrupt)
+        flight = Flight(config, stack, end.transport, platform, planner, watcher, interrupt)
         sortie = Sortie(config, out, end, flight, branching, begun_s=begun_s)
         sortie.prepare_to_branch()
         if injection is not None:
@@ -267,7 +267,7 @@ def _write(
         "schema": 1,
         "outcome": flight.outcome.value,
         "reason": flight.reason,
-        "config": config.to_dict(),
+        "config": replace(config, goal_tolerance_m=flight.goal_tolerance_m).to_dict(),
         "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
         "simulated_s": flight.end_s,
         "quality_of_flight": qof.to_dict(),

@@ -121,7 +121,7 @@ class VehicleProcess:
 def _arguments(config: MissionConfig, truth_folder: Path) -> list[str]:
     line = [
         "--lockstep",
-        "--world", config.world, "--seed", str(config.seed), "--vehicle", config.vehicle,
+        "--world", config.world, "--seed", str(config.seed_of_world), "--vehicle", config.vehicle,
         "--camera-size", f"{config.camera_columns}x{config.camera_rows}",
         "--camera-rate", f"{config.camera_rate_hz:g}",
         "--truth", str(truth_folder),

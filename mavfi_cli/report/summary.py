@@ -198,18 +198,18 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
         "foreseen": "once a collision is foreseen",
         "invocation": f"at invocation {trigger['number']:g} of the kernel",
     }[trigger["when"]]
-    request = fault["request"]
-    lines = [
-        f"Fault       {fault['stage']} stage, {', '.join(fault['states'])}: "
-        f"{request['persistence']} {request['effect']}, {when}"
-    ]
+    request, states = fault["request"], ", ".join(fault["states"])
+    what = f"{fault['stage']} stage, {states}: {request['persistence']} {request['effect']}"
+    if fault["stage"] == "process":
+        what = f"{states} is killed"
+    lines = [f"Fault       {what}, {when}"]
     if fault["state"] == "not_injected":
         lines.append(f"            not injected: {fault['reason']}")
     for strike in fault["strikes"][:3]:
         lines += [_change_line(strike["stamp_s"], change) for change in strike["changes"]]
     if fault["strike_count"] > 3:
         lines.append(f"            and {fault['strike_count'] - 3} more strikes")
-    if fault["state"] == "applied":
+    if fault["state"] == "applied" and fault["stage"] != "process":
         lines.append(f"            {_activation(fault)}")
     return lines
 

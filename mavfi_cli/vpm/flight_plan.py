@@ -17,6 +17,7 @@ from mavfi_cli.mission.companion.companion import BRAKE_SHARE
 from mavfi_cli.mission.config import LIMITS, MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.platform import PlatformProfile
+from mavfi_cli.mission.stack import DEFAULT
 from mavfi_cli.vpm.model import safe_velocity_mps
 from mavfi_cli.vpm.overhead import TIMES
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
@@ -31,7 +32,7 @@ NOT_SCALED = (
     "the simulated companion plans with 90 % of the safe velocity, flies round obstacles, stops to "
     "plan, and speeds up and slows down; the model flies straight at one velocity",
     "flights begin at take-off height and end within the goal's tolerance; climbing there is not "
-    "counted, as in the model",
+    "counted, as in the model; a turn before departure, where the stack has one, is counted",
 )
 
 
@@ -66,6 +67,7 @@ def flight_plan(
     chain_s: float,
     folder: Path,
     models: Path | None = None,
+    stack: str = DEFAULT,
 ) -> FlightPlan:
     """The mission that flies a scheme at the model's safe velocity.
 
@@ -74,6 +76,7 @@ def flight_plan(
         chain_s: what the model takes for that platform's response time.
         folder: absolute; for the files.
         models: of model files NAME.json; None takes those that come with the detectors.
+        stack: that the mission flies.
 
     Raises:
         CannotLift: the rotors do not lift so many boards.
@@ -98,6 +101,7 @@ def flight_plan(
         mission=MissionConfig(
             vehicle=str(vehicle[0]),
             platform=str(computer[0]),
+            stack=stack,
             v_max_mps=velocity_mps,
             a_max_mps2=accel_mps2,
             map_range_m=range_m,

@@ -27,7 +27,7 @@ def flight_table(flights: Mapping[str, Any]) -> list[str]:
     lines = [
         "",
         f"Flights in {', '.join(flights['worlds'])}: {flights['missions_each']} missions a scheme "
-        f"and world, seeds from {flights['first_seed']}",
+        f"and world, seeds from {flights['first_seed']}, stack {flights['stack']}",
         "Numbers are of successful flights, (low to high) are 95 % intervals over missions",
         f"Detectors: {flights['detectors']}",
     ]

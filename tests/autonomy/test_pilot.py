@@ -590,3 +590,120 @@ def test_it_never_waits_for_ever_without_asking(plans):
         assert len(driver.requests) > asked or driver.pilot.mode is not Mode.WAITING
         if driver.pilot.mode is not Mode.WAITING:
             return
+
+
+# The paper's stack ---------------------------------------------------------------------------
+
+PAPER = {
+    "guards_tracking": False, "stops_on_report": True, "acts_on_report_once": True,
+    "owns_sequence_numbers": True, "plans_in_motion": False, "arrives_at_rest": True,
+    "goal_tolerance_m": 8.0, "rejected_plan_pause_s": 1.0,
+}  # fmt: skip
+
+
+def moving(x, speed):
+    return replace(state(x), velocity_enu_mps=np.array([speed, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("uses", "waits_s"), [(True, 3.0 - 2.0 / 3.0 - 0.4), (False, 0.0)])
+def test_a_report_stops_the_vehicle_when_braking_has_to_begin_or_at_once(uses, waits_s):
+    driver = Driver(**PAPER, uses_time_to_collision=uses)
+    driver.fly()
+    begun_s = driver.now_s
+    driver.foresee(3.0)
+    driver.foresee(0.1)  # the same number: only the first counts
+    driver.until(lambda d: d.trajectory is None)
+    assert driver.now_s - begun_s == pytest.approx(waits_s, abs=1.5 * TICK_S)
+    assert driver.pilot.counters.stops == 1
+
+
+@pytest.mark.parametrize("time_s", [math.inf, 1e300])
+def test_a_corrupted_time_to_collision_puts_the_stop_off_for_ever(time_s):
+    driver = Driver(**PAPER)
+    driver.fly(count=200)
+    driver.foresee(time_s)
+    driver.tick(200)
+    assert driver.pilot.mode is Mode.FLYING
+    assert driver.foresee(math.nan, seq=2) is Mode.FLYING
+    assert driver.tick().trajectory is None  # a NaN is no time at all
+
+
+def test_it_hovers_where_it_has_braked_and_only_then_plans():
+    driver = Driver(**PAPER)
+    driver.fly()
+    driver.foresee(0.0)
+    driver.tick(at=moving(10.0, 2.0))
+    for x, speed in [(10.4, 1.0), (10.5, 0.4)]:
+        directive = driver.tick(at=moving(x, speed))
+        assert directive.mode is Mode.STOPPING
+        assert directive.hold_enu_m[0] == x
+        assert len(driver.requests) == 1
+    directive = driver.tick(at=moving(10.6, 0.2))
+    assert directive.mode is Mode.WAITING
+    assert driver.requests[-1].position_enu_m[0] == 10.6
+    np.testing.assert_array_equal(driver.requests[-1].velocity_enu_mps, np.zeros(3))
+
+
+def test_a_larger_number_makes_it_reject_what_is_older_at_a_bounded_rate():
+    driver = Driver(**PAPER)
+    driver.tick()
+    driver.pilot.on_plan(straight(driver.requests[-1], count=4, trajectory_seq=2**30))
+    driver.until(lambda d: d.mode is Mode.FLYING)
+    driver.until(lambda d: d.trajectory is None)
+    begun_s = driver.now_s
+    for number in range(2, 8):
+        asked = len(driver.requests)
+        driver.pilot.on_plan(straight(driver.requests[-1], trajectory_seq=number))
+        driver.until(lambda _, n=asked: len(driver.requests) > n)
+    assert driver.pilot.counters.plans_ignored == 6
+    assert driver.now_s - begun_s >= 5.9
+
+
+def test_a_plan_that_knows_of_a_later_collision_makes_it_ignore_reports():
+    driver = Driver(**PAPER)
+    driver.fly(future_collision_seq=1000, count=400)
+    assert driver.foresee(0.0, seq=5) is Mode.FLYING
+    assert driver.tick(20).mode is Mode.FLYING
+    assert driver.pilot.counters.reports_ignored == 1
+
+
+def test_it_has_arrived_only_at_rest_and_only_without_a_plan():
+    driver = Driver(**PAPER)
+    driver.fly(speed=2.0, count=40)  # the trajectory ends at the goal
+    driver.until(lambda d: d.trajectory is None)
+    assert driver.now_s > 20.0
+    assert driver.pilot.mode is Mode.ARRIVED
+
+
+def test_the_turn_before_departure_looks_all_round_and_asks_for_nothing():
+    driver = Driver(**PAPER, turns_before_departure=True)
+    yaws = [driver.tick().hold_yaw_rad for _ in range(299)]
+    assert driver.requests == []
+    assert yaws == sorted(yaws)
+    assert yaws[-1] == pytest.approx(2.0 * math.pi, abs=0.05)
+    driver.tick(3)
+    assert len(driver.requests) == 1
+
+
+@pytest.mark.parametrize("place", [math.nan, math.inf, 1e300, -50.0])
+def test_a_plan_never_begins_at_a_corrupted_waypoint(place):
+    """One that did ended the companion: smoothing takes the ceiling of its duration."""
+    driver = Driver(guards_tracking=False)
+    plan = driver.fly()
+    corrupted = plan.waypoints.copy()
+    corrupted[:, 0] = place
+    driver.pilot.flown.trajectory = replace(plan, waypoints=corrupted)
+    driver.foresee(30.0)
+    driver.tick(at=moving(5.0, 2.0))
+    assert driver.requests[-1].position_enu_m[0] == 5.0
+    np.testing.assert_array_equal(driver.requests[-1].velocity_enu_mps, np.zeros(3))
+
+
+def test_it_slows_down_where_it_does_not_look():
+    for yaw, rate in [(0.0, 1.0), (math.pi / 4.0 + 0.01, 0.5)]:
+        driver = Driver(slows_where_blind=True)
+        driver.fly()
+        for _ in range(100):
+            here = driver.vehicle().position_enu_m
+            driver.tick(at=state(*here, yaw=yaw))
+        assert driver.last.rate == rate

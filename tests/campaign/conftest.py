@@ -36,7 +36,7 @@ def kernel_inputs(tmp_path_factory) -> Path:
         "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
     )
     path = folder / "inputs.pickle"
-    save_inputs(path, record_inputs(MissionConfig(world=str(world), seed=2)))
+    save_inputs(path, record_inputs(MissionConfig(world=str(world), seed=2, stack="hardened")))
     return path
 
 

@@ -45,9 +45,11 @@ def test_usage_errors(mavfi, tmp_path):
 
 
 def test_the_list_names_model_threshold_and_training(mavfi):
-    rows = {row["name"]: row for row in json.loads(mavfi("detect", "list", "--json").stdout)}
-    assert {"gad", "aad", "range", "l2"} <= set(rows)
-    aad = rows["aad"]
+    listed = json.loads(mavfi("detect", "list", "--json").stdout)
+    rows = {(row["name"], row["stack"]): row for row in listed}
+    stacks = ("hardened", "mavbench")
+    assert {(n, s) for n in ("gad", "aad", "range", "l2") for s in stacks} <= set(rows)
+    aad = rows["aad", "mavbench"]
     assert aad["model"] == str(model_file.shipped("aad"))
     assert aad["threshold"] == model_file.provenance(model_file.shipped("aad"))["threshold"]
     text = mavfi("detect", "list").stdout

@@ -19,6 +19,8 @@ from mavfi_cli.core.states import BY_NAME, DType
 from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.model import Model
+from mavfi_cli.detect.watch import EXTENDED
+from mavfi_cli.mission.stack import load_stack
 
 PLAN = EvaluationPlan(
     worlds=("dense", "farm"), detectors=(NONE, "gad"), flights=2, harmless_flights=1,
@@ -31,7 +33,11 @@ def models(tmp_path):
     """A folder with a Gaussian model that was made with seeds 40 and 41."""
     arrays = {name: np.array(value) for name, value in GaussianDetector.cold().memory.items()}
     split = {"train": ["train-0.05-3/40"], "threshold": ["train-0.2-5/41"]}
-    model = Model(detector="gad", arrays=arrays, provenance={"split": split, "flights": 2})
+    model = Model(
+        detector="gad", arrays=arrays, stack=load_stack("mavbench").mark,
+        extended=dict.fromkeys((state.name for state in EXTENDED), (0, 1)),
+        provenance={"split": split, "flights": 2},
+    )  # fmt: skip
     model_file.save(tmp_path / "gad.json", model)
     return tmp_path
 
@@ -123,7 +129,7 @@ def test_a_model_that_is_missing_or_damaged_is_refused(models):
     plan = replace(PLAN, models=models)
     with pytest.raises(ModelError, match="no such model file"):
         require_held_out(replace(plan, detectors=("aad",)))
-    (models / "gad.json").write_text(json.dumps({"schema": 99}))
+    (models / "gad.json").write_text(json.dumps({"schema": 2}))
     with pytest.raises(ModelError, match="corrupt"):
         require_held_out(plan)
 

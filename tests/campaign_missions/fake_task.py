@@ -81,8 +81,13 @@ def record(changes, seed, world, value):
             "flight_time_s": 20.0 + float(rng.normal()),
             "distance_m": 50.0 + float(rng.normal()),
         },
-        "pilot": {"replans": int(rng.integers(5))},
+        "pilot": {"replans": replans(changes, world, int(rng.integers(5)))},
         "simulated_s": 30.0,
         "fault": None,
         "referee": None if world == "untrue" else {},
     }
+
+
+def replans(changes, world, drawn):
+    """In `rising` as often as the world's seed says, in `flat` never; elsewhere as drawn."""
+    return {"rising": changes.get("world_seed", 0), "flat": 0}.get(world, drawn)

@@ -32,7 +32,7 @@ FAULTS = [
     FaultConfig(target="command_vx", at="tick=1", field="exponent"),
     FaultConfig(target="waypoint_x", at="invocation=1", field="sign"),
     FaultConfig(target="time_to_collision", at="phase=flying", persistence="stuck-at"),
-    FaultConfig(target="control", at="time=999"),  # never comes
+    FaultConfig(target="control", at="time=299"),  # never comes
 ]  # fmt: skip
 
 

@@ -147,7 +147,7 @@ def test_a_worker_of_another_version_is_named_and_refused(cluster, tmp_path):
     assert runner.returncode == 1
     last = err.strip().splitlines()[-1]
     assert "worker tcp://127.0.0.1:" in last
-    assert "has other versions: mavfi was 0.1.0, is 0.0.1" in last
+    assert "has other versions: mavfi was 0.2.0, is 0.0.1" in last
 
 
 def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port):

@@ -137,7 +137,7 @@ def test_a_pair_is_drawn(flown, mavfi, tmp_path, chosen, seed):
     place, title, golden, faulty, written_to = run.stdout.splitlines()
     assert place == f"farm, seed {seed}"
     assert title == "fault: field=mantissa site=waypoint_position together=true"
-    assert re.fullmatch(rf"  golden: success, \d\.\d s  {folder}/runs/00000\d-farm-{seed}", golden)
+    assert re.fullmatch(rf"  golden: success, \d+\.\d s  {folder}/runs/00000\d-farm-{seed}", golden)
     assert faulty.startswith("  FI: success, ")
     assert written_to == f"Picture  {picture}"
     ids = {each.get("id") for each in ET.parse(picture).iter("{http://www.w3.org/2000/svg}g")}

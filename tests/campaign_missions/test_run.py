@@ -237,6 +237,16 @@ def test_a_file_that_missions_name_must_not_change_between_them(campaign, tmp_pa
         campaign.run(more, append=True)
 
 
+def test_the_file_of_a_varied_stack_must_not_change_either(campaign, tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text("")
+    missions = planned("fly", stack=f"{mine}:guards_tracking=true")
+    campaign.run(missions).close()
+    mine.write_text("guards_tracking = false")
+    with pytest.raises(ConfigError, match=r"mine\.toml: not as it was"):
+        campaign.run(missions)
+
+
 def test_a_mission_that_is_listed_twice_is_flown_twice(campaign):
     missions = planned("fly") * 2
     for _ in range(2):

@@ -1,5 +1,6 @@
 """Specifications: what they expand to, and what they refuse."""
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.specification.spec import Stop, load_spec, parse_spec, presets
 from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey, UnknownName
+from mavfi_cli.mission.stack import load_stack
 
 
 def spec_of(text):
@@ -112,6 +114,22 @@ def test_detectors_and_what_they_protect():
     assert {m.config.fault for m in protected} == {faulty.config.fault}
 
 
+def test_a_stack_is_a_factor_as_any_other():
+    text = """
+    [factors]
+    stack = ["hardened", "mavbench:guards_tracking=true,tracking_guard_m=3.0"]
+    """
+    first, second = spec_of(text).missions()
+    assert [m.config.stack for m in (first, second)] == [
+        "hardened", "mavbench:guards_tracking=true,tracking_guard_m=3.0",
+    ]  # fmt: skip
+    assert second.labels["stack"] == second.config.stack
+    assert first.pair != second.pair
+    assert len(flyable(spec_of(text))) == 2
+    with pytest.raises(MavfiError, match=r"gards: unknown key; did you mean 'guards_tracking'.*in"):
+        flyable(spec_of(text.replace("guards_tracking", "gards")))
+
+
 def test_a_planner_is_one_setting_however_it_is_written():
     missions = spec_of('[factors]\nplanner = ["RRT*", "rrt-connect"]').missions()
     assert [m.config.planner for m in missions] == ["rrtstar", "rrtconnect"]
@@ -200,6 +218,11 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
         ("stage = 'control'\nsampling = 'cpu-time'", r"sampling: no factor of faults at source"),
         ("stage = 'control'\nlevel = 'instruction'\nat = 'random'", r"at: no factor of faults at"),
         ("stage = 'control'\nbits = ['one']", r"bits: expected int"),
+        ("stage = 'control'\nat = 'time=301'", r"at time=301: 301 s .* beyond the mission's"),
+        (
+            "stage = 'control'\nat = 'tick=600'\ntime_limit_s = [30.0, 11.0]",
+            r"at tick=600: 12 s into the flight lies beyond the mission's time limit of 11 s \(in ",
+        ),
         ("v_max_mps = [99.0]", r"v_max_mps: must be within"),
         ("threshold = 2.0", r"threshold: without a detector"),
         ("detector = 'gad'\nprotect = ['contrl']", r"did you mean 'control'"),
@@ -238,13 +261,46 @@ def test_the_specification_of_the_documents_can_be_flown():
 def test_every_preset_expands_to_its_numbers(name):
     missions = load_spec(name).missions()
     cells = Counter(tuple(sorted(m.labels.items())) for m in missions)
-    assert set(cells.values()) == {{"fig13": 20, "speeds": 50}.get(name, 100)}  # the paper: 100
+    repetitions = {"fig13": 20, "speeds": 50, "ablation": 50}.get(name, 100)  # the paper: 100
+    assert set(cells.values()) == {repetitions}
     sizes = {
         "fig7": 10, "fig8": 9, "fig9": 4, "table3": 4, "table4": 40, "fig13": 5, "fig14": 136,
-        "fig16": 20, "speeds": 21,
+        "fig16": 20, "speeds": 21, "hardening": 84, "ablation": 110,
     }  # fmt: skip
     assert len(cells) == sizes[name]
     assert len(load_spec(name).scaled(0.1).missions()) == len(missions) // 10
+
+
+def test_the_ablation_changes_every_key_in_which_the_stacks_differ_once():
+    paper, ours = load_stack("mavbench").settings, load_stack("hardened").settings
+    ablation = load_spec("ablation")
+    changed = []
+    for text in ablation.axes["stack"][1:]:
+        values = load_stack(text).settings
+        (key, *needed) = re.findall(r"(\w+)=", text)
+        assert {name for name in values if values[name] != paper[name]} == {key, *needed}
+        assert all(values[name] == ours[name] for name in (key, *needed))
+        changed.append(key)
+    assert sorted(changed) == sorted(key for key in paper if paper[key] != ours[key])
+
+
+def test_hardening_has_each_protection_alone_and_all_of_them():
+    (golden, *_) = load_spec("hardening").settings
+    plain, *single, together = map(load_stack, golden.axes["stack"])
+    assert plain.name == "mavbench"
+    protections = [
+        {key for key, value in stack.settings.items() if value != plain.settings[key]}
+        for stack in single
+    ]
+    assert [len(keys) for keys in protections] == [1, 1, 1, 1]
+    assert set.union(*protections) == {
+        key for key, value in together.settings.items() if value != plain.settings[key]
+    }
+
+
+@pytest.mark.parametrize("name", sorted({*presets()} - {"hardening", "ablation"}))
+def test_the_presets_of_the_paper_fly_its_stack(name):
+    assert {m.config.stack for m in load_spec(name).missions()} == {"mavbench"}
 
 
 def test_an_unknown_preset_gets_the_nearest():

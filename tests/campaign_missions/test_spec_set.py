@@ -51,6 +51,15 @@ def test_nothing_to_replace_leaves_the_specification():
         ("land=false", "100.0", "100.0\nland = false"),
         ("start=1.0,2,0.0", "100.0", "100.0\nstart = [1.0, 2, 0.0]"),
         ("start=[1.0, 2, 0.0]", "100.0", "100.0\nstart = [1.0, 2, 0.0]"),
+        ("stack=hardened", "100.0", '100.0\nstack = "hardened"'),
+        ("stack=mavbench:guards_tracking=true", "100.0",
+         '100.0\nstack = "mavbench:guards_tracking=true"'),
+        ('stack="mavbench:a=true,b=1"', "100.0", '100.0\nstack = "mavbench:a=true,b=1"'),
+        ('stack=["a","b:x=true,y=1"]', '"dense"]', '"dense"]\nstack = ["a", "b:x=true,y=1"]'),
+        ('stack=a,"b:x=true,y=1"', '"dense"]', '"dense"]\nstack = ["a", "b:x=true,y=1"]'),
+        ('protect=[["control"], ["planning"]]', 'protect = ["control"]',
+         'protect = [["control"], ["planning"]]'),
+        ("isolate=[[], ['octomap']]", '"dense"]', '"dense"]\nisolate = [[], ["octomap"]]'),
         ("protect=planning,control", 'protect = ["control"]', 'protect = ["planning", "control"]'),
     ],
 )  # fmt: skip
@@ -76,6 +85,14 @@ def test_the_name_tells_the_changes_and_is_a_folders():
     found = changed("world=../my worlds/a.toml,dense", "bits=1,3")
     assert found.name == "mine-world=..-my-worlds-a.toml-dense-bits=1-3"
     assert replaced(load_spec("fig8"), ["world=dense"]).name == "fig8-world=dense"
+    assert changed('stack=["a","b:x=true,y=1"]').name == "mine-stack=-a-b-x=true-y=1"
+
+
+def test_a_long_name_ends_with_a_digest_of_the_changes():
+    long = "stack=mavbench:" + ",".join(f"key_{n}=true" for n in range(30))
+    names = {changed(change).name for change in (long, long.replace("true", "false"))}
+    assert {len(name) for name in names} == {100}
+    assert len(names) == 2
 
 
 @pytest.mark.parametrize(
@@ -87,6 +104,7 @@ def test_the_name_tells_the_changes_and_is_a_folders():
         (("world",), ConfigError, r"set: expected KEY=VALUE\[,VALUE\], got 'world'"),
         (("world=",), ConfigError, r"set: expected KEY=VALUE"),
         (("world=farm,farm",), ConfigError, r"factors.world: a value is listed twice"),
+        (("world=[]",), ConfigError, r"factors.world: an empty list of values"),
         (("bits=1", "bits=3"), ConfigError, r"set: bits is set twice"),
         (("field=sign",), ConfigError,
          r"field: the campaign has no such factor to replace; it has bits, detector, planner, "),

@@ -36,6 +36,7 @@ def refused(command_line, tmp_path, monkeypatch):
         ("--vehicle", "sollo", "vehicle", "solo"),
         ("--platform", "x68", "platform", "x86"),
         ("--platform", "TX2", "platform", "tx2"),
+        ("--stack", "hardend", "stack", "hardened"),
         ("--isolate", "octomapp", "node", "octomap"),
     ],
 )
@@ -67,6 +68,8 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
     [
         (("--v-max", "nan"), "v_max_mps: must be within 0.1 and 12, got nan"),
         (("--a-max", "-1"), "a_max_mps2: must be within 0.5 and 8, got -1"),
+        (("--inject", "control", "--at", "time=99999"), "at time=99999: 99999 s into the"),
+        (("--inject", "control", "--at", "tick=15001"), "at tick=15001: 300.02 s into the flight"),
         (("--height", "0"), "takeoff_height_m: must be within"),
         (("--time-limit", "inf"), "time_limit_s: must be within"),
         (("--seed", "-1"), "seed: must be within 0 and 2^31 - 1, got -1"),
@@ -158,7 +161,7 @@ def test_no_autopilot_at_the_url(refused, free_port, monkeypatch):
     settings = session.SessionSettings
     monkeypatch.setattr(flight, "SessionSettings", lambda **o: settings(connect_timeout_s=0.2, **o))
     url = f"udpin:127.0.0.1:{free_port}"
-    line = refused("--link", url, "--goal", "1,2,3")
+    line = refused("--link", url, "--goal", "20,2,3")
     assert line == f"no autopilot at {url}: no heartbeat within 0.2 s"
 
 
@@ -166,7 +169,7 @@ def test_an_autopilot_that_refuses_to_arm_in_its_own_words(command_line, autopil
     autopilot = FakePX4()
     autopilot.refuse_arming = "Preflight Fail: No valid data from Accel 0\t"
     _, url = autopilot_on_udp(autopilot)
-    code, out, err = command_line("fly", "--link", url, "--goal", "1,2,3", "--quiet")
+    code, out, err = command_line("fly", "--link", url, "--goal", "20,2,3", "--quiet")
     assert (code, out) == (1, "")
     (line,) = err.splitlines()
     assert line.startswith("error: autopilot refused arming: ")

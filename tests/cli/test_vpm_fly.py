@@ -150,8 +150,9 @@ def test_bad_input_of_flights_is_one_line(command_line, tmp_path, lawn, argument
 
 @pytest.mark.parametrize(
     "arguments",
-    [("--missions", "3"), ("--world", "sparse"), ("--train", "2"), ("--quiet",), ("--jobs", "1"),
-     ("--fly", "--missions", "0"), ("--fly", "--models", ".", "--train", "1")],
+    [("--missions", "3"), ("--world", "sparse"), ("--stack", "hardened"), ("--train", "2"),
+     ("--quiet",), ("--jobs", "1"), ("--fly", "--missions", "0"),
+     ("--fly", "--models", ".", "--train", "1")],
 )  # fmt: skip
 def test_usage_of_flights(command_line, arguments):
     code, out, err = command_line("vpm", *arguments)

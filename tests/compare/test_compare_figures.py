@@ -184,6 +184,9 @@ def test_text_and_csv_say_every_number_with_its_unit(whole):
         line
         == "  mavfi fly --world sparse --seed 2 --platform tx2 --inject planning --fault-seed 14"
     )
+    hardened = {**whole, "plan": {**whole["plan"], "stack": "hardened"}}
+    (line,) = [line for line in table(hardened) if "--seed 2 --platform tx2" in line]
+    assert line.endswith("--platform tx2 --stack hardened --inject planning --fault-seed 14")
     rows = list(csv.DictReader(io.StringIO(rows_csv(whole))))
     assert all(r["unit"] in ("s", "m", "J", "count", "1") for r in rows)
     settings = [r for r in rows if r["table"] == "settings"]

@@ -8,6 +8,7 @@ from flown_twice import flight
 
 from mavfi_cli.campaign.compare.fly import plan_told, timeline_seed
 from mavfi_cli.campaign.compare.plan import ComparePlan, titles
+from mavfi_cli.campaign.specification.changes import replaced
 from mavfi_cli.campaign.specification.spec import load_spec
 from mavfi_cli.core.errors import ConfigError
 
@@ -43,6 +44,14 @@ def test_settings_of_one_mission_share_seed_and_fault():
 def test_more_missions_come_at_the_end_of_the_list():
     few, many = (ComparePlan(missions=count).spec().missions() for count in (2, 5))
     assert many[: len(few)] == few
+
+
+def test_a_stack_is_that_of_every_mission_and_of_the_preset_with_it():
+    plan = ComparePlan(stack="hardened")
+    assert {mission.config.stack for mission in plan.spec().missions()} == {"hardened"}
+    preset = replaced(load_spec("fig16"), ["stack=hardened"])
+    assert plan.spec().missions() == preset.missions()
+    assert plan_told(plan)["stack"] == "hardened"
 
 
 def test_one_platform_and_no_faults_is_a_comparison_too():

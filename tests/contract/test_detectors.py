@@ -5,10 +5,12 @@ import pickle
 import numpy as np
 import pytest
 
-from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
+from mavfi_cli.core.errors import ConfigError, ModelError, OtherStack, UnknownName
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import registry
+from mavfi_cli.detect.fitted import FittedDetector
 from mavfi_cli.detect.preprocess import COUNT, DETECTED, LIMIT, NAN_CODE
+from mavfi_cli.mission.detector_config import DetectorConfig, detector_of
 
 every_detector = pytest.mark.parametrize("name", registry.names())
 STAGES = list(Stage)
@@ -159,6 +161,8 @@ def test_pickles_with_what_it_has_learned(name):
     run(detector, samples())
     twin = pickle.loads(pickle.dumps(detector))
     assert run(twin, samples(seed=5)) == run(detector, samples(seed=5))
+    if isinstance(detector, FittedDetector):
+        assert (twin.stack, twin.extended) == (detector.stack, detector.extended)
     for array in twin.memory.values():  # the twin's memory is its own, and is what it decides by
         array[...] = np.nan if array.dtype.kind == "f" else 0
     assert np.isfinite(detector.threshold)
@@ -177,6 +181,35 @@ def test_the_threshold_can_be_given_within_bounds(name):
 def test_a_model_that_is_not_there_is_an_error(name, tmp_path):
     with pytest.raises(ModelError, match=r"none\.json: "):
         registry.find(name, model=tmp_path / "none.json")
+
+
+@every_detector
+def test_a_mission_takes_the_model_of_its_stack_or_needs_none(name):
+    for stack in ("mavbench", "hardened"):
+        detector = detector_of(DetectorConfig(name=name), stack)
+        if isinstance(detector, FittedDetector):
+            assert detector.stack.name == stack
+
+
+@every_detector
+def test_no_model_flies_a_stack_that_it_was_not_fitted_to_unless_that_is_asked_for(name):
+    asked = DetectorConfig(name=name, any_stack=True)
+    assert detector_of(asked, "mavbench-release").name == name
+    if isinstance(registry.find(name), FittedDetector):
+        with pytest.raises(OtherStack, match="mavfi train --stack mavbench-release"):
+            detector_of(DetectorConfig(name=name), "mavbench-release")
+    else:
+        assert detector_of(DetectorConfig(name=name), "mavbench-release").name == name
+
+
+@every_detector
+def test_extended_states_need_the_ranges_of_a_model(name):
+    config = DetectorConfig(name=name, watch="extended")
+    if isinstance(registry.find(name), FittedDetector):
+        assert detector_of(config, "mavbench").name == name
+    else:
+        with pytest.raises(ConfigError, match=f"needs the ranges of a model, and {name} has none"):
+            detector_of(config, "mavbench")
 
 
 def test_an_unknown_name_names_the_nearest():

@@ -3,7 +3,11 @@
 import numpy as np
 
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
+from mavfi_cli.detect.base import StackMark
 from mavfi_cli.detect.preprocess import NAMES
+
+STACK = StackMark(name="some", digest="5" * 64)
+RANGES = {"collision": (-1, 1), "plan_trajectory_seq": (0, 1), "plan_future_collision_seq": (0, 2)}
 
 
 def report(time_s=np.inf, seq=0):

@@ -2,7 +2,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from detect_builders import plan, trace
+from detect_builders import STACK, plan, trace
 
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Stage
@@ -16,7 +16,7 @@ def dataset(count=3, params=None):
     flights = tuple(
         flight_of(trace(4.0, seed), "w", seed, params, [plan(12)] * seed) for seed in range(count)
     )
-    return Dataset(flights=flights, preprocess=params)
+    return Dataset(flights=flights, preprocess=params, stack=STACK)
 
 
 def test_what_is_saved_is_loaded_and_equal_sets_give_equal_bytes(tmp_path):
@@ -24,9 +24,10 @@ def test_what_is_saved_is_loaded_and_equal_sets_give_equal_bytes(tmp_path):
     made.save(tmp_path / "a.parquet")
     loaded = Dataset.load(tmp_path / "a.parquet")
     assert len(loaded) == 3
+    assert loaded.stack == STACK
     for one, other in zip(made.flights, loaded.flights, strict=True):
         assert (one.world, one.seed) == (other.world, other.seed)
-        for name in ("stamps_s", "reports", "plan_steps", "new_waypoint", "deltas"):
+        for name in ("stamps_s", "reports", "plan_steps", "new_waypoint", "deltas", "extended"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
             assert getattr(one, name).dtype == getattr(other, name).dtype
     loaded.save(tmp_path / "b.parquet")
@@ -34,7 +35,7 @@ def test_what_is_saved_is_loaded_and_equal_sets_give_equal_bytes(tmp_path):
 
 
 def test_an_empty_set_can_be_kept(tmp_path):
-    Dataset(flights=(), preprocess=PreprocessParams()).save(tmp_path / "none.parquet")
+    Dataset(flights=(), preprocess=PreprocessParams(), stack=STACK).save(tmp_path / "none.parquet")
     assert len(Dataset.load(tmp_path / "none.parquet")) == 0
 
 
@@ -48,7 +49,7 @@ def test_samples_of_a_stage_are_those_that_bring_something_new():
 def test_a_flight_can_be_in_a_set_only_once():
     (flight,) = dataset(1).flights
     with pytest.raises(ModelError, match="once only"):
-        Dataset(flights=(flight, flight), preprocess=PreprocessParams())
+        Dataset(flights=(flight, flight), preprocess=PreprocessParams(), stack=STACK)
 
 
 def test_what_is_no_data_set_is_refused(tmp_path):

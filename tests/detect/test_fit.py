@@ -2,12 +2,14 @@ import sys
 
 import numpy as np
 import pytest
+from detect_builders import STACK
 
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import fit, model, registry, train_autoencoder
 from mavfi_cli.detect.dataset import Dataset, Flight
 from mavfi_cli.detect.preprocess import COUNT, NAMES, PreprocessParams
+from mavfi_cli.detect.watch import EXTENDED
 
 
 def flight(world, seed, rows=120):
@@ -29,13 +31,14 @@ def flight(world, seed, rows=120):
         new_waypoint=new,
         deltas=deltas,
         plan_steps=np.zeros(rows, bool),
+        extended=np.repeat([[seed % 3, 0, -(seed % 4)]], rows, axis=0).astype(np.int16),
     )
 
 
 @pytest.fixture(scope="module")
 def dataset():
     flights = tuple(flight(f"w{seed % 2}", seed) for seed in range(20))
-    return Dataset(flights=flights, preprocess=PreprocessParams())
+    return Dataset(flights=flights, preprocess=PreprocessParams(), stack=STACK)
 
 
 @pytest.fixture
@@ -60,7 +63,7 @@ def test_the_split_is_by_flight_alike_in_each_world_and_drawn(dataset):
 
 
 def test_too_few_flights_are_refused(dataset):
-    few = Dataset(flights=dataset.flights[:9], preprocess=dataset.preprocess)
+    few = Dataset(flights=dataset.flights[:9], preprocess=dataset.preprocess, stack=STACK)
     for kind in fit.KINDS:
         with pytest.raises(ModelError, match="9 flights are too few to fit to: 10 at least"):
             fit.fit(kind, few)
@@ -110,6 +113,14 @@ def test_range_holds_all_flights_and_their_mirror_images(dataset):
         assert fitted.arrays["highest"][place] == -fitted.arrays["lowest"][place] == widest
 
 
+@pytest.mark.parametrize("kind", ["gad", "range", "l2"])
+def test_a_model_tells_its_stack_and_what_all_flights_showed_of_the_extended_states(dataset, kind):
+    fitted = fit.fit(kind, dataset)
+    assert fitted.stack == STACK
+    assert list(fitted.extended.values()) == [(0, 2), (0, 0), (-3, 0)]
+    assert list(fitted.extended) == [state.name for state in EXTENDED]
+
+
 def test_mirror_images():
     row = np.zeros((1, COUNT), np.int16)
     place = NAMES.index
@@ -131,6 +142,7 @@ def test_components_of_a_vector_share_their_scale(dataset):
     changed = Flight(
         world="w", seed=99, stamps_s=one.stamps_s, reports=one.reports,
         plan_steps=one.plan_steps, new_waypoint=one.new_waypoint, deltas=deltas,
+        extended=one.extended,
     )  # fmt: skip
     assert fit.scale_of([changed]).tolist() == [1, 2, 1, 1, 1, 1, 1, 1, 1, 4, 4, 4, 1]
 

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from detect_builders import RANGES, STACK
 
 from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.detect import model, registry
@@ -17,7 +18,8 @@ OURS = ["gad", "aad", "range", "l2"]
 def path(tmp_path):
     arrays = {name: np.array(array) for name, array in GaussianDetector.cold(6.0).memory.items()}
     arrays["mean"][3] = 1 / 3
-    model.save(tmp_path / "gad.json", Model(detector="gad", arrays=arrays, provenance={"a": 1}))
+    made = Model(detector="gad", arrays=arrays, stack=STACK, extended=RANGES, provenance={"a": 1})
+    model.save(tmp_path / "gad.json", made)
     return tmp_path / "gad.json"
 
 
@@ -35,6 +37,7 @@ def test_what_is_saved_is_loaded_exactly(path):
     loaded = model.load(path, "gad", SHAPES)
     assert loaded.arrays["mean"][3] == 1 / 3
     assert loaded.provenance == {"a": 1}
+    assert (loaded.stack, loaded.extended) == (STACK, RANGES)
     assert model.preprocessing(path) == PreprocessParams()
     again = path.with_name("again.json")
     model.save(again, loaded)
@@ -44,8 +47,17 @@ def test_what_is_saved_is_loaded_exactly(path):
 @pytest.mark.parametrize(
     ("values", "problem"),
     [
-        ({"schema": 2}, "made for model schema 2, this is 1"),
-        ({"mavfi": "0.0.1"}, "made for mavfi '0.0.1', this is '"),
+        ({"schema": 1}, "made for model schema 1, this is 2"),
+        ({"mavfi": "0.1.0"}, "made for mavfi '0.1.0', this is '"),
+        ({"stack": "mavbench"}, "stack must be a name and a digest"),
+        ({"stack": {"name": "mavbench"}}, "stack must be a name and a digest"),
+        ({"stack": {"name": "mavbench", "digest": 1}}, "stack must be a name and a digest"),
+        ({"stack": None}, "corrupt model file: keys stack"),
+        ({"extended": {}}, "extended must be collision, plan_trajectory_seq, plan_future"),
+        ({"extended": {**RANGES, "collision": [0]}}, "extended: collision is no range"),
+        ({"extended": {**RANGES, "collision": [1, 2]}}, "extended: collision is no range"),
+        ({"extended": {**RANGES, "collision": [0, 0.5]}}, "extended: collision is no range"),
+        ({"extended": {**RANGES, "collision": [0, 40000]}}, "extended: collision is no range"),
         ({"detector": "aad"}, "made for detector 'aad', this is 'gad'"),
         ({"states": "0" * 64}, "made for another table of states"),
         ({"preprocess_digest": "0" * 64}, "made with another preprocessing"),
@@ -126,14 +138,29 @@ def test_thresholds_out_of_range(value):
         model.checked_threshold(value, "n sigma")
 
 
+def test_a_model_of_version_0_1_is_refused_by_its_schema(path):
+    changed(path, schema=1, mavfi="0.1.0", stack=None, extended=None)
+    with pytest.raises(ModelError, match="made for model schema 1, this is 2"):
+        model.load(path, "gad", SHAPES)
+
+
+def test_models_are_shipped_for_these_stacks():
+    assert model.shipped_stacks() == ["hardened", "mavbench"]
+    for name in OURS:
+        assert registry.find(name).stack.name == model.DEFAULT_STACK
+
+
+@pytest.mark.parametrize("stack", model.shipped_stacks())
 @pytest.mark.parametrize("name", OURS)
-def test_the_shipped_models_tell_where_they_come_from(name):
-    path = model.shipped(name)
-    shapes = type(registry.find(name)).shapes
-    loaded = model.load(path, name, shapes)
+def test_the_shipped_models_tell_where_they_come_from(name, stack):
+    path = model.shipped(name, stack)
+    detector = registry.find(name, model=path)
+    loaded = model.load(path, name, type(detector).shapes)
+    assert loaded.stack.name == stack
+    assert (detector.stack, detector.extended) == (loaded.stack, loaded.extended)
     assert model.preprocessing(path) == PreprocessParams()
     told = loaded.provenance
     assert told["worlds"] == ["train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5"]
     parts = [set(told["split"][part]) for part in ("train", "validation", "threshold")]
     assert sum(len(part) for part in parts) == len(set.union(*parts)) == told["flights"] >= 100
-    assert told["threshold"] == registry.find(name).threshold
+    assert told["threshold"] == detector.threshold

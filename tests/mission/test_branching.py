@@ -17,7 +17,7 @@ FAULTS = [
     FaultConfig(target="command_vx", at="tick=3", seed=1),
     FaultConfig(target="command_vy", at="tick=3", seed=2),
     FaultConfig(target="command_yaw", at="tick=5", seed=3),
-    FaultConfig(target="command_vz", at="time=1000", seed=4),
+    FaultConfig(target="command_vz", at="time=299", seed=4),
 ]
 
 

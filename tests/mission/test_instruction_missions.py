@@ -209,7 +209,8 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
     config = load_run(attacked.path).result["config"]
     place = [f"--{n}={','.join(map(str, config[n]))}" for n in ("start", "goal")]
     fault = ["--level", "instruction", "--inject", "control", "--fault-seed", "2"]
-    done = without_perf("fly", "--world", "farm", "--seed", "5", *place, *fault, "--json")
+    where = ["--world", "farm", "--seed", "5", "--stack", "hardened"]
+    done = without_perf("fly", *where, *place, *fault, "--json")
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "runs").glob("farm-5-*")
     assert flown(load_run(folder).folder) == flown(attacked)

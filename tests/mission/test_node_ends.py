@@ -199,3 +199,44 @@ def test_settling_waits_for_work_whose_output_is_not_due_yet(tmp_path):
         assert done.exists()
     finally:
         executor.close()
+
+
+def test_nodes_that_share_a_process_take_turns_and_end_together(executor):
+    published = []
+    for name in ("map", "check", "plan"):
+
+        def publish(value, stamp_s, name=name):
+            published.append((name, value, round(stamp_s, 9)))
+
+        executor.add(name, dying, publish)
+    executor.share_process(("map", "check", "plan"))
+    executor.isolate("check")
+    for value, name in enumerate(("plan", "map", "check", "map")):
+        executor.submit(name, value)
+    executor.advance(1.0)
+    # After the planner comes the map again, as in a loop over the three.
+    assert published == [("plan", 0, 0.1), ("map", 3, 0.2), ("check", 2, 0.3)]
+    executor.submit("check", "die")
+    executor.submit("plan", "waits")
+    executor.advance(1.5)
+    executor.submit("map", "while down")
+    executor.advance(5.0)
+    assert published[3:] == [("map", "while down", 2.2)]
+    assert [node.restarts for node in executor.nodes.values()] == [1, 1, 1]
+    assert [loss.node for loss in executor.losses] == ["check"]
+
+
+def test_a_kill_loses_the_work_under_way_and_what_waits(executor):
+    published = []
+    executor.add("a", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
+    executor.isolate("a")
+    executor.submit("a", "under way")
+    executor.submit("a", "waiting")
+    executor.advance(0.05)
+    executor.kill("a", 0.05)
+    executor.kill("a", 0.05)  # nothing is left to kill
+    executor.advance(0.5)
+    executor.submit("a", "newer")
+    executor.advance(3.0)
+    assert published == [("newer", 1.15)]
+    assert [(loss.stamp_s, loss.how) for loss in executor.losses] == [(0.05, "killed by SIGKILL")]

@@ -2,22 +2,26 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mavfi_cli.core.errors import ConfigError, FaultSpecError, UnknownName
+from mavfi_cli.campaign.specification.spec import load_spec
+from mavfi_cli.core.errors import ConfigError, FaultSpecError, OtherStack, UnknownName
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.detect import model
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission.companion import protection as protection_module
 from mavfi_cli.mission.companion.protection import Protection, Response
-from mavfi_cli.mission.detector_config import DetectorConfig
+from mavfi_cli.mission.detector_config import DetectorConfig, detector_of, model_path
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of, differing_results, same_file
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.stack import load_stack
 
 LIMIT = 8.0
 TRAJECTORY = Trajectory(
@@ -57,12 +61,12 @@ def per_stage(request):
 @pytest.fixture
 def limit(monkeypatch, per_stage):
     """The registry knows one detector."""
-    monkeypatch.setattr(protection_module, "find", lambda *_a, **_k: Limit(per_stage=per_stage))
+    monkeypatch.setattr(protection_module, "detector_of", lambda *_: Limit(per_stage=per_stage))
     return DetectorConfig(name="limit", alarms_max=3)
 
 
 def protection(config):
-    return Protection(config, WallClock())
+    return Protection(config, "mavbench", WallClock())
 
 
 def tick(gate, command, at_s=0.0):
@@ -132,12 +136,90 @@ def test_a_wild_report_is_withheld(limit):
     [
         ({"protect": ()}, ConfigError), ({"protect": ("vision",)}, UnknownName),
         ({"threshold": 0.0}, ConfigError), ({"threshold": float("nan")}, ConfigError),
-        ({"alarms_max": 0}, ConfigError),
+        ({"alarms_max": 0}, ConfigError), ({"watch": "all"}, UnknownName),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(wrong, error):
     with pytest.raises(error):
         DetectorConfig(name="gad", **wrong)
+
+
+EXTENDED = DetectorConfig(name="gad", watch="extended")
+FIRST = replace(TRAJECTORY, waypoints=np.full((6, 10), 0.25))
+
+
+def test_a_plan_with_a_wrong_number_is_withheld_until_recomputing_has_confirmed_it():
+    gate = protection(replace(EXTENDED, alarms_max=2))
+    assert gate.plan(FIRST, 0.0) is Response.PASS
+    wrong = [replace(FIRST, trajectory_seq=number) for number in (900, 901, 902, 903)]
+    assert [gate.plan(plan, 0.1) for plan in wrong] == [
+        Response.RECOMPUTE, Response.HOLD, Response.ACCEPT, Response.PASS,
+    ]  # fmt: skip
+    assert {alarm["states"] for alarm in gate.summary()["alarms"]} == {("plan_trajectory_seq",)}
+    assert gate.news()[0] == ("extended watch alarm in planning: plan_trajectory_seq; recompute")
+
+
+@pytest.mark.parametrize("name", ["gad", "aad"])
+def test_a_flown_plan_gets_back_the_number_that_was_accepted(name):
+    gate = protection(replace(EXTENDED, name=name))
+    gate.plan(FIRST, 0.0)
+    response, alarm = gate.ahead(replace(FIRST, trajectory_seq=1025), 0, None, 0.1)
+    assert (response, alarm.stage) == (Response.RECOMPUTE, Stage.PLANNING)
+    assert alarm.mended.trajectory_seq == 1
+    assert gate.ahead(alarm.mended, 0, None, 0.2) == (Response.PASS, None)
+
+
+def test_a_model_follows_the_stack_and_any_stack_its_base(tmp_path):
+    def path(stack, **asked):
+        return model_path(DetectorConfig(name="gad", **asked), stack)
+
+    mine = tmp_path / "mine.toml"
+    mine.write_text('name = "mine"\nbase = "hardened"\nguards_tracking = false\n')
+    for stack in ("mavbench", "hardened"):
+        assert path(stack) == path(stack, any_stack=True) == model.shipped("gad", stack)
+    for stack in ("mavbench-release", "mavbench:guards_tracking=true", str(mine)):
+        assert path(stack) is None
+    for stack, base in (
+        ("mavbench-release", "mavbench"), ("mavbench-release:goal_tolerance_m=2.0", "mavbench"),
+        (str(mine), "hardened"), ("hardened:guards_tracking=false", "hardened"),
+    ):  # fmt: skip
+        assert path(stack, any_stack=True) == model.shipped("gad", base)
+        assert detector_of(DetectorConfig(name="gad", any_stack=True), stack).stack.name == base
+    assert path("hardened", model="my.json") == Path("my.json")
+    assert path("hardened", model="my.json", any_stack=True) == Path("my.json")
+
+
+@pytest.mark.parametrize(
+    ("stack", "asked", "problem"),
+    [
+        ("mavbench-release", {}, r"stack 'mavbench', the mission flies 'mavbench-release'; "),
+        ("mavbench:guards_tracking=true", {}, "mavfi train --stack mavbench:guards_tracking=true"),
+        ("mavbench", {"model": str(model.shipped("gad", "hardened"))},
+         r"hardened/gad\.json: .*the stack 'hardened', the mission flies 'mavbench'"),
+    ],
+)  # fmt: skip
+def test_a_model_of_another_stack_is_refused_in_one_line(stack, asked, problem):
+    with pytest.raises(OtherStack, match=problem) as caught:
+        detector_of(DetectorConfig(name="gad", **asked), stack)
+    assert "--any-stack-model" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert detector_of(DetectorConfig(name="gad", any_stack=True, **asked), stack).name == "gad"
+
+
+def test_a_stack_that_differs_in_nothing_needs_no_model_of_its_own():
+    same = "mavbench:guards_tracking=false"
+    assert load_stack(same).mark.digest == load_stack("mavbench").mark.digest
+    assert detector_of(DetectorConfig(name="aad"), same).stack.name == "mavbench"
+    assert load_stack("hardened").mark.digest != load_stack("mavbench").mark.digest
+
+
+def test_a_model_of_the_stack_as_it_once_was_is_refused(tmp_path):
+    held = json.loads(model.shipped("gad").read_text())
+    held["stack"]["digest"] = "0" * 64
+    (tmp_path / "old.json").write_text(json.dumps(held))
+    config = DetectorConfig(name="gad", model=str(tmp_path / "old.json"))
+    with pytest.raises(OtherStack, match="for the stack 'mavbench as it was', the mission flies"):
+        detector_of(config, "mavbench")
 
 
 # Whole missions ------------------------------------------------------------------------------
@@ -215,6 +297,89 @@ def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
     (change,) = record["strikes"][0]["changes"]
     assert change["before"] == LIMIT
     assert change["state"] == "threshold"
+
+
+@pytest.mark.slow
+def test_a_flip_in_a_number_of_a_plan_is_seen_by_the_extended_watch_alone(
+    fly_short, short_flight, tmp_path
+):
+    fault = FaultConfig(target="plan_trajectory_seq", at="invocation=1", exact_bits=(10,))
+    runs = {
+        watch: load_run(fly_short(detector=replace(EXTENDED, watch=watch), fault=fault).path)
+        for watch in ("paper", "extended")
+    }
+    assert runs["paper"].result["detection"]["alarm_count"] == 0
+    assert runs["paper"].result["fault"]["activation"]["activation"] == "read"
+    result = runs["extended"].result
+    (alarm,) = result["detection"]["alarms"]
+    assert (alarm["message"], alarm["stage"]) == ("plan", "planning")
+    assert (alarm["states"], alarm["response"]) == (["plan_trajectory_seq"], "recompute")
+    assert result["fault"]["activation"]["activation"] == "withheld"
+    assert result["pilot"]["plans_rejected"] == 1
+    assert result["outcome"] == "success"
+    assert result["config"]["detector"]["watch"] == "extended"
+    again = load_run(fly_mission(config_of(runs["extended"]), tmp_path, Watcher()).path)
+    assert same_file(again.folder.trace, runs["extended"].folder.trace)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gad", "aad"])
+def test_a_flip_in_a_number_of_the_flown_plan_is_undone_before_the_check_reads_it(fly_short, name):
+    fault = FaultConfig(target="plan_future_collision_seq", at="phase=flying", exact_bits=(14,))
+    detector = replace(EXTENDED, name=name)
+    result = load_run(fly_short(detector=detector, fault=fault).path).result
+    assert result["fault"]["activation"]["activation"] == "withheld"
+    (alarm,) = result["detection"]["alarms"]
+    assert (alarm["message"], alarm["stage"]) == ("ahead", "planning")
+    assert alarm["states"] == ["plan_future_collision_seq"]
+    assert result["pilot"]["stops"] == 0
+    assert result["outcome"] == "success"
+
+
+@pytest.mark.slow
+def test_a_golden_flight_is_the_same_with_the_extended_watch(fly_short, short_flight):
+    golden, run = load_run(short_flight.path), load_run(fly_short(detector=EXTENDED).path)
+    assert run.result["detection"]["alarm_count"] == 0
+    assert same_file(run.folder.trace, golden.folder.trace)
+    assert same_file(run.folder.tlog, golden.folder.tlog)
+
+
+def test_a_flight_with_a_model_of_another_stack_ends_before_it_begins(fly_short, mavfi, tmp_path):
+    with pytest.raises(OtherStack):
+        fly_short(stack="mavbench-release", detector=DetectorConfig(name="gad"))
+    words = ("fly", "--stack", "mavbench-release", "--detector", "gad", "--out", tmp_path / "runs")
+    done = mavfi(*words)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("error: gad: this model is for the stack 'mavbench'")
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_a_model_of_another_stack_flies_where_that_is_asked_for(fly_short):
+    detector = DetectorConfig(name="gad", any_stack=True)
+    run = load_run(fly_short(stack="mavbench-release", detector=detector).path)
+    assert run.result["outcome"] == "success"
+    assert run.result["detection"]["checks"]["tick"] == run.trace.num_rows
+    assert run.result["config"]["detector"]["any_stack"] is True
+
+
+def test_a_campaign_refuses_a_model_of_another_stack_before_it_flies(mavfi, tmp_path):
+    text = (
+        'name = "other"\nrepetitions = 1\n[factors]\nstack = "mavbench-release"\n'
+        'detector = "gad"\nany_stack = {}\nwatch = ["paper", "extended"]\n'
+    )
+    specification = tmp_path / "other.toml"
+    specification.write_text(text.format("false"))
+    done = mavfi("campaign", "run", specification, "--out", tmp_path / "flown", "--quiet")
+    assert done.returncode == 1
+    assert "this model is for the stack 'mavbench'" in done.stderr
+    assert not (tmp_path / "flown").exists()
+    specification.write_text(text.format("true"))
+    missions = [m.config.detector for m in load_spec(str(specification)).missions()]
+    assert [(each.any_stack, each.watch) for each in missions] == [
+        (True, "paper"), (True, "extended"),
+    ]  # fmt: skip
 
 
 def test_a_fault_in_no_detector_is_refused(fly_short):

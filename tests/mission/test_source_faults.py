@@ -45,7 +45,7 @@ def troubled(troubled_flight):
 def evaded(tmp_path_factory):
     fault = FaultConfig(target="time_to_collision", field="exponent", at="phase=evading")
     out = tmp_path_factory.mktemp("evaded")
-    mission = MissionConfig(world="dense", seed=3, fault=fault)
+    mission = MissionConfig(world="dense", seed=3, stack="hardened", fault=fault)
     return load_run(fly_mission(mission, out, Watcher()).path)
 
 
@@ -126,6 +126,6 @@ def test_the_document_lists_the_phases():
 
 
 def test_a_trigger_that_never_comes_is_not_injected(struck):
-    fault = struck("planning", at="time=1000").result["fault"]
+    fault = struck("planning", at="time=299").result["fault"]
     assert (fault["state"], fault["activation"]["activation"]) == ("not_injected", "not_injected")
     assert fault["reason"]

@@ -53,6 +53,13 @@ def test_mass_pull_and_velocity_are_the_model_s(plan, scheme):
     assert vehicle["avionics_w"] == planned.boards_w
 
 
+def test_the_stack_is_the_mission_s(tmp_path):
+    setting = setting_of(load_vehicle("spark"), Choices())
+    arguments = (setting, named(SCHEMES, "none"), X86, SUM_S, tmp_path)
+    assert flight_plan(*arguments).mission.stack == "mavbench"
+    assert flight_plan(*arguments, stack="hardened").mission.stack == "hardened"
+
+
 def test_what_a_mission_cannot_take_is_told(plan):
     planned, _ = plan("spark", "none")
     assert planned.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)

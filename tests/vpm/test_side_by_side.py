@@ -74,7 +74,7 @@ def spark(tmp_path):
         )  # fmt: skip
         compared = side_by_side(told, chosen, flown, paired_ratio, {"aad": overhead})
         flights = {"worlds": ["w"], "missions_each": count, "first_seed": 1, "detectors": "mine",
-                   **compared}  # fmt: skip
+                   "stack": "mavbench", **compared}  # fmt: skip
         return {**told, "flights": flights}
 
     return beside

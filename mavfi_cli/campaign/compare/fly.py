@@ -154,5 +154,5 @@ def timeline_seed(plan: ComparePlan, flights: Sequence[Flown]) -> int:
 
 
 def _golden(plan: ComparePlan, platform: str, seed: int) -> PlannedMission:
-    config = MissionConfig(world=plan.world, platform=platform, seed=seed)
+    config = MissionConfig(world=plan.world, platform=platform, stack=plan.stack, seed=seed)
     return PlannedMission(config=config, labels={"platform": platform})

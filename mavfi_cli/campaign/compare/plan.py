@@ -12,6 +12,7 @@ from mavfi_cli.campaign.specification.spec import Setting, Spec
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage
+from mavfi_cli.mission.stack import DEFAULT
 
 NAME = "compare"
 NONE = "none"  # no detector: faults without protection are what detectors are held against
@@ -34,6 +35,7 @@ class ComparePlan:
         first_seed: of the missions; seeds count up from here.
         seed: root of the faults' seeds.
         field: bit field that is struck; None draws any bit.
+        stack: of all missions; a name, a file or a variant.
 
     Raises:
         ConfigError: nothing to fly, or something is named twice.
@@ -47,6 +49,7 @@ class ComparePlan:
     first_seed: int = 1
     seed: int = 1
     field: str | None = None
+    stack: str = DEFAULT
 
     def __post_init__(self) -> None:
         for key, names in (("platform", self.platforms), ("detector", self.detectors)):
@@ -97,6 +100,7 @@ class ComparePlan:
             first_seed=self.first_seed,
             repetitions=self.missions,
             keep=Keep.NONE,
+            fixed={} if self.stack == DEFAULT else {"stack": self.stack},
             axes={"world": (self.world,), "platform": self.platforms},
             settings=(Setting(name=GOLDEN), *faulty),
         )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
 from mavfi_cli.campaign.statistics.bootstrap import FEW
 from mavfi_cli.core.columns import columns
+from mavfi_cli.mission.stack import DEFAULT
 
 Row = Mapping[str, Any]
 # The paper, section VII-E: on the TX2, a single bit flip in an inter-kernel state.
@@ -67,6 +69,7 @@ def _head(told: Row) -> list[str]:
     lines = [
         f"Missions    {plan['missions']} in {plan['world']}, seeds {plan['first_seed']} to {last}, "
         "the same on each platform",
+        f"Stack       {plan['stack']}",
         f"Faults      {_faults(plan)}",
     ]
     for number, row in enumerate(plan["platforms"]):
@@ -240,6 +243,8 @@ def command_of(told: Row, row: Row) -> str:
     parts = [
         f"mavfi fly --world {plan['world']} --seed {flight['seed']} --platform {row['platform']}"
     ]
+    if plan["stack"] != DEFAULT:
+        parts.append(f"--stack {shlex.quote(plan['stack'])}")
     if flight["target"]:
         parts.append(f"--inject {flight['target']} --fault-seed {flight['fault_seed']}")
         parts += [] if plan["field"] is None else [f"--field {plan['field']}"]

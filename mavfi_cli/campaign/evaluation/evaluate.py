@@ -22,7 +22,7 @@ from mavfi_cli.campaign.missions import changes_of
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
 from mavfi_cli.campaign.statistics.paired import holm
-from mavfi_cli.detect.registry import find
+from mavfi_cli.mission.detector_config import detector_of
 from mavfi_cli.mission.run import installed_versions
 
 SCHEMA = 1
@@ -116,9 +116,7 @@ def _plan(plan: EvaluationPlan) -> dict[str, Any]:
         "worlds": list(plan.worlds),
         "detectors": {
             name: {
-                "threshold": find(
-                    name, model=plan.model_path(name) if plan.models is not None else None
-                ).threshold,
+                "threshold": detector_of(plan.detector_config(name), plan.base.stack).threshold,
                 "model_sha256": model_digest(plan, name),
             }
             for name in plan.protectors

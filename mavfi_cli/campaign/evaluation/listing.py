@@ -12,31 +12,39 @@ from mavfi_cli.detect.registry import find, names
 
 
 def listing(models: Path | None = None) -> list[dict[str, Any]]:
-    """A row a detector: name, model, threshold, provenance, and a line about it.
+    """A row a model: detector, file, stack, threshold, provenance, and a line about it.
 
-    A detector that cannot be used is told with the reason instead of its threshold.
+    A detector without a model has one row. One that cannot be used is told with the reason instead
+    of its threshold.
 
     Args:
-        models: folder of model files `NAME.json`; None takes those that come with the detectors.
+        models: folder of model files `NAME.json`; None takes those that are shipped.
     """
-    return [_row(name, models) for name in names()]
+    return [_row(name, path) for name in names() for path in _paths(name, models)]
 
 
-def _row(name: str, models: Path | None) -> dict[str, Any]:
-    path = model_file.shipped(name) if models is None else models / f"{name}.json"
-    has_model = path.is_file()
+def _paths(name: str, models: Path | None) -> list[Path | None]:
+    """The model files of a detector; None stands for none."""
+    if models is not None:
+        return [models / f"{name}.json"]
+    shipped = [model_file.shipped(name, stack) for stack in model_file.shipped_stacks()]
+    return [path for path in shipped if path.is_file()] or [None]
+
+
+def _row(name: str, path: Path | None) -> dict[str, Any]:
+    has_model = path is not None and path.is_file()
     row: dict[str, Any] = {
         "name": name,
         "model": str(path) if has_model else None,
+        "stack": None,
         "threshold": None,
         "provenance": None,
     }
     try:
-        row["threshold"] = find(
-            name, model=path if has_model or models is not None else None
-        ).threshold
-        if has_model:
+        row["threshold"] = find(name, model=path).threshold
+        if path is not None:
             row["provenance"] = model_file.provenance(path)
+            row["stack"] = row["provenance"].pop("stack")["name"]
     except ModelError as error:
         return {**row, "told": f"cannot be used: {error}"}
     return {**row, "told": _told(row["provenance"])}

@@ -15,10 +15,10 @@ from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.states import DType
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import model as model_file
-from mavfi_cli.detect.registry import find, names
+from mavfi_cli.detect.registry import names
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.detector_config import STAGES, DetectorConfig
+from mavfi_cli.mission.detector_config import STAGES, DetectorConfig, detector_of, model_path
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 
@@ -72,7 +72,7 @@ class EvaluationPlan:
             detectors; of the others only faults that turn out to do harm.
         golden_flights: error-free missions of each world; the first of them are those with faults.
         first_seed: seeds of missions count up from here.
-        models: folder of model files `NAME.json`; None takes those that come with the detectors.
+        models: folder of model files `NAME.json`; None takes those shipped for the stack of `base`.
         level: source or instruction.
         fields: bit fields that are struck at the source level.
         seed: of the faults.
@@ -127,8 +127,7 @@ class EvaluationPlan:
             ModelError: the folder of models has no such file.
         """
         if self.models is None:
-            shipped = model_file.shipped(detector)
-            return shipped if shipped.is_file() else None
+            return model_path(DetectorConfig(name=detector), self.base.stack)
         path = self.models.absolute() / f"{detector}.json"
         if not path.is_file():
             raise ModelError("no such model file", path=path)
@@ -246,7 +245,7 @@ def require_held_out(plan: EvaluationPlan) -> None:
     """
     for detector in plan.protectors:
         path = plan.model_path(detector)
-        find(detector, model=path if plan.models is not None else None)
+        detector_of(plan.detector_config(detector), plan.base.stack)
         if path is None:
             continue
         for flight in training_flights(model_file.provenance(path)):

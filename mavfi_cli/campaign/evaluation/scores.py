@@ -21,8 +21,8 @@ from mavfi_cli.core.states import BY_NAME
 from mavfi_cli.core.types import Stage, Trajectory
 from mavfi_cli.detect.model import preprocessing
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
-from mavfi_cli.detect.registry import find
 from mavfi_cli.fi import bits
+from mavfi_cli.mission.detector_config import detector_of
 from mavfi_cli.mission.record.plan_file import read_plans
 from mavfi_cli.mission.record.run_folder import load_run
 
@@ -108,7 +108,7 @@ class Scores:
         if not flight.columns:  # it ended before the first tick
             return 0.0
         path = self._plan.model_path(detector)
-        fresh = find(detector, model=path if self._plan.models is not None else None)
+        fresh = detector_of(self._plan.detector_config(detector), self._plan.base.stack)
         protect = frozenset(Stage(name) for name in self._plan.protect)
         params = None if path is None else preprocessing(path)
         from_s = -math.inf if struck_s is None else struck_s - 1e-9

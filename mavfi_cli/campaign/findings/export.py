@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FORMATS = (".parquet", ".csv")
-_CONFIG = ("world", "seed", "planner", "platform", "vehicle")
+_CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
 _QUALITY = (
     "flight_time_s", "distance_m", "mean_speed_mps", "max_speed_mps", "min_clearance_m",
     "goal_distance_m", "energy_regression_j", "energy_propeller_j",

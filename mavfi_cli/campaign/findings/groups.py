@@ -24,7 +24,8 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
-TREATMENT = ("setting", "detector", "protect")  # labels in which protected flights differ
+# Labels in which protected flights differ.
+TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
 INACTIVE = frozenset(each.value for each in Injected) - COUNTED
 
 

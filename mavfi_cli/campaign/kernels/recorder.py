@@ -26,7 +26,7 @@ from mavfi_cli.link.transport import open_transport
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.kernels import tracking_inputs
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
@@ -80,9 +80,8 @@ def _fly(config: MissionConfig, recording: _Recording) -> None:
         try:
             warm_up()
             planner = planners.find(config.planner)
-            flight = Flight(
-                config, transport, load_platform(config.platform), planner, Watcher(), []
-            )
+            platform = load_platform(config.platform)
+            flight = Flight(config, stack_of(config), transport, platform, planner, Watcher(), [])
             try:
                 flight.connect()
                 told = briefing.of_simulation(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import tomllib
 from collections.abc import Sequence
@@ -14,6 +15,8 @@ from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 
 _ODD = re.compile(r"[^\w.+=-]+")  # what no folder's name gets
+_COMMA = re.compile(r',(?=(?:[^"]*"[^"]*")*[^"]*$)')  # outside double quotes
+_LONGEST = 100  # a folder's name; a longer one ends with a digest of the changes
 
 
 def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
@@ -23,7 +26,8 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
     it does not have is added to all missions.
 
     Args:
-        changes: KEY=VALUE[,VALUE], each another key.
+        changes: KEY=VALUE[,VALUE], each another key. A value with a comma is quoted as in TOML, and
+            all values may be written as one TOML list.
 
     Raises:
         UnknownKey: no such factor; names the nearest.
@@ -42,7 +46,10 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
             raise ConfigError(f"{key} is set twice", key="set")
         seen.add(key)
         _replace(data, key, _values(key, text))
-        data["name"] += "-" + _ODD.sub("-", change)
+        data["name"] += "-" + _ODD.sub("-", change).strip("-")
+    if len(data["name"]) > _LONGEST:
+        digest = hashlib.sha256("\n".join(changes).encode()).hexdigest()[:8]
+        data["name"] = f"{data['name'][: _LONGEST - 9]}-{digest}"
     return read_spec(data, Path(f"{spec.name}.toml"))
 
 
@@ -57,7 +64,8 @@ def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
         known = {name for table in (fixed, crossed, *data["setting"]) for name in table}
         have = ", ".join(sorted(known & set(NAMES))) or "none"
         raise ConfigError(f"the campaign has no such factor to replace; it has {have}", key=key)
-    if not found and (len(values) == 1 or key in LISTS):
+    one = not isinstance(values[0], list) if key in LISTS and values else len(values) == 1
+    if not found and one:
         fixed[key] = values if key in LISTS else values[0]
     elif not found:
         fixed.pop(key, None)
@@ -65,15 +73,18 @@ def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
 
 
 def _values(key: str, text: str) -> list[Any]:
-    """The values; of a factor that is a list, the elements of one."""
-    several = text[1:-1] if key in LISTS and text[0] == "[" and text[-1] == "]" else text
-    return [_value(each.strip()) for each in several.split(",")]
+    """The values; of a factor that is a list, the elements of one, or several lists."""
+    listed = text[0] == "[" and text[-1] == "]"
+    if listed and isinstance(values := _value(text), list):
+        return values
+    several = text[1:-1] if key in LISTS and listed else text
+    return [_value(each.strip()) for each in _COMMA.split(several)]
 
 
 def _value(text: str) -> Any:
-    """A number or truth value as in TOML; else the text."""
+    """A number, a truth value, a quoted text or a list as in TOML; else the text."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
-    return value if isinstance(value, int | float | str) else text
+    return value if isinstance(value, int | float | str | list) else text

@@ -43,6 +43,10 @@ def _choices(spec: Spec, repetitions: str) -> _Choices:
             known = found.setdefault(name, [])
             known += [value for value in values if value not in known]
     found |= {f"mission.{name}": [value] for name, value in spec.fixed.items()}
+    if spec.fixed_world is not None:
+        found["rule of fixed worlds"] = [spec.fixed_world.rule()]
+        seeds = spec.fixed_world.world_seed.items()
+        found["fixed worlds"] = [f"{world} {seed}" for world, seed in seeds]
     return {
         **found,
         repetitions: [spec.repetitions],

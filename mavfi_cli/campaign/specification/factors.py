@@ -126,23 +126,24 @@ def check_names(config: MissionConfig, simulator: Callable[[MissionConfig], None
         simulator: raises what the simulated vehicle says to it.
 
     Raises:
-        MavfiError: a world, vehicle, planner, platform or target that does not exist, values
-            that make no fault, a start that is blocked.
+        MavfiError: a world, vehicle, planner, platform, stack or target that does not exist, a
+            model of another stack, values that make no fault, a start that is blocked.
     """
     from mavfi_cli.autonomy import planners
-    from mavfi_cli.detect.registry import find
+    from mavfi_cli.mission.detector_config import detector_of
     from mavfi_cli.mission.platform import load_platform
+    from mavfi_cli.mission.stack import load_stack
 
     planners.find(config.planner)
     load_platform(config.platform)
+    load_stack(config.stack)
     if config.fault is not None:
         config.fault.check()
     if config.instruction is not None:
         config.instruction.strategy()
         config.instruction.node()
     if config.detector is not None:
-        detector = config.detector
-        find(detector.name, model=detector.model_path, threshold=detector.threshold)
+        detector_of(config.detector, config.stack)
     elif config.fault is not None and config.fault.attacks_detector:
         raise FaultSpecError("a fault in the detector needs one")
     simulator(config)

@@ -16,13 +16,14 @@ from mavfi_cli.autonomy.planner_names import canonical
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import Label, PlannedMission, naming
 from mavfi_cli.campaign.specification.factors import NAMES, Point
-from mavfi_cli.core.config import syntax_error
+from mavfi_cli.campaign.specification.fixed_world import FixedWorld
+from mavfi_cli.core.config import structure, syntax_error
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 from mavfi_cli.core.seeds import Stream, derive
 
 Axes = Mapping[str, tuple[Any, ...]]
 _TOP = ("name", "about", "seed", "first_seed", "repetitions", "keep", "mission", "factors",
-        "setting", "stop")  # fmt: skip
+        "setting", "stop", "fixed_world")  # fmt: skip
 _SETTING = ("name", "repetitions")
 MOST = 1_000_000  # missions of one campaign
 # Factors whose value is a list already: a list of lists crosses several.
@@ -66,6 +67,7 @@ class Spec:
         axes: factors that are crossed, each with its values.
         settings: lists of missions, each crossed with `axes`.
         stop: ends settings early; None flies everything.
+        fixed_world: has all missions of a world share one; None: the world changes with the seed.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Spec:
     axes: Axes = field(default_factory=dict)
     settings: tuple[Setting, ...] = (Setting(),)
     stop: Stop | None = None
+    fixed_world: FixedWorld | None = None
 
     def scaled(self, scale: float) -> Spec:
         """The same campaign with so much of its repetitions, at least one each.
@@ -147,7 +150,10 @@ class Spec:
         # else has: the same place gets the same fault whatever protects it or computes.
         fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition, point.target)
         with naming(labels):
-            return PlannedMission(config=point.mission(seed, fault_seed), labels=labels)
+            config = point.mission(seed, fault_seed)
+            if self.fixed_world is not None and config.world_seed is None:
+                config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
+            return PlannedMission(config=config, labels=labels)
 
 
 def _label(value: Any) -> Label:
@@ -226,6 +232,7 @@ class _Reader:
             axes=self._axes(self._table(data, "factors"), "factors."),
             settings=tuple(self._setting(each, i) for i, each in enumerate(settings)),
             stop=self._stop(data),
+            fixed_world=self._fixed_world(data),
         )
 
     def _setting(self, data: Any, index: int) -> Setting:
@@ -309,8 +316,6 @@ class _Reader:
     def _stop(self, data: Mapping[str, Any]) -> Stop | None:
         if "stop" not in data:
             return None
-        from mavfi_cli.core.config import structure
-
         stop = structure(self._table(data, "stop"), Stop, path=self._path)
         if not (0.0 < stop.margin < 0.5 and 0.0 < stop.confidence < 1.0 and stop.batch >= 1):
             raise ConfigError(
@@ -319,3 +324,16 @@ class _Reader:
                 key="stop",
             )
         return stop
+
+    def _fixed_world(self, data: Mapping[str, Any]) -> FixedWorld | None:
+        if "fixed_world" not in data:
+            return None
+        table = self._table(data, "fixed_world")
+        return structure({"fixed_world": table}, _Rule, path=self._path).fixed_world
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rule:
+    """The table in its place, so that errors name it."""
+
+    fixed_world: FixedWorld

@@ -31,11 +31,22 @@ def to_toml(spec: Spec) -> str:
         lines += ["", "[[setting]]", *_pairs({**own, **_lists(setting.axes)})]
     if spec.stop is not None:
         lines += _table("[stop]", asdict(spec.stop))
+    if spec.fixed_world is not None:
+        rule = asdict(spec.fixed_world)
+        inner = {key: rule.pop(key) for key in ("world_seed", "flown")}
+        lines += _table("[fixed_world]", rule)
+        for key, values in inner.items():
+            lines += _table(f"[fixed_world.{key}]", _quoted(values))
     return "\n".join(lines) + "\n"
 
 
 def _table(head: str, values: Mapping[str, Any]) -> list[str]:
     return ["", head, *_pairs(values)] if values else []
+
+
+def _quoted(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with keys that may hold what no bare key of TOML has, as names of worlds do."""
+    return {json.dumps(key, ensure_ascii=False): value for key, value in values.items()}
 
 
 def _pairs(values: Mapping[str, Any]) -> list[str]:

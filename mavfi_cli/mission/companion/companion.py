@@ -11,6 +11,7 @@ What the detector gate withholds there, and what follows, is in `mission.recover
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from mavfi_cli.core.types import (
     CollisionReport,
     Command,
     DepthFrame,
+    FloatArray,
     PointCloud,
     Stage,
     Trajectory,
@@ -42,6 +44,7 @@ from mavfi_cli.mission.companion.response import Reaction
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.platform import PlatformProfile, latency_model
+from mavfi_cli.mission.stack import Stack
 
 # A command computed within one physics step of the vehicle goes out in the tick of its state:
 # a shorter delay is below what the simulation resolves.
@@ -60,6 +63,7 @@ class Companion:
     def __init__(
         self,
         config: MissionConfig,
+        stack: Stack,
         platform: PlatformProfile,
         planner: Planner,
         briefing: Briefing,
@@ -68,15 +72,27 @@ class Companion:
         protection: NoProtection,
     ) -> None:
         self._config = config
+        self._stack = stack
         self._injection = injection
         self.protection = protection
         v_max, a_max = config.v_max_mps, config.a_max_mps2
         self.pilot = Pilot(
             PilotParams(
-                goal_tolerance_m=config.goal_tolerance_m,
+                goal_tolerance_m=stack.goal_tolerance_m,
                 v_max_mps=v_max,
                 a_max_mps2=a_max,
                 brake_mps2=BRAKE_SHARE * a_max,
+                guards_tracking=stack.guards_tracking,
+                tracking_error_max_m=stack.tracking_guard_m,
+                stops_on_report=stack.stops_on_report,
+                uses_time_to_collision=stack.uses_time_to_collision,
+                acts_on_report_once=stack.acts_on_report_once,
+                owns_sequence_numbers=stack.owns_sequence_numbers,
+                plans_in_motion=stack.plans_in_motion,
+                arrives_at_rest=stack.arrives_at_rest,
+                turns_before_departure=stack.turns_before_departure,
+                rejected_plan_pause_s=stack.rejected_plan_pause_s,
+                slows_where_blind=stack.slows_where_blind,
             ),
             briefing.goal_enu_m,
         )
@@ -92,17 +108,21 @@ class Companion:
             restart_s=config.node_restart_s,
             watchdog_s=config.node_watchdog_s,
         )
-        kernels = Kernels(config, planner, briefing)
+        kernels = Kernels(config, stack, planner, briefing)
         add = self.executor.add
         add("point_cloud", kernels.point_cloud, self._take_cloud)
-        add("octomap", kernels.octomap, self._take_snapshot)
+        add("octomap", kernels.octomap, self._take_snapshot, self._octomap_is_up)
         add("collision_check", kernels.collision_check, self._take_report)
         add("planner", kernels.planner, self._take_plan, self._planner_is_up)
-        add("control", kernels.control, lambda _output, _stamp_s: None)
+        add("control", kernels.control, lambda _output, _stamp_s: None, self._control_is_up)
+        for nodes in stack.processes:
+            self.executor.share_process(nodes)
         if injection.follower is not None:
             self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
         self._checked: Trajectory | None = None
+        self._queued: Trajectory | None = None  # the plan that control has
+        self._heard_seq = 0  # newest future_collision_seq that the planner has heard of
         self._commands: deque[Setpoint] = deque()
         self._frame: DepthFrame | None = None
         self._state: VehicleState | None = None
@@ -142,6 +162,8 @@ class Companion:
         if not self._recovery.admit_report(report, stamp_s):
             return
         self.report = report
+        if report.collision:
+            self._heard_seq = max(self._heard_seq, report.future_collision_seq)
         timely = self.pilot.on_report(report)
         if self._injection.follower is not None:
             states = VERDICT_STATES if timely else VERDICT_STATES - {"time_to_collision"}
@@ -155,17 +177,33 @@ class Companion:
     def _take_plan(self, result: Trajectory | PlanFailure, stamp_s: float) -> None:
         if isinstance(result, Trajectory):
             result = self._injection.pass_on(result, self._moment(stamp_s))
-            if self.pilot.expects(result) and not self._recovery.admit_plan(result, stamp_s):
+            if not self.pilot.expects(result):
+                self.protection.lose_plan()
+            elif not self._recovery.admit_plan(result, stamp_s):
                 return
             self.plans.append(result)
             if self._injection.follower is not None:
                 self._injection.follower.read(result, "mission logic", stamp_s, PLAN_STATES)
+        else:
+            self.protection.lose_plan()
         self.pilot.on_plan(result)
 
     def _planner_is_up(self, planner: Node) -> None:
         """It died over a request; unless a newer one waits for it, the mission asks again."""
+        self._heard_seq = 0
         if planner.pending is None:
             self.pilot.plan_lost()
+
+    def _octomap_is_up(self, octomap: Node) -> None:
+        """Who shares its process had no copy of the map."""
+        if octomap.mates:
+            self._snapshot = occupancy.empty_snapshot(self._config.map_resolution_m)
+
+    def _control_is_up(self, _control: Node) -> None:
+        """A queue of its own is lost: the pilot plans anew."""
+        if self._stack.control_owns_queue and self._state is not None:
+            self._queued = None
+            self.pilot.control_lost(self._state)
 
     def _on_start(self, node: str, value: Any, start_s: float) -> None:
         """A node begins to work on its input: it has read it."""
@@ -182,9 +220,18 @@ class Companion:
         self.executor.submit(
             "collision_check",
             CheckInput(
-                snapshot=self._snapshot, trajectory=trajectory, time_s=self.pilot.flown.time_s
+                snapshot=self._snapshot,
+                trajectory=trajectory,
+                time_s=self.pilot.flown.time_s,
+                position_enu_m=self._front(),
             ),
         )
+
+    def _front(self) -> FloatArray | None:
+        """Where the check moves the path to; None where it stays."""
+        if not self._stack.shifts_path_to_vehicle or self._state is None:
+            return None
+        return self._state.position_enu_m
 
     # The control tick
 
@@ -205,19 +252,25 @@ class Companion:
         self._ticks += 1
         self._state = self._recovery.state = state
         self._injection.strike_memory(self._moment(stamp_s))
+        copy = None
         if self.pilot.flown.trajectory is not None:
             flown = self.pilot.flown.trajectory
-            self._strike_latched(flown, stamp_s)
+            copy = self._strike_latched(flown, stamp_s)
             self._recovery.look_round(stamp_s, flown)
         if self._injection.follower is not None:
-            self._follow(self._injection.follower, stamp_s)
+            self._follow(self._injection.follower, stamp_s, copy)
         directive = self.directive = self.pilot.update(stamp_s, state)
         self._injection.watch(self._moment(stamp_s))
         if directive.plan is not None:
             assert self._snapshot is not None
-            self.executor.submit("planner", (directive.plan, self._snapshot))
+            request = directive.plan
+            if self._stack.owns_sequence_numbers:
+                request = replace(request, future_collision_seq=self._heard_seq)
+            self.executor.submit("planner", (request, self._snapshot))
         if directive.trajectory is not None and directive.trajectory is not self._checked:
             self._check(stamp_s)
+        if copy is not None and directive.trajectory is not None:
+            directive = replace(directive, trajectory=copy)
         setpoint = self._track(stamp_s, state, directive)
         if setpoint is not None:  # else the last one stays in force: the node is busy, or down
             self._commands.append(setpoint)
@@ -225,12 +278,22 @@ class Companion:
             self._take_command(stamp_s, self._commands.popleft())
         return self.command
 
-    def _strike_latched(self, flown: Trajectory, stamp_s: float) -> None:
-        """A fault in the memory of the flown trajectory."""
+    def _strike_latched(self, flown: Trajectory, stamp_s: float) -> Trajectory | None:
+        """A fault in the memory of the flown trajectory, or in control's copy of it.
+
+        Where control owns its queue, its copy is the flown trajectory: it tells the others what is
+        left of it. Else the copy is replaced in the next tick.
+
+        Returns:
+            What control has in this tick instead of the flown trajectory; None where nothing else.
+        """
         struck = self._injection.strike_latched(
             flown, self._moment(stamp_s), self.pilot.flown.waypoint
         )
+        if self._injection.in_queue and not self._stack.control_owns_queue:
+            return None if struck is flown else struck
         self._exchange(flown, struck)
+        return None
 
     def _exchange(self, flown: Trajectory, changed: Trajectory) -> None:
         """Fly a changed version of a plan; nobody is told, so no check follows."""
@@ -239,16 +302,16 @@ class Companion:
         if self._checked is flown:
             self._checked = changed
 
-    def _follow(self, follower: Follower, stamp_s: float) -> None:
+    def _follow(self, follower: Follower, stamp_s: float, copy: Trajectory | None) -> None:
         """Mission logic and control are about to read the followed waypoint, and the next yaw."""
         if not follower.waits:
             return
-        flown = self.pilot.flown.trajectory
+        flown = copy or self.pilot.flown.trajectory
         if flown is not None:
             at = self.pilot.flown.waypoint
             follower.read(flown, "control", stamp_s, FOLLOWED_STATES, at)
             follower.read(flown, "control", stamp_s, {"waypoint_yaw"}, at + 1)
-        follower.settle(lambda message: message is self.report or self.pilot.holds(message))
+        follower.settle(lambda m: m is self.report or m is copy or self.pilot.holds(m))
 
     def _track(
         self,
@@ -259,12 +322,15 @@ class Companion:
     ) -> Setpoint | None:
         """Have control compute a command, due when its latency has passed."""
         fresh, attempt = (None, 0) if retry is None else (retry.fresh, retry.attempt)
-        job = ControlInput(
-            inputs=tracking_inputs(stamp_s, state, directive), fresh=fresh, yaw_rad=state.yaw_rad
-        )
+        inputs = tracking_inputs(stamp_s, state, directive)
+        goes_on = self._stack.control_owns_queue and directive.trajectory is self._queued
+        if goes_on:
+            inputs = replace(inputs, trajectory=None)
+        job = ControlInput(inputs=inputs, goes_on=goes_on, fresh=fresh, yaw_rad=state.yaw_rad)
         called = self.executor.call("control", job, stamp_s, again=retry is not None)
         if called is None:
             return None
+        self._queued = directive.trajectory
         command, latency_s = called
         frame_s, self._fresh_frame_s = self._fresh_frame_s, None
         flown = directive.trajectory
@@ -291,6 +357,9 @@ class Companion:
         if not passes:
             return
         self.command = command
+        self.pilot.flown.pace = command.pace
+        if command.skips_waypoint and setpoint.directive.trajectory is self.pilot.flown.trajectory:
+            self.pilot.flown.skip_waypoint()
         if self._injection.follower is not None:
             self._injection.follower.read(command, "setpoint", stamp_s, COMMAND_STATES)
         if setpoint.frame_s is not None:

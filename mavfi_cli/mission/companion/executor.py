@@ -5,6 +5,9 @@ invocation that starts at `t` occupies the node, and one core of the platform, u
 its latency; only then is its output published. The real computation is done at any host time
 in between, so the vehicle's simulation need not wait for it.
 
+Nodes that share a process work one after the other, each with its newest input, in the order in
+which they are listed. They end together, and what waits for any of them is lost.
+
 A node in a process of its own may die, of a signal or of an error in its kernel. The input that it
 worked on is lost, and it starts anew, with fresh state, a restart time after its output was due. A
 node that hangs works on until the watchdog kills it. Both are decided by *what* became of the
@@ -15,7 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -57,6 +60,7 @@ class Node:
     restarts: int = 0
     finished: int = 0  # invocations that are over, well or not
     free_s: float = 0.0  # end of the newest work outside the queue
+    mates: list[Node] = field(default_factory=list)  # in its process: those after it, then before
 
 
 @dataclass(slots=True, eq=False)
@@ -68,6 +72,7 @@ class _Job:
     input: Any
     order: int | None = None  # number of the order in the node's process
     done: bool = False
+    cancelled: bool = False  # its process was killed before the output was due
     output: Any = None
 
     def begin(self, wall: WallClock) -> None:
@@ -162,15 +167,28 @@ class Executor:
         self._nodes[name] = node
         return node
 
+    def share_process(self, names: Sequence[str]) -> None:
+        """Let nodes share a process, as one thread in it: the order is that of its loop."""
+        nodes = [self._nodes[name] for name in names]
+        for place, node in enumerate(nodes):
+            node.mates = nodes[place + 1 :] + nodes[:place]
+
+    def process_of(self, name: str) -> dict[str, Run]:
+        """What the process of a node runs: its kernel and those of its mates, by name."""
+        node = self._nodes[name]
+        return {each.name: each.run for each in (node, *node.mates)}
+
     def isolate(self, name: str, process: NodeProcess | None = None) -> None:
-        """Let a node do its real work in a process of its own from now on; `close` ends it.
+        """Let a node do its real work in a process apart from now on; `close` ends it.
 
         Args:
-            name: of the node.
-            process: one that serves it; default a fork of this one, to which its state moves.
+            name: of the node; its mates move with it.
+            process: one that serves them; default a fork of this one, to which their state moves.
         """
         node = self._nodes[name]
-        node.process = process or NodeProcess.fork({name: node.run})
+        node.process = process or NodeProcess.fork(self.process_of(name))
+        for mate in node.mates:
+            mate.process = node.process
 
     def settle(self) -> None:
         """Wait for work under way: what a fault does there must not depend on the host's pace."""
@@ -178,6 +196,29 @@ class Executor:
             if job.node.process is not None:
                 job.settle(self.wall)
         self._jobs.clear()
+
+    def kill(self, name: str, stamp_s: float) -> None:
+        """End the process of a node as a signal would; nothing is left to kill where it is down.
+
+        What it works on is lost, and so is what waits for it.
+
+        Args:
+            name: of a node that works in a process apart.
+            stamp_s: now.
+        """
+        node = self._nodes[name]
+        together = (node, *node.mates)
+        jobs = [self._jobs.pop(each.name) for each in together if each.name in self._jobs]
+        if not jobs and any(each.busy for each in together):
+            return
+        for job in jobs:  # how far it came on this host must not matter
+            job.settle(self.wall)
+            job.cancelled = True
+            self._working -= 1
+        node.busy, node.pending = True, None
+        self._note_loss(node, stamp_s, NodeLost(hung=False, how="killed by SIGKILL"))
+        self._at(stamp_s + self.restart_s, lambda up_s: self._revive(node, up_s))
+        self._start_waiting()
 
     def close(self) -> None:
         """End the processes of all nodes."""
@@ -255,7 +296,7 @@ class Executor:
         self.timetable.append(Invocation(node=name, start_s=start_s, end_s=end_s))
 
     def _start_if_free(self, node: Node) -> None:
-        if node.busy or node.pending is None:
+        if node.busy or node.pending is None or any(mate.busy for mate in node.mates):
             return
         if self._working >= self.cores:
             if node not in self._waiting:
@@ -280,6 +321,8 @@ class Executor:
         self._count += 1
 
     def _finish(self, job: _Job, end_s: float) -> None:
+        if job.cancelled:
+            return
         job.node.finished += 1
         self._jobs.pop(job.node.name, None)
         try:
@@ -289,9 +332,14 @@ class Executor:
             return
         job.node.busy = False
         job.node.publish(output, end_s)  # its core is still taken: what this starts asks last
-        self._start_if_free(job.node)
+        self._start_next(job.node)
         self._working -= 1
         self._start_waiting()
+
+    def _start_next(self, node: Node) -> None:
+        """A node is free: the next of its process that has an input works."""
+        for each in (*node.mates, node):
+            self._start_if_free(each)
 
     def _start_waiting(self) -> None:
         while self._waiting and self._working < self.cores:
@@ -309,6 +357,8 @@ class Executor:
                      traceback=loss.traceback)  # fmt: skip
         node.losses.append(entry)
         self.losses.append(entry)
+        for mate in node.mates:
+            mate.pending = None
 
     def _bury(self, node: Node, stamp_s: float) -> None:
         self._working -= 1
@@ -316,11 +366,15 @@ class Executor:
         self._start_waiting()
 
     def _revive(self, node: Node, _stamp_s: float) -> None:
-        """A new process with fresh state: this one's copy of the node has never worked."""
+        """A new process with fresh state: this one's copy of the nodes has never worked."""
         if node.process is not None:
             node.process.close(kill=True)
-        node.process = NodeProcess.fork({node.name: node.run})
-        node.restarts += 1
-        node.busy = False
-        node.on_restart(node)
-        self._start_if_free(node)
+        process = NodeProcess.fork(self.process_of(node.name))
+        together = (node, *node.mates)
+        for each in together:
+            each.process = process
+            each.restarts += 1
+            each.busy = False
+        for each in together:
+            each.on_restart(each)
+        self._start_next(node)

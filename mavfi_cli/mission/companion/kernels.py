@@ -5,22 +5,25 @@ A node may live in a process of its own: then its part of the state lives there,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
 from mavfi_cli.autonomy.orders import Directive, PlanFailure, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.autonomy.planners.base import PlanningParams
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import (
     CollisionReport,
     Command,
     DepthFrame,
+    FloatArray,
     PointCloud,
     Trajectory,
     VehicleState,
 )
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.stack import Stack
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,13 +33,19 @@ class CheckInput:
     snapshot: occupancy.MapSnapshot
     trajectory: Trajectory | None
     time_s: float
+    position_enu_m: FloatArray | None = None  # (3,) of the vehicle, where the path is shifted to it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlInput:
-    """What the controller works on."""
+    """What the controller works on.
+
+    Attributes:
+        goes_on: control follows the plan that it has; that of `inputs` is left out.
+    """
 
     inputs: tracking.TrackingInputs
+    goes_on: bool = False
     fresh: tracking.TrackingState | None  # compute from this state instead of one's own
     yaw_rad: float  # the vehicle's, for a controller that begins
 
@@ -61,7 +70,10 @@ def tracking_inputs(
 class Kernels:
     """Every method is what one node does: (input, start stamp) -> output."""
 
-    def __init__(self, config: MissionConfig, planner: Planner, briefing: Briefing) -> None:
+    def __init__(
+        self, config: MissionConfig, stack: Stack, planner: Planner, briefing: Briefing
+    ) -> None:
+        self._stack = stack
         self._seed = config.seed
         self._planner = planner
         v_max, a_max = config.v_max_mps, config.a_max_mps2
@@ -71,14 +83,31 @@ class Kernels:
                 resolution_m=config.map_resolution_m, max_range_m=config.map_range_m
             )
         )
-        self._collision_params = collision.CollisionParams()
+        self._collision_params = collision.CollisionParams(
+            radius_m=stack.check_radius_m,
+            refuses_far_waypoints=stack.refuses_far_waypoints,
+            farthest_m=stack.farthest_waypoint_m,
+            owns_sequence_numbers=stack.owns_sequence_numbers,
+        )
         self._collision_state = collision.CollisionState()
         self._planning_params = planning.StageParams(
-            smoothing=smoothing.SmoothingParams(v_max_mps=v_max, a_max_mps2=a_max)
+            clearance=PlanningParams(radius_m=stack.planner_radius_m),
+            smoothing=smoothing.SmoothingParams(v_max_mps=v_max, a_max_mps2=a_max),
         )
         self._bounds_enu_m = briefing.bounds_enu_m
-        self._tracking_params = tracking.TrackingParams(v_max_mps=v_max, a_max_mps2=a_max)
+        self._tracking_params = tracking.TrackingParams(
+            kp_per_s=stack.position_gain_per_s,
+            kp_climb_per_s=stack.climb_gain_per_s,
+            ki_per_s2=stack.integral_gain_per_s2,
+            kd=stack.damping_gain,
+            v_max_mps=v_max,
+            a_max_mps2=a_max,
+            stretches_clock=stack.stretches_clock,
+            skips_endless_slices=stack.skips_endless_slices,
+        )
         self._tracking_state: tracking.TrackingState | None = None
+        self._queue: Trajectory | None = None  # control's own
+        self._plans = 0  # of the planner
 
     def point_cloud(self, frame: DepthFrame, _stamp_s: float) -> PointCloud:
         """A depth frame's points in the world."""
@@ -94,8 +123,9 @@ class Kernels:
         inputs = collision.CollisionInputs(
             stamp_s=stamp_s,
             snapshot=check.snapshot,
-            trajectory=check.trajectory,
+            trajectory=self._as_read(check.trajectory),
             time_s=check.time_s,
+            front_enu_m=check.position_enu_m,
         )
         self._collision_state, report = collision.step(
             self._collision_state, inputs, self._collision_params
@@ -107,6 +137,9 @@ class Kernels:
     ) -> Trajectory | PlanFailure:
         """A trajectory that answers a request, or the reason why there is none."""
         request, snapshot = job
+        newest = request.trajectory_seq
+        if self._stack.owns_sequence_numbers:
+            newest, self._plans = self._plans, self._plans + 1
         found = planning.plan(
             self._planner,
             planning.StageInputs(
@@ -120,7 +153,7 @@ class Kernels:
                 goal_enu_m=request.goal_enu_m,
                 bounds_enu_m=self._bounds_enu_m,
                 sequence=smoothing.Sequence(
-                    trajectory_seq=_next_int32(request.trajectory_seq),
+                    trajectory_seq=_next_int32(newest),
                     future_collision_seq=request.future_collision_seq,
                 ),
                 seed=derive(self._seed, Stream.PLANNER, request.attempt),
@@ -136,8 +169,22 @@ class Kernels:
         state = job.fresh or self._tracking_state
         if state is None:
             state = tracking.TrackingState(yaw_rad=job.yaw_rad, stamp_s=job.inputs.stamp_s)
-        self._tracking_state, command = tracking.step(state, job.inputs, self._tracking_params)
+        inputs = job.inputs
+        if job.goes_on:
+            inputs = replace(inputs, trajectory=self._queue)
+        elif inputs.trajectory is not None:
+            inputs = replace(inputs, trajectory=self._as_read(inputs.trajectory))
+        self._queue = inputs.trajectory
+        self._tracking_state, command = tracking.step(state, inputs, self._tracking_params)
         return command
+
+    def _as_read(self, trajectory: Trajectory | None) -> Trajectory | None:
+        """A plan as its readers take it: without accelerations where nobody feeds them forward."""
+        if trajectory is None or self._stack.feeds_acceleration_forward:
+            return trajectory
+        waypoints = trajectory.waypoints.copy()
+        waypoints[:, 7:10] = 0.0
+        return replace(trajectory, waypoints=waypoints)
 
 
 def _next_int32(value: int) -> int:

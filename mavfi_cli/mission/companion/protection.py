@@ -20,10 +20,8 @@ import numpy as np
 from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.gate import Alarm, Gate
-from mavfi_cli.detect.registry import find
-from mavfi_cli.mission.detector_config import DetectorConfig
+from mavfi_cli.mission.detector_config import DetectorConfig, detector_of, watch_of
 
 MAX_LISTED_ALARMS = 100
 TOLD_EVERY_S = 1.0  # alarms of one stage are told to people no more often
@@ -73,6 +71,9 @@ class NoProtection:
         """Passes."""
         return Response.PASS
 
+    def lose_plan(self) -> None:
+        """Nothing to judge."""
+
     def ahead(
         self, plan: Trajectory, first: int, only: int | None, stamp_s: float
     ) -> tuple[Response, Alarm | None]:
@@ -99,15 +100,17 @@ class Protection(NoProtection):
 
     Args:
         config: which detector, which stages.
+        stack: of the mission, as `load_stack` takes it.
         wall: gets the host time of all checks, under "gate".
     """
 
-    def __init__(self, config: DetectorConfig, wall: WallClock) -> None:
+    def __init__(self, config: DetectorConfig, stack: str, wall: WallClock) -> None:
         self._config = config
         self._wall = wall
+        _warm_up(Gate(detector_of(config, stack)))
+        detector = detector_of(config, stack)
         stages = frozenset(Stage(name) for name in config.protect)
-        _warm_up(Gate(self._detector()))
-        self.gate: Gate = Gate(self._detector(), stages)
+        self.gate: Gate = Gate(detector, stages, watch=watch_of(config, detector))
         self._threshold = self.gate.threshold
         self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
@@ -115,11 +118,6 @@ class Protection(NoProtection):
         self._alarms: list[AlarmRecord] = []
         self._news: list[str] = []
         self._told_s: dict[Stage, float] = {}
-
-    def _detector(self) -> Detector:
-        """A fresh one."""
-        config = self._config
-        return find(config.name, model=config.model_path, threshold=config.threshold)
 
     def report(self, report: CollisionReport, stamp_s: float) -> tuple[Response, Stage]:
         """Judge perception's message on its arrival; and which stage is to compute again."""
@@ -138,7 +136,14 @@ class Protection(NoProtection):
         if alarm is None:
             self._recovered(Stage.PLANNING, stamp_s, proven=False)
             return Response.PASS
-        return self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
+        response = self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
+        if response is Response.ACCEPT:
+            self.gate.accept_plan(plan)
+        return response
+
+    def lose_plan(self) -> None:
+        """The planner has answered, and nobody waits for a plan of it."""
+        self.gate.lose_plan()
 
     def ahead(
         self, plan: Trajectory, first: int, only: int | None, stamp_s: float
@@ -270,9 +275,9 @@ def _warm_up(gate: Gate) -> None:
         gate.judge_tick(plan, 0, command)
 
 
-def protection_of(config: DetectorConfig | None, wall: WallClock) -> NoProtection:
+def protection_of(config: DetectorConfig | None, stack: str, wall: WallClock) -> NoProtection:
     """The protection that a mission asks for; the null object where it asks for none."""
-    return NoProtection() if config is None else Protection(config, wall)
+    return NoProtection() if config is None else Protection(config, stack, wall)
 
 
 def gate_of(protection: NoProtection) -> Gate:

@@ -9,6 +9,9 @@
 Perception looks anew where the alarm is its own. That of a detector over all stages recomputes
 control (section V-D), which it does in the next tick, without the report.
 
+Where a number of the flown plan has changed, and not a waypoint, the plan gets back the number that
+was accepted, and another one is asked for. The mission logic and the collision check never see it.
+
 To hold is to give the plan up, hover, and plan anew from there. PASS and ACCEPT let the message
 take effect. Where computing a command again did not help, or its waypoint is to blame, control
 drops that waypoint, takes the next, and begins afresh (paper, section V-E).
@@ -173,8 +176,11 @@ class Recovery:
             if response is Response.HOLD:
                 self._hold()
             elif response is Response.RECOMPUTE and alarm is not None:
-                assert alarm.waypoint is not None
-                self._drop(flown, alarm.waypoint)
+                if alarm.mended is not None:
+                    self._replace(flown, alarm.mended)
+                else:
+                    assert alarm.waypoint is not None
+                    self._drop(flown, alarm.waypoint)
                 if alarm.stage is Stage.PLANNING:
                     pilot.want_plan()
                 if pilot.flown.trajectory is not flown:
@@ -184,9 +190,12 @@ class Recovery:
     def _drop(self, flown: Trajectory, waypoint: int) -> Trajectory:
         """The plan without a waypoint, which is flown from now on."""
         bridged = without_waypoint(flown, waypoint)
-        self._withhold(flown)
-        self._exchange(flown, bridged)
+        self._replace(flown, bridged)
         return bridged
+
+    def _replace(self, flown: Trajectory, mended: Trajectory) -> None:
+        self._withhold(flown)
+        self._exchange(flown, mended)
 
     def _hold(self) -> None:
         if self.state is not None:

@@ -206,7 +206,7 @@ def _kept(path: Path, make: Callable[[], T]) -> T:
 def _key(golden: MissionConfig, versions: Mapping[str, str]) -> str:
     """A name for all that the golden flight depends on."""
     values = golden.to_dict()
-    files = [Path(str(values[name])) for name in ("world", "platform", "vehicle")]
+    files = [Path(name) for name in golden.files]
     parts = [
         json.dumps(values, sort_keys=True),
         json.dumps(dict(versions), sort_keys=True),

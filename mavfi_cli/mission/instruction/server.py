@@ -18,7 +18,7 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.node_process import receive, send, serve
 from mavfi_cli.mission.companion.protection import NoProtection
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.instruction.scope import node_scope
 from mavfi_cli.mission.platform import load_platform
@@ -56,6 +56,7 @@ def main() -> None:
     config = setup.config
     companion = Companion(
         config,
+        stack_of(config),
         load_platform(config.platform),
         planners.find(config.planner),
         setup.briefing,
@@ -64,7 +65,7 @@ def main() -> None:
         NoProtection(),
     )
     send(connection, (node_scope(setup.node, config.planner), _newest_cache_ns()))
-    serve(connection, {setup.node: companion.executor.nodes[setup.node].run})
+    serve(connection, companion.executor.process_of(setup.node))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.mission.record.trace import read_trace
+from mavfi_cli.mission.stack import FIRST
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -137,4 +138,6 @@ def load_run(path: Path) -> Run:
     missing = [key for key in _NEEDED if key not in result]
     if missing:
         raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")
+    # Records of before there were stacks flew the one that there was.
+    result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}
     return Run(folder, result, trace)

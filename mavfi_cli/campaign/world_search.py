@@ -1,0 +1,128 @@
+"""The search for fixed worlds: candidates are flown golden, in turn, until one fits the rule.
+
+The search is a campaign of its own, in a folder of the campaign's. One that was interrupted goes on
+where it stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import PlannedMission, golden_of
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.campaign.specification.fixed_world import FixedWorld, Flown
+from mavfi_cli.campaign.specification.spec import Spec
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.mission.config import MissionConfig
+
+SEARCH = "world-search"  # the folder
+_AT_ONCE = 4  # candidates whose flights fill the slots together
+
+
+class NoWorldFits(ConfigError):
+    """None of the candidates fits the rule; says how often their flights replan."""
+
+    def __init__(self, world: str, rule: FixedWorld, flown: Flown) -> None:
+        often = sorted(count for replans in flown for count in replans)
+        seen = f"; they replan {often[0]} to {often[-1]} times" if often else ""
+        super().__init__(
+            f"no world seed of {world} up to {rule.candidates} is {rule.rule()}{seen}; leave the "
+            f"world out of `worlds`, or name its seed in [fixed_world.world_seed]",
+            key="fixed_world",
+        )
+
+
+class _Notes(Spectator):
+    """Hands on notes only: the progress of a search is none of the campaign."""
+
+    def __init__(self, spectator: Spectator) -> None:
+        self.on_note = spectator.on_note  # type: ignore[method-assign]
+
+
+def with_worlds(
+    spec: Spec,
+    missions: Sequence[PlannedMission],
+    folder: Path,
+    options: Options,
+    spectator: Spectator,
+) -> Spec:
+    """The specification with a seed for every world that the rule is for.
+
+    A world is judged by the first mission in it, flown without fault and protection. The first
+    mission has the first of all values, so all stacks and platforms share one world.
+
+    Args:
+        missions: of the specification.
+        folder: of the campaign.
+
+    Raises:
+        NoWorldFits: no candidate fits.
+        MavfiError: as `run_campaign`.
+    """
+    rule = spec.fixed_world
+    if rule is None:
+        return spec
+    judged: dict[str, MissionConfig] = {}
+    for mission in missions:
+        config = mission.config
+        if config.world_seed is None and rule.rules(config.world):
+            judged.setdefault(config.world, golden_of(config))
+    for world, config in judged.items():
+        flown = _search(rule, config, spec.first_seed, folder / SEARCH, options, spectator)
+        rule = replace(
+            rule,
+            world_seed={**rule.world_seed, world: len(flown)},
+            flown={**rule.flown, world: flown},
+        )
+        spectator.on_note(f"fixed world {world}: seed {len(flown)}")
+    return replace(spec, fixed_world=rule)
+
+
+def _search(
+    rule: FixedWorld,
+    config: MissionConfig,
+    first_seed: int,
+    folder: Path,
+    options: Options,
+    spectator: Spectator,
+) -> Flown:
+    """The replans of candidates 1, 2, 3, ... up to the one that fits."""
+    flown: Flown = ()
+    for first in range(1, rule.candidates + 1, _AT_ONCE):
+        last = min(first + _AT_ONCE - 1, rule.candidates)
+        spectator.on_note(f"fixed world {config.world}: seeds {first} to {last} are flown")
+        missions = {
+            seed: [
+                replace(config, world_seed=seed, seed=first_seed + flight)
+                for flight in range(rule.flights)
+            ]
+            for seed in range(first, last + 1)
+        }
+        replans = _replans(missions, folder, options, spectator)
+        for seed, configs in missions.items():
+            counts = (replans[each] for each in configs)
+            flown = (*flown, tuple(count for count in counts if count is not None))
+            if rule.fits(flown[-1]):
+                return flown[:seed]
+    raise NoWorldFits(config.world, rule, flown)
+
+
+def _replans(
+    missions: dict[int, list[MissionConfig]], folder: Path, options: Options, spectator: Spectator
+) -> dict[MissionConfig, int | None]:
+    """How often each flight replans; None where it could not begin."""
+    planned = [
+        PlannedMission(config=config, labels={"world": config.world, "world_seed": seed})
+        for seed, configs in missions.items()
+        for config in configs
+    ]
+    quiet = replace(options, keep=Keep.NONE)
+    with run_campaign(planned, folder, quiet, _Notes(spectator), append=True) as ledger:
+        return {
+            each.mission.config: (each.result.get("pilot") or {}).get("replans")
+            for each in ledger.results()
+        }

@@ -1,0 +1,232 @@
+"""Stacks: how the companion is wired and what it checks. TOML files, one a stack.
+
+A file either says every key, or names a shipped stack as its `base` and says what differs. For an
+ablation a stack can be named with what differs: `mavbench:guards_tracking=true`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.core.config import read_toml, shipped_names, shipped_path, structure
+from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
+from mavfi_cli.detect.base import StackMark
+from mavfi_cli.mission.platform import KERNELS
+
+DEFAULT = "mavbench"
+FIRST = "hardened"  # the stack of records that name none
+_FOLDER = Path(__file__).parent / "stacks"
+_ABOUT = ("name", "description", "base", "sources")
+_PAIR = re.compile(r",(?=\s*\w+\s*=)")  # between two KEY=VALUE; arrays have commas, too
+_LIMITS = {  # smallest and largest of each number
+    "tracking_guard_m": (0.1, 1000.0),
+    "farthest_waypoint_m": (10.0, 1.0e6),
+    "position_gain_per_s": (0.01, 10.0),
+    "climb_gain_per_s": (0.0, 10.0),
+    "integral_gain_per_s2": (0.0, 10.0),
+    "damping_gain": (0.0, 1.0),
+    "check_radius_m": (0.1, 10.0),
+    "planner_radius_m": (0.1, 10.0),
+    "goal_tolerance_m": (0.1, 50.0),
+    "rejected_plan_pause_s": (0.0, 60.0),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stack:
+    """How the companion is wired and what it checks. docs/stacks.md explains every key.
+
+    Attributes:
+        stretches_clock: a waypoint is flown until its distance is flown. A command that is clipped
+            to a share of its speed advances the trajectory's clock by that share.
+        skips_endless_slices: a waypoint whose slice of 10 ms is stretched to 2^63 s or more is over
+            at once.
+        guards_tracking: farther than `tracking_guard_m` from the reference the vehicle stops and
+            plans anew.
+        refuses_far_waypoints: the check reports a waypoint that is not finite, or farther than
+            `farthest_waypoint_m` from the first one, as a collision.
+        shifts_path_to_vehicle: the check moves the path rigidly until its front is the vehicle.
+        owns_sequence_numbers: planner, check and pilot count by themselves and reject what is
+            older than their own number. Else each continues the number of the other.
+        stops_on_report: a foreseen collision ends the plan: the vehicle stops. Else it goes on,
+            slows down or stops along the plan.
+        uses_time_to_collision: a stop waits until braking has to begin, or the choice between
+            going on, slowing down and stopping depends on it. Else the vehicle stops at once.
+        acts_on_report_once: of reports with the same number only the first counts.
+        plans_in_motion: plans begin where the vehicle will be. Else it hovers while it plans.
+        processes: nodes that share a process: they work one after the other, and die together.
+        control_owns_queue: control gets a plan once and keeps it. Else it gets the plan with every
+            tick.
+        position_gain_per_s, climb_gain_per_s: P gain of horizontal and vertical position.
+        integral_gain_per_s2, damping_gain: I and D gain of position.
+        feeds_acceleration_forward: the reference accelerates as its waypoints say. Else it keeps
+            each waypoint's velocity, and nobody reads accelerations.
+        check_radius_m, planner_radius_m: distance that the check and the planner keep.
+        goal_tolerance_m: how near the goal counts as reached.
+        arrives_at_rest: only a vehicle at rest has arrived.
+        turns_before_departure: the vehicle turns once all round before the first plan.
+        rejected_plan_pause_s: pause before another plan is asked for after a rejected one.
+        slows_where_blind: the vehicle flies at half speed where it does not look.
+        sources: key -> where its value is from.
+    """
+
+    name: str
+    stretches_clock: bool
+    skips_endless_slices: bool
+    guards_tracking: bool
+    tracking_guard_m: float
+    refuses_far_waypoints: bool
+    farthest_waypoint_m: float
+    shifts_path_to_vehicle: bool
+    owns_sequence_numbers: bool
+    stops_on_report: bool
+    uses_time_to_collision: bool
+    acts_on_report_once: bool
+    plans_in_motion: bool
+    processes: tuple[tuple[str, ...], ...]
+    control_owns_queue: bool
+    position_gain_per_s: float
+    climb_gain_per_s: float
+    integral_gain_per_s2: float
+    damping_gain: float
+    feeds_acceleration_forward: bool
+    check_radius_m: float
+    planner_radius_m: float
+    goal_tolerance_m: float
+    arrives_at_rest: bool
+    turns_before_departure: bool
+    rejected_plan_pause_s: float
+    slows_where_blind: bool
+    description: str = ""
+    base: str = ""
+    sources: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key, (low, high) in _LIMITS.items():
+            value = getattr(self, key)
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ValueError(f"{key}: must be within {low:g} and {high:g}, is {value:g}")
+        self._check_processes()
+        if self.planner_radius_m < self.check_radius_m:
+            raise ValueError(
+                f"planner_radius_m: {self.planner_radius_m:g} is below check_radius_m, "
+                f"{self.check_radius_m:g}: the check would refuse what the planner has made"
+            )
+        if self.acts_on_report_once and not (self.stops_on_report or self.plans_in_motion):
+            raise ValueError(
+                "acts_on_report_once: a vehicle that neither stops on a report nor plans in motion "
+                "would fly on into the obstacle"
+            )
+        for key in self.sources:
+            if key not in KEYS:
+                raise ValueError(f"sources.{key}: no such key")
+
+    def _check_processes(self) -> None:
+        seen: set[str] = set()
+        for nodes in self.processes:
+            if len(nodes) < 2:
+                raise ValueError("processes: a process that is shared has two nodes or more")
+            for node in nodes:
+                if node not in KERNELS:
+                    raise ValueError(f"processes: no node {node!r}; known: {', '.join(KERNELS)}")
+                if node == "control":
+                    raise ValueError("processes: control works in every tick, alone in its process")
+                if node in seen:
+                    raise ValueError(f"processes: {node} is in two of them")
+                seen.add(node)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Every key that decides how a mission flies, with its value."""
+        return {key: getattr(self, key) for key in KEYS}
+
+    @property
+    def mark(self) -> StackMark:
+        """What a detector's model remembers of the stack that it was fitted to."""
+        text = json.dumps(self.settings, sort_keys=True)
+        return StackMark(name=self.name, digest=hashlib.sha256(text.encode()).hexdigest())
+
+
+KEYS: tuple[str, ...] = tuple(each.name for each in fields(Stack) if each.name not in _ABOUT)
+
+
+def stack_names() -> list[str]:
+    """The shipped stacks, in alphabetical order."""
+    return shipped_names(_FOLDER)
+
+
+def load_stack(text: str) -> Stack:
+    """The stack that a text names: `NAME`, `FILE.toml`, or either with `:KEY=VALUE,KEY=VALUE`.
+
+    A name is that of a shipped stack. Values are written as in TOML, and replace those of the
+    stack.
+
+    Raises:
+        UnknownName: no shipped stack has this name, and it is not a path to a TOML file.
+        UnknownKey: a key that no stack has; names the nearest.
+        ConfigError: the file or a value cannot be used; a key is missing; the stack contradicts
+            itself.
+    """
+    name, colon, changes = text.partition(":")
+    path = shipped_path("stack", name, _FOLDER)
+    values, source = _values(path)
+    if colon:
+        changed = _changes(changes)
+        sources = {**values.get("sources", {}), **dict.fromkeys(changed, "this variant's name")}
+        about = {"name": text, "base": name, "description": "", "sources": sources}
+        values = {**values, **changed, **about}
+    return structure(values, Stack, path=path, text=source)
+
+
+def lineage(stack: Stack) -> Iterator[Stack]:
+    """The stack, that which it is based on, and so on; raises as `load_stack`."""
+    yield stack
+    while stack.base:
+        stack = load_stack(stack.base)
+        yield stack
+
+
+def _values(path: Path) -> tuple[dict[str, Any], str]:
+    """What a file and its base say, and the file's text."""
+    values, text = read_toml(path)
+    _require_known(values, path)
+    base = values.get("base", "")
+    if not base:
+        return values, text
+    if base not in stack_names() or path == _FOLDER / f"{base}.toml":
+        error = UnknownName("stack", str(base), set(stack_names()) - {path.stem})
+        raise ConfigError(str(error), path=path, key="base")
+    inherited, _ = _values(_FOLDER / f"{base}.toml")
+    told = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}
+    return {**inherited, **values, "sources": {**told, **values.get("sources", {})}}, text
+
+
+def _changes(text: str) -> dict[str, Any]:
+    """The values of `KEY=VALUE,KEY=VALUE`."""
+    try:
+        values = tomllib.loads("\n".join(_PAIR.split(text)))
+    except tomllib.TOMLDecodeError:
+        raise ConfigError(
+            f"expected KEY=VALUE,KEY=VALUE after the stack's name, got {text!r}", key="stack"
+        ) from None
+    _require_known(values, None)
+    return values
+
+
+def _require_known(values: Mapping[str, Any], path: Path | None) -> None:
+    for key in values:
+        if key not in (*KEYS, *_ABOUT):
+            raise UnknownKey(key, (*KEYS, *_ABOUT), path=path)
+
+
+def with_tolerance(stack: Stack, goal_tolerance_m: float | None) -> Stack:
+    """The stack with a mission's own tolerance of the goal; None leaves the stack's."""
+    return stack if goal_tolerance_m is None else replace(stack, goal_tolerance_m=goal_tolerance_m)

@@ -1,0 +1,158 @@
+"""Fixed worlds: the rule, the search, and that a campaign remembers what it has found."""
+
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.campaign import begin as beginning
+from mavfi_cli.campaign.begin import begin, fixed_world
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.specification.changes import replaced
+from mavfi_cli.campaign.specification.fixed_world import FixedWorld
+from mavfi_cli.campaign.specification.spec import parse_spec
+from mavfi_cli.campaign.specification.text import to_toml
+from mavfi_cli.campaign.world_search import SEARCH
+from mavfi_cli.core.errors import ConfigError, UnknownKey
+
+SPEC = """
+name = "mine"
+repetitions = 2
+[factors]
+world = ["rising", "flat"]
+[fixed_world]
+replans = [5, 6]
+flights = 3
+candidates = 9
+worlds = ["rising"]
+[[setting]]
+name = "golden"
+stack = ["hardened", "mavbench"]
+[[setting]]
+name = "FI"
+stage = "control"
+"""
+
+
+def spec_of(text=SPEC):
+    return parse_spec(text, Path("mine.toml"))
+
+
+@pytest.fixture
+def begun(campaign, monkeypatch):
+    """Begin a campaign of flights that fly nothing; its stored rule and missions."""
+    monkeypatch.setattr(beginning, "_check", lambda missions: None)  # no vehicle knows the worlds
+
+    def of(spec, **how):
+        with begin(
+            spec, campaign.folder, options=campaign.options, spectator=campaign.notes, **how
+        ) as ledger:
+            return fixed_world(ledger), [row[3] for row in ledger.rows()]
+
+    return of
+
+
+def test_all_missions_in_a_world_fly_the_first_candidate_that_fits(begun, campaign):
+    rule, missions = begun(spec_of())
+    assert rule.world_seed == {"rising": 5}
+    assert rule.flown == {"rising": ((1,) * 3, (2,) * 3, (3,) * 3, (4,) * 3, (5,) * 3)}
+    assert len(missions) == 2 * 2 * 3
+    assert {'"world":"rising"' in each for each in missions} == {True, False}
+    for each in missions:
+        assert ('"world_seed":5' in each) == ('"world":"rising"' in each)
+    assert campaign.notes.lines[-1] == "fixed world rising: seed 5"
+    with Ledger(campaign.folder / SEARCH) as search:
+        flown = [each.mission.config for each in search.results()]
+    assert {config.stack for config in flown} == {"hardened"}  # the first
+    assert {config.fault for config in flown} == {None}
+    assert sorted({config.seed for config in flown}) == [1, 2, 3]
+    assert rule.told() == (
+        "world seeds: rising 5 (median 5); "
+        "the first from 1 on whose golden flights replan 5 to 6 times (median of 3)"
+    )
+
+
+def test_a_campaign_that_was_begun_searches_no_more(begun, campaign, monkeypatch):
+    found = begun(spec_of())
+    text = (campaign.folder / "campaign.toml").read_text()
+    assert parse_spec(text, Path("x.toml")).fixed_world == found[0]
+    monkeypatch.setattr("mavfi_cli.campaign.world_search._search", None)
+    assert begun(spec_of()) == found  # the same command
+    assert begun(parse_spec(text, Path("x.toml"))) == found  # the folder, or its file elsewhere
+    more, missions = begun(spec_of(SPEC.replace("= 2\n", "= 3\n")), append=True)
+    assert (more, len(missions)) == (found[0], 18)
+
+
+def test_an_interrupted_search_goes_on(begun, campaign):
+    begun(spec_of())
+    (campaign.folder / "ledger.sqlite").unlink()
+    with Ledger(campaign.folder / SEARCH) as search:
+        before = search.over()
+    begun(spec_of())
+    with Ledger(campaign.folder / SEARCH) as search:
+        assert search.over() == before == 8 * 3
+
+
+def test_another_rule_is_another_campaign(begun):
+    begun(spec_of())
+    other = spec_of(SPEC.replace("[5, 6]", "[2, 2]"))
+    with pytest.raises(ConfigError, match="rule of fixed worlds the first from 1 on whose golden"):
+        begun(other)
+    with pytest.raises(ConfigError, match=r"another \[fixed_world\]; another folder starts anew"):
+        begun(other, append=True)
+
+
+def test_a_world_in_which_none_fits_is_an_error_unless_it_is_named_or_left_out(begun, campaign):
+    everywhere = SPEC.replace('worlds = ["rising"]\n', "")
+    told = r"^fixed_world: no world seed of flat up to 9 is the first .* they replan 0 to 0 times; "
+    with pytest.raises(ConfigError, match=told):
+        begun(spec_of(everywhere))
+    assert not (campaign.folder / "campaign.toml").exists()
+    named = everywhere.replace("[[setting]]", "[fixed_world.world_seed]\nflat = 7\n[[setting]]", 1)
+    rule, missions = begun(spec_of(named))
+    assert rule.world_seed == {"flat": 7, "rising": 5}
+    assert sum('"world_seed":7' in each for each in missions) == 6
+    assert "flat 7 (named)" in rule.told()
+
+
+def test_a_seed_of_the_mission_goes_before_the_rule(begun):
+    rule, missions = begun(replaced(spec_of(), ["world_seed=4"]))
+    assert rule.world_seed == {}
+    assert all('"world_seed":4' in each for each in missions)
+
+
+def test_other_values_of_factors_keep_the_rule(begun):
+    rule, missions = begun(replaced(spec_of(), ["world=rising", "stack=mavbench"]))
+    assert rule.world_seed == {"rising": 5}
+    assert len(missions) == 2 * 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error", "told"),
+    [
+        ("replans = [5, 6]", "", ConfigError, "fixed_world.replans: is missing"),
+        ("replans = [5, 6]", "replans = [6, 5]", ConfigError, r"replans: expected \[LEAST, MOST\]"),
+        ("replans = [5, 6]", "replans = 5", ConfigError, "fixed_world.replans: "),
+        ("flights = 3", "flights = 0", ConfigError, "must be at least 1"),
+        ("flights = 3", "fligths = 3", UnknownKey, "fixed_world.fligths: .*did you mean 'flights'"),
+    ],
+)
+def test_a_rule_that_makes_no_sense_is_refused(old, new, error, told):
+    with pytest.raises(error, match=told):
+        spec_of(SPEC.replace(old, new))
+
+
+def test_the_rule_comes_back_as_it_was():
+    spec = spec_of(SPEC.replace("worlds =", 'world_seed = {"train-0.05-3" = 2}\nworlds ='))
+    assert spec_of(to_toml(spec)) == spec
+
+
+def test_a_candidate_whose_flights_could_not_begin_does_not_fit():
+    rule = FixedWorld(replans=(0, 9), flights=2)
+    assert rule.fits((1, 2))
+    assert not rule.fits((1,))
+    assert not rule.fits(())
+
+
+def test_boxes_of_a_user_are_one_world_already():
+    rule = FixedWorld(replans=(0, 9))
+    assert (rule.rules("dense"), rule.rules("mine.toml")) == (True, False)

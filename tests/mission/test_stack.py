@@ -1,0 +1,177 @@
+"""Stacks: their files, and what each key does to a flight."""
+
+import json
+import math
+
+import pytest
+from record_digest import record_digest
+
+from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.stack import KEYS, load_stack, stack_names
+
+
+def test_the_shipped_stacks_say_every_key_and_where_it_is_from():
+    assert stack_names() == ["hardened", "mavbench", "mavbench-protected", "mavbench-release"]
+    mavbench = load_stack("mavbench")
+    unused = {"tracking_guard_m", "farthest_waypoint_m"}
+    assert set(mavbench.sources) == set(KEYS) - unused
+    assert mavbench.processes == (("octomap", "collision_check", "planner"),)
+    assert (mavbench.check_radius_m, mavbench.planner_radius_m) == (1.5, 2.0)
+
+
+def test_the_release_differs_in_the_two_claims_only():
+    paper, release = load_stack("mavbench").settings, load_stack("mavbench-release").settings
+    assert {key for key in KEYS if paper[key] != release[key]} == {
+        "uses_time_to_collision", "feeds_acceleration_forward",
+    }  # fmt: skip
+
+
+def test_a_file_of_the_users_switches_one_key(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('name = "mine"\nbase = "mavbench"\nguards_tracking = true\n')
+    mine, base = load_stack(str(file)), load_stack("mavbench")
+    assert {key for key in KEYS if mine.settings[key] != base.settings[key]} == {"guards_tracking"}
+    assert mine.name == "mine"
+    assert "guards_tracking" not in mine.sources  # the base's source is not of this value
+
+
+def test_a_variant_is_named_by_what_differs():
+    text = 'mavbench:guards_tracking=true,processes=[["octomap","planner"]]'
+    variant = load_stack(text)
+    assert (variant.name, variant.base, variant.guards_tracking) == (text, "mavbench", True)
+    assert variant.processes == (("octomap", "planner"),)
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "said"),
+    [
+        ("mavbenc", UnknownName, "did you mean 'mavbench'"),
+        ("mavbench:guard=true", UnknownKey, "did you mean 'guards_tracking'"),
+        ("mavbench:guards_tracking", ConfigError, "expected KEY=VALUE"),
+        ("mavbench:guards_tracking=1", ConfigError, "guards_tracking"),
+        ("mavbench:guards_tracking=true,tracking_guard_m=0.0", ConfigError, "tracking_guard_m"),
+        ("mavbench:planner_radius_m=1.0", ConfigError, "check would refuse"),
+        ("mavbench:stops_on_report=false", ConfigError, "into the obstacle"),
+        ('mavbench:processes=[["octomap"]]', ConfigError, "two nodes or more"),
+        ('mavbench:processes=[["octomap","control"]]', ConfigError, "control"),
+        ('mavbench:processes=[["octomap","planer"]]', ConfigError, "no node 'planer'"),
+        ("nowhere.toml", ConfigError, "no such file"),
+    ],
+)
+def test_a_stack_that_cannot_be_is_refused_in_one_line(text, error, said):
+    with pytest.raises(error, match=said) as refused:
+        load_stack(text)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_file_that_lacks_a_key_is_refused(tmp_path):
+    file = tmp_path / "half.toml"
+    file.write_text('name = "half"\nguards_tracking = true\n')
+    with pytest.raises(ConfigError, match="is missing"):
+        load_stack(str(file))
+
+
+def fly(tmp_path, **values):
+    folder = fly_mission(MissionConfig(**{"world": "dense", "seed": 3, **values}), tmp_path,
+                         Watcher())  # fmt: skip
+    return load_run(folder.path)
+
+
+@pytest.fixture(scope="module")
+def golden(tmp_path_factory):
+    return fly(tmp_path_factory.mktemp("golden"))
+
+
+@pytest.mark.slow
+def test_the_paper_s_stack_turns_round_stops_and_plans_from_the_hover(golden):
+    result = golden.result
+    assert result["outcome"] == "success"
+    assert result["config"]["stack"] == "mavbench"
+    assert result["config"]["goal_tolerance_m"] == 8.0
+    phases = golden.trace["phase"].to_pylist()
+    assert phases[0] == "turning"
+    assert phases.count("turning") * 0.02 == pytest.approx(6.0, abs=0.1)
+    assert {"evading", "slowing"}.isdisjoint(phases)
+    assert result["pilot"]["replans"] == result["pilot"]["stops"] == 2
+    speeds = [math.hypot(*v) for v in zip(*(golden.trace[f"v{a}_mps"].to_pylist() for a in "xyz"),
+                                          strict=True)]  # fmt: skip
+    departures = [n for n in range(1, len(phases))
+                  if phases[n] == "flying" and phases[n - 1] != "flying"]  # fmt: skip
+    assert len(departures) == 3
+    assert max(speeds[n] for n in departures) <= 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "key",
+    ["refuses_far_waypoints=true", "control_owns_queue=false", "stretches_clock=false",
+     "rejected_plan_pause_s=0.2"],
+)  # fmt: skip
+def test_a_protection_changes_nothing_without_a_fault(key, golden, tmp_path):
+    """What masks faults must not act in a golden flight, else its ablation would say nothing."""
+    variant = fly(tmp_path, stack=f"mavbench:{key}")
+    for name in ("trace.parquet", "plans.parquet"):
+        assert (variant.folder.path / name).read_bytes() == (golden.folder.path / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_flight_of_the_paper_s_stack_repeats_with_its_nodes_apart(golden, tmp_path):
+    again = fly(tmp_path, isolate=("octomap", "control"))
+    assert record_digest(again.folder.path) == record_digest(golden.folder.path)
+
+
+@pytest.mark.slow
+def test_a_number_that_a_fault_has_raised_stalls_the_mission_and_heals_where_it_is_shared(tmp_path):
+    """Bit 30 of the first plan's trajectory_seq: no later plan has a larger number."""
+    fault = FaultConfig(target="plan_trajectory_seq", at="invocation=1", exact_bits=(30,))
+    lost = fly(tmp_path, fault=fault, time_limit_s=60.0)
+    assert lost.result["outcome"] == "timeout"
+    asked = lost.result["pilot"]
+    assert asked["plans_ignored"] > 5
+    assert asked["plans_requested"] < 60  # about one a second, not ten
+    kept = fly(tmp_path, fault=fault, stack="mavbench:owns_sequence_numbers=false",
+               time_limit_s=60.0)  # fmt: skip
+    assert kept.result["outcome"] == "success"
+
+
+@pytest.mark.slow
+def test_a_far_waypoint_is_flown_until_its_distance_is_flown(tmp_path):
+    fault = FaultConfig(target="queue.waypoint_x", at="time=10", exact_bits=(57,))
+    where = {"world": "farm", "time_limit_s": 40.0, "fault": fault}
+    lost = fly(tmp_path, **where)
+    assert lost.result["outcome"] == "timeout"
+    assert lost.trace["x_m"][-1].as_py() > 60.0
+    for key in ("stretches_clock=false", "guards_tracking=true", "control_owns_queue=false"):
+        kept = fly(tmp_path, stack=f"mavbench:{key}", **where)
+        assert kept.result["outcome"] == "success", key
+
+
+@pytest.mark.slow
+def test_a_dead_process_takes_its_mates_and_the_map_with_it(golden, tmp_path):
+    fault = FaultConfig(target="process.planner", at="time=9")
+    run = fly(tmp_path, fault=fault)
+    nodes = run.result["nodes"]
+    assert {name: node["restarts"] for name, node in nodes.items()} == {
+        "point_cloud": 0, "octomap": 1, "collision_check": 1, "planner": 1, "control": 0,
+    }  # fmt: skip
+    assert run.result["fault"]["states"] == ["process.planner"]
+    assert run.result["fault"]["strike_count"] == 1
+    never = fly(tmp_path, fault=fault, node_restart_s=3600.0)
+    assert never.result["outcome"] == "collision"  # nobody looks ahead any more
+    assert fly(tmp_path, fault=fault).trace.equals(run.trace)
+
+
+@pytest.mark.slow
+def test_a_record_of_before_there_were_stacks_replays_as_hardened(golden, tmp_path):
+    folder = tmp_path / "older"
+    folder.mkdir()
+    result = json.loads(golden.folder.result.read_text())
+    del result["config"]["stack"], result["config"]["world_seed"]
+    (folder / "result.json").write_text(json.dumps(result))
+    assert config_of(load_run(folder)).stack == "hardened"
