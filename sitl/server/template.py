@@ -123,7 +123,12 @@ class Template:
         self._poller.register(self._branched, select.POLLIN)
 
     def serve(self) -> None:
-        """Until the other end closes."""
+        """Serve until the other end closes, then close every channel."""
+        with self._control, self._branched, self._register:
+            self._obey_all()
+            self._let_go()
+
+    def _obey_all(self) -> None:
         while True:
             for descriptor, _ in self._poller.poll():
                 if descriptor in self._flying:
@@ -209,6 +214,9 @@ class Template:
 
     def _settle(self) -> None:
         end_children()
+        self._let_go()
+
+    def _let_go(self) -> None:
         for descriptor, ended in self._flying.items():
             self._poller.unregister(descriptor)
             os.close(descriptor)
