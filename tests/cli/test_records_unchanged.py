@@ -1,0 +1,123 @@
+"""The commands' machine-readable outputs are what they were: a guard for every redesign.
+
+Each hash stands for all that a command reports, without what tells of time, host, versions and
+paths. A change that means to alter a record renews the hash and says why.
+"""
+
+import csv
+import hashlib
+import io
+import json
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+# Fields of reports that depend on the host, on the clock or on the code's own files; a struck
+# register may hold an address, and where the stack begins depends on the length of paths.
+_PASSING = {
+    *("attempts", "build_ids", "cpu_s", "host", "injections_per_core_hour", "path", "prepare_s"),
+    *("sources", "struck_after_hex", "struck_before_hex", "timeline", "versions", "wall_s"),
+}
+CAMPAIGN = """
+name = "hashed"
+repetitions = 1
+keep = "none"
+[mission]
+start = [2.0, 2.0, 0.0]
+goal = [10.0, 6.0, 5.0]
+world = "farm"
+[factors]
+stack = ["mavbench", "hardened"]
+[[setting]]
+name = "golden"
+[[setting]]
+name = "FI"
+site = "waypoint_position"
+together = true
+field = "exponent"
+[[setting]]
+name = "FI"
+level = "instruction"
+stage = "control"
+[[setting]]
+name = "D&R(A)"
+site = "waypoint_position"
+together = true
+field = "exponent"
+detector = "aad"
+any_stack = true
+"""
+
+
+def lasting(value):
+    """The report without the fields that differ from run to run."""
+    if isinstance(value, dict):
+        return {key: lasting(item) for key, item in value.items() if key not in _PASSING}
+    if isinstance(value, list):
+        return [lasting(item) for item in value]
+    return value
+
+
+def digest(value):
+    return hashlib.sha256(json.dumps(lasting(value), sort_keys=True).encode()).hexdigest()[:16]
+
+
+@pytest.fixture
+def report(mavfi, tmp_path):
+    """Run a command in an empty folder; what it prints, as JSON or as rows of CSV."""
+    (tmp_path / "hashed.toml").write_text(CAMPAIGN)
+
+    def run(arguments):
+        done = mavfi(*arguments, cwd=tmp_path, timeout=600.0)
+        assert done.returncode == 0, done.stderr
+        if done.stdout.startswith(("{", "[")):
+            return json.loads(done.stdout)
+        return list(csv.DictReader(io.StringIO(done.stdout)))
+
+    return run
+
+
+COMMANDS = {
+    "campaign": (
+        "e5a43c538cf29d5b",
+        ["campaign", "run", "hashed.toml", "--quiet", "--out", "c", "--json"],
+        ["campaign", "status", "c", "--quality", "--failures", "--json"],
+        ["campaign", "export", "c", "-"],
+    ),
+    "plan": ("6aa389c6388b46f8", ["campaign", "plan", "fig7", "--json"]),
+    "kernels": ("d49c145442c23906", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
+    "compare": (
+        "eac34e35e3c1cd54",
+        [
+            *("compare", "--platform", "x86", "--platform", "tx2", "--world", "farm"),
+            *("--inject", "waypoint_position", "--field", "exponent", "--detector", "none,gad"),
+            *("--missions", "1", "--quiet", "--json"),
+        ],
+    ),
+    "evaluate": (
+        "0f143c6526f0a965",
+        [
+            *("detect", "evaluate", "--world", "farm", "--detector", "none,gad", "--flights", "1"),
+            *("--harmless-flights", "0", "--golden-flights", "1", "--field", "exponent"),
+            *("--quiet", "--json"),
+        ],
+    ),
+    "vpm": ("296d60db76b3b4d4", ["vpm", "--vehicle", "spark", "--json"]),
+    "vpm --fly": (
+        "347da80654dec6fe",
+        [
+            *("vpm", "--vehicle", "spark", "--fly", "--world", "farm", "--missions", "1"),
+            *("--quiet", "--csv"),
+        ],
+    ),
+    "platforms": ("74ae6a5804b06c25", ["platforms", "--json"]),
+    "stacks": ("9d210fde04e7d330", ["stacks", "mavbench", "--json"]),
+    "states": ("a82ad9744e330395", ["states", "--json"]),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_report_is_what_it_was(name, report):
+    expected, *commands = COMMANDS[name]
+    assert digest([report(arguments) for arguments in commands]) == expected
