@@ -59,18 +59,17 @@ class DetectorConfig:
 
 
 def model_path(config: DetectorConfig, stack: str) -> Path | None:
-    """The model file of a mission's detector; None where nothing fits, or it has no model.
+    """The model file of a mission's detector; None if it has no model.
 
-    It is the one that is asked for, else the one that is shipped for the stack. With `any_stack` a
-    stack without one takes that of the stack which it is based on.
+    The file is the one that is asked for, else the one that is shipped for the stack or for the
+    nearest stack that it is based on. `detector_of` refuses the latter without `any_stack`.
 
     Args:
         stack: of the mission, as `load_stack` takes it; raises as that does.
     """
     if config.model is not None:
         return Path(config.model)
-    flown = load_stack(stack)
-    for each in lineage(flown) if config.any_stack else (flown,):
+    for each in lineage(load_stack(stack)):
         if each.name in shipped_stacks() and (path := shipped(config.name, each.name)).is_file():
             return path
     return None
