@@ -11,14 +11,14 @@ import click
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print result.json as it is.")
-@click.option("--golden/--no-golden", default=True, show_default=True,
-              help="Fly the golden pair once, to say what the fault changed.")  # fmt: skip
+@click.option("--pair", is_flag=True,
+              help="Fly the golden pair, to say what the fault changed. It is kept in RUN.")  # fmt: skip
 @click.option("--events", is_flag=True, help="Also list every event of the flight.")
 @click.option("--picture", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
               help="Draw the flight from above, as SVG.")  # fmt: skip
-def show(run: Path, as_json: bool, golden: bool, events: bool, picture: Path | None) -> None:
+def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
     """Say what happened in RUN, a run folder."""
-    from mavfi_cli.mission.golden import paired_golden
+    from mavfi_cli.mission.golden import kept_golden, paired_golden
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.summary import difference_lines, event_lines, summary_lines
 
@@ -31,8 +31,12 @@ def show(run: Path, as_json: bool, golden: bool, events: bool, picture: Path | N
         click.echo(json.dumps(record.result, indent=2, sort_keys=True))
         return
     lines = summary_lines(record.result)
-    if golden and record.result.get("fault"):
-        lines += difference_lines(record, paired_golden(record, _note))
+    if record.result.get("fault"):
+        golden = paired_golden(record, _note) if pair else kept_golden(record)
+        if golden is None:
+            lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair and tells it")
+        else:
+            lines += difference_lines(record, golden)
     if events:
         lines += ["", "Events", *event_lines(record.result)]
     click.echo("\n".join(lines))

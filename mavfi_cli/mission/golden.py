@@ -16,6 +16,13 @@ from mavfi_cli.mission.run import fly_mission
 FOLDER = "golden"
 
 
+def kept_golden(run: Run) -> Run | None:
+    """The golden pair that is kept in the run's folder; None if none was flown to its end."""
+    folder = run.folder.path / FOLDER
+    golden = load_run(folder) if folder.is_dir() else None
+    return None if golden is None or interrupted(golden) else golden
+
+
 def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
     """The golden pair of a run: flown once, then kept in the run's folder.
 
@@ -27,11 +34,9 @@ def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run
         Interrupted: the user ended the golden flight; nothing of it is kept.
     """
     config = config_of(run, with_fault=False)
+    if (golden := kept_golden(run)) is not None:
+        return golden
     kept = run.folder.path / FOLDER
-    if kept.is_dir():
-        golden = load_run(kept)
-        if not interrupted(golden):
-            return golden
     note(f"flying the golden pair: {config.world}, seed {config.seed}")
     try:
         with tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent:

@@ -51,7 +51,7 @@ def sideways(fly_short):
 def test_an_interrupted_golden_pair_is_not_kept(command_line, sideways, cut_once):
     before = {path.name for path in sideways.path.iterdir()}
     cut_once("mavfi_cli.mission.golden")
-    code, out, err = command_line("show", sideways.path)
+    code, out, err = command_line("show", "--pair", sideways.path)
     assert (code, out) == (130, "")
     assert err.splitlines() == [
         "flying the golden pair: farm, seed 5",
@@ -59,9 +59,12 @@ def test_an_interrupted_golden_pair_is_not_kept(command_line, sideways, cut_once
     ]
     assert {path.name for path in sideways.path.iterdir()} == before
     code, out, err = command_line("show", sideways.path)
+    assert (code, err, "Effect      unknown; `mavfi show --pair`" in out) == (0, "", True)
+    code, out, err = command_line("show", "--pair", sideways.path)
     assert (code, "Effect      first at" in out) == (0, True)
     assert err == "flying the golden pair: farm, seed 5\n"
-    assert command_line("show", sideways.path) == (0, out, "")  # kept, so not flown again
+    for options in ([], ["--pair"]):  # kept, so not flown again
+        assert command_line("show", *options, sideways.path) == (0, out, "")
 
 
 def test_an_interrupted_golden_pair_of_an_older_version_is_flown_anew(sideways):
@@ -87,13 +90,13 @@ def test_an_interrupted_repetition_is_neither_equal_nor_different(
     assert not list((tmp_path / "again").iterdir())
 
 
-@pytest.mark.parametrize("command", ["show", "replay"])
+@pytest.mark.parametrize("command", [["show", "--pair"], ["replay"]])
 def test_an_interrupted_flight_does_not_repeat(command_line, fly_short, command):
     folder = fly_short(CtrlC(), fault=FaultConfig(target="command_vx", at="time=9"))
-    code, out, err = command_line(command, folder.path)
+    code, out, err = command_line(*command, folder.path)
     assert (code, out) == (1, "")
     assert err == f"error: {folder.path}: an interrupted flight does not repeat\n"
-    assert command_line("show", "--no-golden", folder.path)[0] == 0
+    assert command_line("show", folder.path)[0] == 0
 
 
 @traced
