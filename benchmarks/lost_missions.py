@@ -1,6 +1,7 @@
 """Lost and longer missions of flown campaigns, cell by cell.
 
-    python benchmarks/lost_missions.py docs/results/effects-part*.parquet --by label_setting world label_field
+    python benchmarks/lost_missions.py docs/results/effects-part*.parquet \\
+        --by label_setting world label_field
 
 Reads exports of campaigns (`mavfi campaign export`). A cell counts the missions whose fault was
 read. A mission is lost if it does not end in success. It is longer if it succeeds and takes more

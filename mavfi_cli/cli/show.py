@@ -12,7 +12,7 @@ import click
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print result.json as it is.")
 @click.option("--pair", is_flag=True,
-              help="Fly the golden pair, to say what the fault changed. It is kept in RUN.")  # fmt: skip
+              help="Fly the golden pair, say what the fault changed, and keep it.")  # fmt: skip
 @click.option("--events", is_flag=True, help="Also list every event of the flight.")
 @click.option("--picture", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
               help="Draw the flight from above, as SVG.")  # fmt: skip
@@ -34,7 +34,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
     if record.result.get("fault"):
         golden = paired_golden(record, _note) if pair else kept_golden(record)
         if golden is None:
-            lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair and tells it")
+            lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")
         else:
             lines += difference_lines(record, golden)
     if events:
