@@ -1,6 +1,6 @@
-"""Lost and longer missions of flown campaigns, cell by cell.
+r"""Lost and longer missions of flown campaigns, cell by cell.
 
-    python benchmarks/lost_missions.py docs/results/effects-part*.parquet \\
+    python benchmarks/lost_missions.py docs/results/effects-part*.parquet \
         --by label_setting world label_field
 
 Reads exports of campaigns (`mavfi campaign export`). A cell counts the missions whose fault was
