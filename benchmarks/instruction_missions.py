@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import tempfile
+from pathlib import Path
 
 from missions import fly, fly_pairs
 
@@ -36,8 +37,10 @@ def row(node: str, seed: int, given: argparse.Namespace, out: str) -> str:
     planner = node if node in PLANNERS else "rrtstar"
     plain = ["--world", given.world, "--seed", str(given.seed), "--planner", planner, "--out", out]
     plain += ["--stack", "hardened"]
-    fault = ["--level", "instruction", "--inject", "planner" if node in PLANNERS else node]
-    fault += ["--fault-seed", str(seed)] + (["--null-injection"] if given.null else [])
+    attacked = "planner" if node in PLANNERS else node
+    mission = Path(out) / f"{node}.toml"
+    mission.write_text(f'[instruction]\ntarget = "{attacked}"\nnull = {str(given.null).lower()}\n')
+    fault = ["--config", str(mission), "--fault-seed", str(seed)]
     first = fly(*plain, *fault)
     golden, attacked = fly_pairs(plain, plain + fault, given.pairs)
     wall = ([c.wall_s for c in attacked], [c.wall_s for c in golden])

@@ -10,7 +10,7 @@ from typing import NoReturn
 import click
 
 from mavfi_cli import __version__
-from mavfi_cli.core.errors import Interrupted, MavfiError
+from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
 
 # name -> (module, what it does); the help page must not import the modules
 _COMMANDS = {
@@ -56,8 +56,6 @@ class _LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """As click does, but an unknown command names the nearest one."""
-        from mavfi_cli.core.errors import UnknownName
-
         if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
             ctx.fail(str(UnknownName("command", args[0], _COMMANDS)))
         return super().resolve_command(ctx, args)
@@ -70,14 +68,26 @@ def cli() -> None:
 
 
 def main() -> NoReturn:
-    """Entry point: a known error is one line and exit code 1, a usage error exit code 2."""
+    """Entry point: a known error is one line and exit code 1, a usage error exit code 2.
+
+    A name that does not exist is a usage error.
+    """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up
     try:  # not standalone: click hands back the code of an Exit instead of leaving with it
         code = cli.main(prog_name="mavfi", standalone_mode=False)
-    except click.ClickException as error:
-        error.show()
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
         sys.exit(error.exit_code)
+    except click.NoSuchOption as error:
+        click.echo(f"error: {_no_such_option(error)}", err=True)
+        sys.exit(error.exit_code)
+    except click.ClickException as error:
+        click.echo(f"error: {error.format_message()}", err=True)
+        sys.exit(error.exit_code)
+    except UnknownName as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(2)
     except (Interrupted, KeyboardInterrupt, click.Abort) as error:
         click.echo(str(error) or "interrupted", err=True)
         sys.exit(130)
@@ -88,3 +98,11 @@ def main() -> NoReturn:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _no_such_option(error: click.NoSuchOption) -> str:
+    params = error.ctx.command.params if error.ctx is not None else []
+    known = [name.lstrip("-") for param in params for name in param.opts]
+    match = nearest(error.option_name.lstrip("-"), known)
+    hint = f"; did you mean '--{match}'?" if match else ""
+    return f"no such option {error.option_name!r}{hint}"

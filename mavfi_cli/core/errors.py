@@ -38,9 +38,12 @@ class MavfiError(Exception):
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name most like `name`, capitals apart, or None where none is close."""
+    """The known name most like `name`, capitals and folders apart, or None if none is close."""
+    for each in known:
+        if each.endswith(f"/{name}"):
+            return each
     spelled = {each.lower(): each for each in known}
-    matches = difflib.get_close_matches(name.lower(), list(spelled), n=1, cutoff=0.5)
+    matches = difflib.get_close_matches(name.lower(), list(spelled), n=1, cutoff=0.6)
     return spelled[matches[0]] if matches else None
 
 
@@ -59,11 +62,18 @@ class UnknownName(MavfiError):
 
 
 class ConfigError(MavfiError):
-    """A file or a value that cannot be used: says where (file, line, key) and why."""
+    """A file or a value that cannot be used: says where (file, line, key) and why.
+
+    Attributes:
+        problem: what is wrong, without the place.
+        path: the file, or None if the value is in no file.
+        key: name of the setting, or empty.
+    """
 
     def __init__(
         self, problem: str, *, path: Path | None = None, line: int | None = None, key: str = ""
     ) -> None:
+        self.problem, self.path, self.key = problem, path, key
         place = ""
         if path is not None:
             place = f"{path}:{line}: " if line is not None else f"{path}: "

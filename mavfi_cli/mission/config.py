@@ -126,7 +126,7 @@ class MissionConfig:
         if self.isolate or self.instruction is not None:
             raise ConfigError(
                 f"{self.platform} measures the kernels in the companion's own process: without "
-                "--isolate and --level instruction",
+                "isolate and --level instruction",
                 key="platform",
             )
 

@@ -159,6 +159,8 @@ def parse_trigger(text: str) -> Trigger:
     from mavfi_cli.autonomy.orders import Mode
 
     kind, _, value = text.partition("=")
+    if not value and kind.replace(".", "", 1).isdigit():
+        raise FaultSpecError(f"at {text}: a number needs its kind, as in time={text} (s)")
     when: When = _member(When, "trigger", kind)
     if when in (When.RANDOM, When.FORESEEN):
         return Trigger(when=when)

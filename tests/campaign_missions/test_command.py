@@ -232,7 +232,7 @@ def test_a_refused_setting_is_named_among_many(refused, tmp_path):
 def test_what_does_not_exist_gets_one_line(refused, tmp_path):
     for command_line in (("run",), ("status",), ("draw", "--output", "pair.svg"), ("export", "-")):
         name, *rest = command_line
-        assert "did you mean 'table3'?" in refused(name, "table33", *rest)
+        assert "did you mean 'table3'?" in refused(name, "table33", *rest, code=2)
     assert "campaigns/table3: no campaign there" in refused("status", "table3")
     assert "no campaign there" in refused("run", "./table3")
     assert "No such file" in refused("run", "none.toml")

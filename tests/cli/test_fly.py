@@ -66,13 +66,65 @@ def test_expect(command_line):
 def test_options_arrive_in_the_mission(command_line, planner):
     _, out, _ = command_line(
         *SHORT, "--json", "--quiet", "--no-picture", "--time-limit=1", "--planner", planner,
-        "--vehicle=spark", "--v-max=2", "--a-max=3", "--tolerance=2", "--camera=32x24",
-        "--height=4", "--land",
+        "--vehicle=spark", "--v-max=2", "--land",
     )  # fmt: skip
     config = json.loads(out)["config"]
     expected = {
-        "planner": planner, "vehicle": "spark", "v_max_mps": 2.0, "a_max_mps2": 3.0,
-        "goal_tolerance_m": 2.0, "camera_columns": 32, "camera_rows": 24, "time_limit_s": 1.0,
-        "takeoff_height_m": 4.0, "land": True, "seed": 5, "start": [2.0, 2.0, 0.0],
+        "planner": planner, "vehicle": "spark", "v_max_mps": 2.0, "time_limit_s": 1.0,
+        "land": True, "seed": 5, "start": [2.0, 2.0, 0.0],
     }  # fmt: skip
     assert {name: config[name] for name in expected} == expected
+
+
+MISSION = """
+world = "farm"
+seed = 5
+start = [2.0, 2.0, 0.0]
+goal = [10.0, 6.0, 5.0]
+takeoff_height_m = 4.0
+a_max_mps2 = 3.0
+camera_columns = 32
+time_limit_s = 9.0
+[fault]
+target = "command_vx"
+at = "time=2"
+persistence = "intermittent"
+period_s = 0.5
+[detector]
+name = "aad"
+alarms_max = 3
+"""
+
+
+def test_a_file_holds_a_whole_mission_and_options_replace_what_it_says(command_line, tmp_path):
+    (tmp_path / "mission.toml").write_text(MISSION)
+    fly = ("fly", "--config", "mission.toml", "--json", "--quiet", "--no-picture")
+    _, out, err = command_line(*fly, "--time-limit=1.5", "--at=time=1", "--protect=control")
+    assert err == ""
+    config = json.loads(out)["config"]
+    expected = {
+        "world": "farm", "takeoff_height_m": 4.0, "a_max_mps2": 3.0, "camera_columns": 32,
+        "time_limit_s": 1.5, "v_max_mps": 3.0,
+    }  # fmt: skip
+    assert {name: config[name] for name in expected} == expected
+    fault, detector = config["fault"], config["detector"]
+    assert (fault["target"], fault["at"], fault["period_s"]) == ("command_vx", "time=1", 0.5)
+    assert (detector["name"], detector["alarms_max"]) == ("aad", 3)
+    assert detector["protect"] == ["control"]
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "code", "said"),
+    [
+        ("wrold = 3\n", (), 1, "mission.toml:1: wrold: unknown key; did you mean 'world'?"),
+        ("v_max_mps = 0\n", (), 1, "v_max_mps: must be within 0.1 and 12, got 0"),
+        ("[fault]\nbits = 2\n", (), 1, "mission.toml"),
+        ("", ("--v-max=0",), 2, "error: --v-max: must be within 0.1 and 12, got 0"),
+        ("", ("--inject=planning", "--at=8"), 2, "as in time=8 (s)"),
+    ],
+)
+def test_a_mistake_names_the_file_or_the_option(command_line, tmp_path, text, options, code, said):
+    (tmp_path / "mission.toml").write_text(text)
+    left, out, err = command_line("fly", "--config", "mission.toml", *options)
+    assert (left, out, len(err.splitlines())) == (code, "", 1)
+    assert said in err

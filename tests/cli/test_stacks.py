@@ -62,5 +62,5 @@ def test_json_has_all_of_it(command_line):
 
 def test_an_unknown_stack_is_named(command_line):
     code, out, err = command_line("stacks", "hardend")
-    assert (code, out) == (1, "")
+    assert (code, out) == (2, "")
     assert "did you mean 'hardened'" in err

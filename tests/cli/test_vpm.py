@@ -122,7 +122,7 @@ def test_files_and_pictures(command_line, tmp_path):
 def test_bad_input_is_one_line(command_line, tmp_path, arguments, said):
     (tmp_path / "file").touch()
     code, out, err = command_line("vpm", *arguments)
-    assert (code, out) == (1, "")
+    assert (code, out) == (2 if said.startswith("unknown") else 1, "")
     (line,) = err.splitlines()
     assert line.startswith(f"error: {said}")
 
@@ -163,7 +163,8 @@ def test_a_bad_profile_is_one_line(command_line, tmp_path, old, new, said):
 def test_usage(command_line, arguments):
     code, out, err = command_line("vpm", *arguments)
     assert (code, out) == (2, "")
-    assert "Error: " in err
+    assert err.startswith("error: ")
+    assert len(err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,53 @@
+"""Options in groups: the help of a command with many options reads section by section."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+
+class GroupedOption(click.Option):
+    """An option that the help shows in a section of its own.
+
+    Args:
+        group: title of the section.
+    """
+
+    def __init__(self, *args: Any, group: str, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.group = group
+
+
+class GroupedCommand(click.Command):
+    """A command whose help shows its options in their groups, in the order of declaration."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write one section a group."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            if record is not None:
+                sections.setdefault(getattr(param, "group", "Output"), []).append(record)
+        for title, records in sections.items():
+            with formatter.section(title):
+                formatter.write_dl(records)
+
+
+def given_options() -> dict[str, Any]:
+    """The options that the user gave to the current command, by the names of its parameters."""
+    context = click.get_current_context()
+    return {
+        name: value
+        for name, value in context.params.items()
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+    }
+
+
+def spelling(name: str) -> str:
+    """How the user spells a parameter of the current command, as `--v-max`; else the name."""
+    for param in click.get_current_context().command.params:
+        if param.name == name:
+            return param.opts[0]
+    return name
