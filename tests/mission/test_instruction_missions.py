@@ -14,9 +14,9 @@ from click.testing import CliRunner
 from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.replay import replay
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
-from mavfi_cli.fi import record as records
-from mavfi_cli.fi.native.arch import SUPPORTED
-from mavfi_cli.fi.native.doctor import check_tracing
+from mavfi_cli.fi.tracer import record as records
+from mavfi_cli.fi.tracer.arch import SUPPORTED
+from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.instruction.spawned_node import SpawnedNode

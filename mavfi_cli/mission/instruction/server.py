@@ -12,6 +12,7 @@ import socket
 import sys
 from dataclasses import dataclass
 
+from mavfi_cli.attack.kernels.scope import node_scope
 from mavfi_cli.autonomy import planners, warm_up
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.briefing import Briefing
@@ -20,7 +21,6 @@ from mavfi_cli.mission.companion.node_process import receive, send, serve
 from mavfi_cli.mission.companion.protection import NoProtection
 from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.instruction.scope import node_scope
 from mavfi_cli.mission.platform import load_platform
 
 

@@ -9,10 +9,10 @@ import socket
 import sys
 import time
 
+from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.native import linux
+from mavfi_cli.fi.tracer import linux
 from mavfi_cli.mission.companion.node_process import receive, send
-from mavfi_cli.mission.instruction.scope import KernelScope
 from mavfi_cli.mission.instruction.server import Setup
 
 _CHANNEL = 3

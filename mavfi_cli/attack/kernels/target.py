@@ -1,0 +1,334 @@
+"""One kernel as a target: a template process that forks itself for every run.
+
+The attacker's side of `attack.kernels.template`: it starts a run, stopped, takes its output
+afterwards, and judges it in terms of what the kernel computes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import math
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.attack.attacker import run_out
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.difference import unpack
+from mavfi_cli.attack.kernels.scope import KernelScope
+from mavfi_cli.attack.kernels.template import (
+    ASK_SCOPE,
+    GO,
+    LENGTH_BYTES,
+    PID_BYTES,
+    RAISED,
+    RUN,
+    TIMES,
+)
+from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.profile import TargetProfile, Watch, profile_run
+from mavfi_cli.attack.target import Difference, Golden, Limits, Verdict, digest, judged
+from mavfi_cli.core.errors import FaultError, RecordError, TargetError
+from mavfi_cli.core.sources import own_digest
+from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.breakpoints import Mechanism
+from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+
+# Nothing else of the environment reaches a run, so that its memory does not depend on the shell.
+_KEPT = ("HOME", "PATH", "LANG", "NUMBA_CACHE_DIR", "VIRTUAL_ENV")
+_FIXED = {
+    "PYTHONHASHSEED": "0",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "1",
+}
+# Only `_fill_caches` leaves bytecode behind, whatever the user's own setting is.
+_NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Where everything is in the memory of a kernel's runs; the same in every template."""
+
+    scope: KernelScope
+    image: Image
+    digest: str  # of the addresses of all code
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelTarget:
+    """A kernel and what it is fed.
+
+    Attributes:
+        kernel: name of one of ours, or the file of a kernel of the user's own.
+        inputs: file of the inputs of one flight, which `flight` names in words.
+        tolerance: relative difference of an output that is no silent corruption.
+        layout: of a template that was started before; looking it up takes seconds.
+    """
+
+    kernel: str
+    inputs: Path
+    inputs_sha256: str = ""
+    flight: str = ""
+    tolerance: float = 0.0
+    limits: Limits = field(default_factory=Limits)
+    mechanism: Mechanism | None = None
+    layout: Layout | None = None
+
+    @property
+    def name(self) -> str:
+        """The kernel's name."""
+        return catalogue.find(self.kernel).name
+
+    @property
+    def stream(self) -> tuple[str, ...]:
+        """A kernel's faults do not depend on which others are attacked."""
+        return (self.name,)
+
+    def known(self) -> dict[str, Any]:
+        """What its results depend on."""
+        return {
+            "inputs_sha256": self.inputs_sha256,
+            "flight": self.flight,
+            "tolerance": self.tolerance,
+            "sources": own_digest(),
+        }
+
+    def open(self) -> KernelPlace:
+        """Start the kernel's template."""
+        if self.layout is None:
+            _fill_caches(self)
+        return KernelPlace(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What a run left: the times of its call, and its packed output or its error."""
+
+    cpu_s: float
+    wall_s: float
+    data: bytes
+
+
+class _Template:
+    """A template process, and the channels to it; belongs to the thread that made it."""
+
+    def __init__(self, target: KernelTarget, *, fill_caches: bool = False) -> None:
+        """Start it and wait until it is ready.
+
+        Command line, environment and folder are the same whoever starts it, wherever the inputs
+        lie: their lengths alone would move its stack and its heap.
+
+        Raises:
+            RecordError: the inputs cannot be read.
+            TargetError: the kernel cannot be loaded.
+        """
+        self.name = target.name
+        data = _read(target.inputs)
+        self.output = os.memfd_create("mavfi-kernel-output", 0)
+        self.control, theirs = socket.socketpair()
+        self._errors = os.memfd_create("mavfi-kernel-errors", 0)
+        environment = {name: os.environ[name] for name in _KEPT if name in os.environ} | _FIXED
+        if not fill_caches:
+            environment |= _NO_BYTECODE
+        with theirs, linux.fixed_addresses():
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "mavfi_cli.attack.kernels.template", target.kernel],
+                stdin=theirs.fileno(),
+                stdout=self.output,
+                stderr=self._errors,
+                env=environment,
+                cwd="/",
+                start_new_session=True,
+            )
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
+            self.control.sendall(len(data).to_bytes(LENGTH_BYTES, "little"))
+            self.control.sendall(data)
+            self._receive(1)
+            undo.pop_all()
+
+    def layout(self, known: Layout | None) -> Layout:
+        """Where everything is; what is known already where it is the same."""
+        pid = self._process.pid
+        if known is not None and known.digest == _digest_of_code(pid):
+            return known
+        self.control.send(ASK_SCOPE)
+        size = int.from_bytes(self._receive(LENGTH_BYTES), "little")
+        scope: KernelScope = pickle.loads(self._receive(size))
+        return Layout(scope=scope, image=Image(pid, scope.regions), digest=_digest_of_code(pid))
+
+    def _receive(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            piece = self.control.recv(size - len(data))
+            if not piece:
+                raise TargetError(self.name, f"does not load: {self._last_words()}")
+            data += piece
+        return data
+
+    def _last_words(self) -> str:
+        said = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
+        return said[-1] if said else "its process ended"
+
+    def close(self) -> None:
+        """End the process."""
+        self.control.close()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        os.close(self._errors)
+        os.close(self.output)
+
+
+class KernelPlace:
+    """Where one kernel runs: forks of one template. Belongs to the thread that made it."""
+
+    kind = "kernel"
+
+    def __init__(self, target: KernelTarget) -> None:
+        """Start the template.
+
+        Raises:
+            RecordError: the inputs cannot be read.
+            TargetError: the kernel cannot be loaded.
+        """
+        self.name, self.limits = target.name, target.limits
+        self._template = _Template(target)
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
+            self.layout = self._template.layout(target.layout)
+            undo.pop_all()
+        self.target = replace(target, layout=self.layout)
+        self._kernel = catalogue.find(target.kernel)
+
+    def start(self) -> Tracee:
+        """A fresh run, attached and stopped, that has not called the kernel yet.
+
+        Raises:
+            TracingForbidden: the operating system refuses.
+            FaultError: the template has died.
+        """
+        control = self._template.control
+        os.ftruncate(self._template.output, 0)
+        control.send(RUN)
+        told = control.recv(PID_BYTES)
+        if len(told) < PID_BYTES:
+            raise FaultError(f"the process that loads {self.name} has died")
+        tracee = Tracee.attach(int.from_bytes(told, "little"), mechanism=self.target.mechanism)
+        control.send(GO)
+        return tracee
+
+    def image(self, _: Tracee) -> Image:
+        """What a run has in its memory: the same in all."""
+        return self.layout.image
+
+    def scope(self, image: Image) -> Scope:
+        """The code that may be hit."""
+        return scope_of(image, self.layout.scope.objects)
+
+    def context(self) -> dict[str, Any]:
+        """What every record says of the kernel."""
+        objects = list(self.layout.scope.objects)
+        return {"scope": objects, "inputs_sha256": self.target.inputs_sha256}
+
+    def profile(
+        self, rng: np.random.Generator, *, windows: int, watch: Watch | None = None
+    ) -> TargetProfile:
+        """Step a fault-free run of the kernel, or a sample of it where that is too long.
+
+        Raises:
+            TargetError: the kernel never enters its native code.
+            WindowTooLong: too many instructions.
+        """
+        scope, limit = self.layout.scope, self.limits.profile_steps
+        markers = (scope.inner or (scope.entry,)) if self._kernel.too_long else ()
+        return profile_run(self, rng, markers=markers, windows=windows, limit=limit, watch=watch)
+
+    def fault_free(self) -> Golden:
+        """One run without a fault.
+
+        Raises:
+            TargetError: it fails.
+        """
+        ended = run_out(self.start())
+        told = self.told()
+        if told is None or ended.exit_code != 0:
+            how = f"signal {ended.signal}" if ended.signal else f"exit code {ended.exit_code}"
+            text = told.data.decode(errors="replace") if told else how
+            raise TargetError(self.name, f"fails without a fault: {text}")
+        return Golden(output=told.data, cpu_s=told.cpu_s, wall_s=told.wall_s)
+
+    def told(self) -> Told | None:
+        """What the run that has ended left; None where it left nothing whole."""
+        output = self._template.output
+        data = os.pread(output, os.fstat(output).st_size, 0)
+        if len(data) < TIMES.size:
+            return None
+        cpu_s, wall_s = TIMES.unpack_from(data)
+        return Told(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
+
+    def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
+        """Judge the last run; `ended` is None where it was cut off."""
+        told = self.told()
+        left = None if told is None or ended is None else told.data
+        tolerance = self.target.tolerance or None
+        outcome, difference = judged(golden, ended, left, self._compare, tolerance=tolerance)
+        raised = left is not None and ended is not None and ended.exit_code == RAISED
+        size = 0.0 if difference is None else difference.relative
+        return Verdict(
+            outcome=outcome,
+            output_sha256=digest(left) if left else "",
+            details={
+                "error": left.decode(errors="replace") if raised and left is not None else "",
+                "magnitude": None if difference is None else difference.to_json(),
+                "within_tolerance": outcome is Outcome.BENIGN and size > 0.0,
+            },
+        )
+
+    def _compare(self, golden: bytes, output: bytes) -> Difference:
+        try:
+            return self._kernel.compare(unpack(golden), unpack(output))
+        except (ValueError, KeyError) as damage:
+            text = f"unreadable: {damage}"
+            return Difference(relative=math.inf, absolute=math.inf, text=text)
+
+    def close(self) -> None:
+        """End the template."""
+        self._template.close()
+
+
+def _read(inputs: Path) -> bytes:
+    try:
+        return inputs.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{inputs}: {error.strerror}") from None
+
+
+@functools.cache
+def _fill_caches(target: KernelTarget) -> None:
+    """Load a kernel once, so that all its compiled code is in the cache from now on.
+
+    So is the bytecode of all that it imports: a process that compiles modules has another memory
+    than one that finds them compiled.
+    """
+    _Template(target, fill_caches=True).close()
+
+
+def _digest_of_code(pid: int) -> str:
+    """Of the addresses of everything executable in a process."""
+    maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    code = [line.split() for line in maps if "x" in line.split()[1]]
+    known = [f"{part[0]} {part[2]} {part[-1]}" for part in code]
+    return hashlib.sha256("\n".join(known).encode()).hexdigest()
