@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.attack.campaign import TargetRuns, run_campaign
+from mavfi_cli.attack.comparison import Comparison
 from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.plan import Plan
-from mavfi_cli.attack.program import Comparison, ProgramTarget, Workplace
+from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.spawn import Command

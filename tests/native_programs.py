@@ -6,6 +6,19 @@ import subprocess
 import pytest
 
 SOURCES = {
+    # Writes what it reads from standard input, and its double; prints a time. args: the files.
+    "writing": """
+#include <stdio.h>
+#include <time.h>
+int main(int c, char **v) {
+    double x = 7; struct timespec now; clock_gettime(CLOCK_REALTIME, &now);
+    if (scanf("%lf", &x) < 0) x = 7;
+    for (int i = 1; i < c; i++) {
+        FILE *f = fopen(v[i], "w"); fprintf(f, "%g %g\\n", x, 2 * x); fclose(f);
+    }
+    printf("Time = %ld.%09ld\\nx = %g\\n", (long) now.tv_sec, now.tv_nsec, x);
+    return 0;
+}""",
     # A loop whose counter is an argument of the called function; arg: iterations.
     "counting": """
 #include <stdio.h>

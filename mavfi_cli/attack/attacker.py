@@ -56,8 +56,10 @@ def golden_run(place: JudgedPlace) -> Golden:
         TargetError: it fails, or its outputs differ.
     """
     runs = [place.fault_free() for _ in range(GOLDEN_RUNS)]
-    if len({(run.output, run.exit_code) for run in runs}) > 1:
-        raise TargetError(place.name, "fault-free runs differ; outcomes cannot be told")
+    for again in runs[1:]:
+        if unlike := place.unlike(runs[0], again):
+            problem = f"fault-free runs differ, so outcomes cannot be told: {unlike}"
+            raise TargetError(place.name, problem)
     slowest = max(run.cpu_s for run in runs), max(run.wall_s for run in runs)
     return replace(runs[0], cpu_s=slowest[0], wall_s=slowest[1])
 

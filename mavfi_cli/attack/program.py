@@ -2,56 +2,27 @@
 
 from __future__ import annotations
 
-import math
-import re
+import os
 import resource
+import shutil
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
+from mavfi_cli.attack.comparison import Comparison, compared, joined
 from mavfi_cli.attack.profile import TargetProfile, Watch, function_of, profile_calls, profile_run
-from mavfi_cli.attack.target import Difference, Golden, Limits, Verdict, digest, judged
-from mavfi_cli.core.errors import ConfigError, TargetError
+from mavfi_cli.attack.target import Golden, Limits, Verdict, digest, judged
+from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
-
-_SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
-    """What is compared: standard output, or a file that the program writes."""
-
-    file: str | None = None  # None: standard output
-    tolerance: float = 0.0  # largest relative difference of a number that still counts as equal
-
-    @classmethod
-    def of(cls, text: str, tolerance: float = 0.0) -> Comparison:
-        """From the command line: `stdout`, or `file:PATH` relative to where the program runs.
-
-        Raises:
-            ConfigError: neither.
-        """
-        if text == "stdout":
-            return cls(tolerance=tolerance)
-        kind, _, path = text.partition(":")
-        if kind == "file" and path:
-            return cls(file=path, tolerance=tolerance)
-        raise ConfigError(f"cannot compare {text!r}; known: stdout, file:PATH", key="compare")
-
-    def output(self, directory: Path, stdout: Path) -> bytes:
-        """The output of a run; a file that was not written is empty."""
-        path = stdout if self.file is None else directory / self.file
-        return path.read_bytes() if path.is_file() else b""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,15 +53,18 @@ class ProgramTarget:
 
     def context(self) -> dict[str, Any]:
         """What every record says of it."""
-        return {
+        told: dict[str, Any] = {
             "program": list(self.command.argv),
             "scope": list(self.scope_objects),
             "function": self.function,
         }
+        if self.command.stdin != Path(os.devnull):
+            told["stdin"] = str(self.command.stdin)
+        return told
 
     def known(self) -> dict[str, Any]:
         """What its results depend on."""
-        return self.context() | {"comparison": asdict(self.comparison)}
+        return self.context() | {"comparison": self.comparison.to_json()}
 
     def open(self) -> Workplace:
         """Make a scratch folder for its runs."""
@@ -98,22 +72,23 @@ class ProgramTarget:
 
 
 class Workplace:
-    """A scratch folder with the output files of one worker."""
+    """A scratch folder with the output files of one worker.
+
+    Nothing is ever removed outside of it. Where files are compared the program runs in a folder in
+    it that is made anew for every run.
+    """
 
     kind = "program"
 
     def __init__(self, target: ProgramTarget) -> None:
         self.target, self.limits = target, target.limits
-        self._scratch = tempfile.TemporaryDirectory(prefix="mavfi-kernels-")
-        root = Path(self._scratch.name)
-        self._stdout, self._stderr = root / "stdout", root / "stderr"
-        self._directory = target.command.directory
-        self._own_file: Path | None = None
-        if target.comparison.file is not None:
-            self._directory = root / "run"
-            self._directory.mkdir()
-            self._own_file = self._directory / target.comparison.file
-        self._command = replace(target.command, directory=self._directory)
+        self._scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
+        self._stdout, self._stderr = self._scratch / "stdout", self._scratch / "stderr"
+        self._folder = self._scratch / "run" if target.comparison.files else None
+        self._command = target.command
+        if self._folder is not None:
+            self._folder.mkdir()
+            self._command = replace(target.command, directory=self._folder)
 
     @property
     def name(self) -> str:
@@ -126,8 +101,7 @@ class Workplace:
         Raises:
             TargetError: it ends before its entry point.
         """
-        if self._own_file is not None:
-            self._own_file.unlink(missing_ok=True)
+        self._renew_folder()
         tracee = spawn(
             self._command,
             stdout=self._stdout,
@@ -139,6 +113,16 @@ class Workplace:
             problem = f"ends before its entry point{': ' + said[0] if said else ''}"
             raise TargetError(self._command.argv[0], problem)
         return tracee
+
+    def _renew_folder(self) -> None:
+        if self._folder is None:
+            return
+        try:
+            shutil.rmtree(self._folder)  # follows no link
+            self._folder.mkdir()
+        except OSError as error:
+            problem = f"leaves files in its scratch folder that cannot be removed: {error}"
+            raise TargetError(self.name, problem) from None
 
     def image(self, tracee: Tracee) -> Image:
         """What a run has in its memory."""
@@ -152,9 +136,10 @@ class Workplace:
         """What every record says of the program."""
         return self.target.context()
 
-    def output(self) -> bytes:
-        """What the last run left."""
-        return self.target.comparison.output(self._directory, self._stdout)
+    def _parts(self) -> dict[str, bytes | None]:
+        """What the last run left, by name of the output."""
+        folder = self._folder or self._command.directory
+        return self.target.comparison.parts(folder, self._stdout)
 
     def profile(
         self, rng: np.random.Generator, *, windows: int = 16, watch: Watch | None = None
@@ -176,7 +161,7 @@ class Workplace:
         """One run without a fault, timed from the entry point.
 
         Raises:
-            TargetError: it is killed by a signal.
+            TargetError: it is killed by a signal, or does not write a file that is compared.
         """
         before_s = _children_cpu_s()
         tracee = self.start()
@@ -185,16 +170,35 @@ class Workplace:
         ended = run_out(tracee)
         if ended.exit_code is None:
             raise TargetError(self.name, f"is killed by signal {ended.signal} without a fault")
+        parts = self._parts()
+        if missing := [name for name, data in parts.items() if data is None]:
+            raise TargetError(
+                self.name,
+                f"writes no file {missing[0]} in the folder in which it runs, so there is nothing "
+                "to compare",
+            )
         return Golden(
-            output=self.output(),
+            output=joined(parts),
             exit_code=ended.exit_code,
             cpu_s=_children_cpu_s() - before_s,
             wall_s=time.perf_counter() - start,
         )
 
+    def unlike(self, golden: Golden, again: Golden) -> str:
+        """How two fault-free runs differ; empty where they do not."""
+        if again.exit_code != golden.exit_code:
+            return f"their exit codes are {golden.exit_code} and {again.exit_code}"
+        if self.target.comparison.same(golden.output, again.output):
+            return ""
+        lines = zip(golden.output.splitlines(), again.output.splitlines(), strict=False)
+        first = next((a for a, b in lines if a != b), b"")
+        text = first[:60].decode(errors="replace").strip()
+        where = f"at the line {text!r}" if text else "in length"
+        return f"their outputs differ {where}; --ignore-lines leaves out lines that change"
+
     def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
         """Judge the last run; `ended` is None where it was cut off."""
-        output = self.output()
+        output = joined(self._parts())
         tolerance = self.target.comparison.tolerance
         outcome, difference = judged(golden, ended, output, compared, tolerance=tolerance)
         return Verdict(
@@ -208,48 +212,9 @@ class Workplace:
 
     def close(self) -> None:
         """Delete the scratch folder."""
-        self._scratch.cleanup()
-
-
-def compared(golden: bytes, output: bytes) -> Difference | None:
-    """The difference between the numbers of two texts; None where other things differ."""
-    size = magnitude(golden, output)
-    return None if size is None else Difference(relative=size, absolute=size)
-
-
-def magnitude(golden: bytes, output: bytes) -> float | None:
-    """Largest relative difference between the numbers of two texts.
-
-    Relative to the golden number's size, absolute where that is 0; infinite where one of the two
-    is not finite and they differ. None where the texts differ in more than their numbers.
-    """
-    ours, theirs = _SEPARATORS.split(golden), _SEPARATORS.split(output)
-    if len(ours) != len(theirs):
-        return None
-    largest = 0.0
-    for a, b in zip(ours, theirs, strict=True):
-        if a == b:
-            continue
-        try:
-            expected, got = float(a), float(b)
-        except ValueError:
-            return None
-        if not (math.isfinite(expected) and math.isfinite(got)):
-            return math.inf
-        largest = max(largest, abs(got - expected) / (abs(expected) or 1.0))
-    return largest
+        shutil.rmtree(self._scratch, ignore_errors=True)
 
 
 def _children_cpu_s() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-def absolute_arguments(argv: Sequence[str], directory: Path) -> tuple[str, ...]:
-    """Arguments that name existing files, made absolute: the program runs in a scratch folder."""
-    return tuple(
-        str((directory / argument).resolve())
-        if not argument.startswith("/") and (directory / argument).is_file()
-        else argument
-        for argument in argv
-    )

@@ -111,6 +111,9 @@ class JudgedPlace(Place, Protocol):
             TargetError: it fails.
         """
 
+    def unlike(self, golden: Golden, again: Golden) -> str:
+        """How two fault-free runs differ, in words; empty where they do not."""
+
     def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
         """Judge the last run; `ended` is None where it was cut off."""
 

@@ -6,6 +6,7 @@ import contextlib
 import csv
 import io
 import json
+import os
 import shlex
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -31,9 +32,17 @@ if TYPE_CHECKING:
 @click.option("--world-seed", default=3, show_default=True, help="Its seed.")
 @click.option("--program", help="Attack this native program instead of our kernels.")
 @click.option("--args", help="Its arguments, quoted as in a shell.")
-@click.option("--compare", help="What of it is compared: stdout or file:PATH  [stdout].")
+@click.option("--compare", multiple=True, metavar="OUTPUT",
+              help="What of it is compared: stdout, or file:PATH that it writes, relative to the "
+                   "scratch folder in which it then runs. May be repeated  [stdout].")  # fmt: skip
+@click.option("--ignore-lines", multiple=True, metavar="REGEX",
+              help="Program: lines in which this is found are not compared. May be "
+                   "repeated.")  # fmt: skip
+@click.option("--stdin", "stdin_file", metavar="FILE",
+              type=click.Path(exists=True, dir_okay=False, path_type=Path),
+              help="Program: its standard input  [none].")  # fmt: skip
 @click.option("--tolerance", default=0.0, type=click.FloatRange(min=0.0),
-              help="Relative difference that is no SDC.")  # fmt: skip
+              help="Relative error of a number that is still counted as benign.")  # fmt: skip
 @click.option("--runs", default=1000, show_default=True, type=click.IntRange(min=1),
               help="Of each kernel, or of the program: one fault a run.")  # fmt: skip
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1),
@@ -87,7 +96,10 @@ def kernels(**options: Any) -> None:
         _refuse(("kernel", "world", "world_seed"), "goes without --program")
         _attack_program(options)
     else:
-        _refuse(("args", "compare", "scope", "function"), "needs --program")
+        _refuse(
+            ("args", "compare", "ignore_lines", "stdin_file", "scope", "function"),
+            "needs --program",
+        )
         _attack_kernels(options)
 
 
@@ -188,18 +200,22 @@ def _attack_program(options: dict[str, Any]) -> None:
 
 
 def _program(options: dict[str, Any]) -> Target:
-    from mavfi_cli.attack.program import Comparison, ProgramTarget, absolute_arguments
+    from mavfi_cli.attack.comparison import Comparison, absolute_arguments
+    from mavfi_cli.attack.program import ProgramTarget
     from mavfi_cli.fi.tracer.spawn import Command
 
-    comparison = Comparison.of(options["compare"] or "stdout", options["tolerance"])
+    comparison = Comparison.of(
+        options["compare"], tolerance=options["tolerance"], ignored=options["ignore_lines"]
+    )
     try:
-        arguments: tuple[str, ...] = tuple(shlex.split(options["args"] or ""))
+        arguments = shlex.split(options["args"] or "")
     except ValueError as error:
         raise ConfigError(str(error), key="args") from None
-    if comparison.file is not None:
-        arguments = absolute_arguments(arguments, Path.cwd())
+    if comparison.files:
+        arguments = list(absolute_arguments(arguments, Path.cwd(), comparison.files))
+    stdin = (options["stdin_file"] or Path(os.devnull)).resolve()
     return ProgramTarget(
-        command=Command.of([options["program"], *arguments]),
+        command=Command.of([options["program"], *arguments], stdin=stdin),
         comparison=comparison,
         objects=tuple(options["scope"]),
         function=options["function"],

@@ -11,9 +11,10 @@ from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import run_campaign
+from mavfi_cli.attack.comparison import Comparison
 from mavfi_cli.attack.outcome import Outcome, design_effect, shares, wilson
 from mavfi_cli.attack.plan import Plan
-from mavfi_cli.attack.program import Comparison, ProgramTarget, Workplace, magnitude
+from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.attack.summary import PROGRAM_COLUMNS, csv_rows, summarise_program
 from mavfi_cli.attack.target import Limits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
@@ -377,27 +378,6 @@ def test_independent_runs_count_in_full():
     assert alike.high - alike.low > 2.0 * (alone.high - alone.low)
 
 
-@pytest.mark.parametrize(
-    ("golden", "output", "size"),
-    [
-        (b"1 2 3", b"1 2 3", 0.0),
-        (b"x=2.0", b"x=3.0", 0.5),
-        (b"0", b"0.25", 0.25),
-        (b"1", b"nan", math.inf),
-        (b"1 2", b"1", None),
-        (b"a", b"b", None),
-    ],
-)
-def test_magnitude(golden, output, size):
-    assert magnitude(golden, output) == size
-
-
-def test_what_can_be_compared():
-    assert Comparison.of("file:out.txt").file == "out.txt"
-    with pytest.raises(ConfigError, match="known: stdout, file:PATH"):
-        Comparison.of("stderr")
-
-
 # -- command
 
 
@@ -429,20 +409,6 @@ def test_the_table_names_outcomes_and_signals(native_program, tmp_path):
     (crashes,) = (line for line in lines if line.startswith("crashes: "))
     assert re.search(r"\bSIG[A-Z]+ \d+", crashes)
     assert lines[-1] == f"Files  {tmp_path}: kernels.json, kernels.csv, runs.jsonl"
-
-
-def test_a_file_as_output(native_program, tmp_path, target):
-    script = tmp_path / "writer"
-    script.write_text("#!/bin/sh\necho 42 > result.txt\n")
-    script.chmod(0o755)
-    program = ProgramTarget(
-        command=Command.of([str(script)]),
-        comparison=Comparison.of("file:result.txt"),
-        objects=("dash",),
-    )
-    place = Workplace(program)
-    assert golden_run(place).output == b"42\n"
-    place.close()
 
 
 def test_csv_has_a_value_for_every_column(target):

@@ -5,8 +5,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from mavfi_cli.attack.comparison import Comparison
 from mavfi_cli.attack.profile import function_of, profile_calls, profile_run
-from mavfi_cli.attack.program import Comparison, ProgramTarget, Workplace
+from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.core.errors import TargetError, UnknownName
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.fault import FaultModel, Site

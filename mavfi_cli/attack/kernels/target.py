@@ -270,6 +270,10 @@ class KernelPlace:
             raise TargetError(self.name, f"fails without a fault: {text}")
         return Golden(output=told.data, cpu_s=told.cpu_s, wall_s=told.wall_s)
 
+    def unlike(self, golden: Golden, again: Golden) -> str:
+        """How two fault-free runs differ; empty where they do not."""
+        return "" if golden.output == again.output else "their outputs differ"
+
     def told(self) -> Told | None:
         """What the run that has ended left; None where it left nothing whole."""
         output = self._template.output
