@@ -198,12 +198,12 @@ class Workplace:
 
     def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
         """Judge the last run; `ended` is None where it was cut off."""
-        output = joined(self._parts())
-        tolerance = self.target.comparison.tolerance
+        parts, tolerance = self._parts(), self.target.comparison.tolerance
+        output = joined(parts)
         outcome, difference = judged(golden, ended, output, compared, tolerance=tolerance)
         return Verdict(
             outcome=outcome,
-            output_sha256=digest(output),
+            output_sha256=digest(output if any(parts.values()) else b""),
             details={
                 "exit_code": None if ended is None else ended.exit_code,
                 "magnitude": None if difference is None else difference.relative,
