@@ -7,15 +7,9 @@ afterwards, and judges it in terms of what the kernel computes.
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import math
 import os
-import pickle
-import signal
-import socket
-import subprocess
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +23,6 @@ from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.kernels.template import (
     ASK_SCOPE,
     GO,
-    LENGTH_BYTES,
     PID_BYTES,
     RAISED,
     RUN,
@@ -37,24 +30,16 @@ from mavfi_cli.attack.kernels.template import (
 )
 from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.profile import TargetProfile, Watch, profile_run
+from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import Difference, Golden, Limits, Verdict, digest, judged
+from mavfi_cli.core.channel import receive
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.core.sources import own_digest
-from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
-# Nothing else of the environment reaches a run, so that its memory does not depend on the shell.
-_KEPT = ("HOME", "PATH", "LANG", "NUMBA_CACHE_DIR", "VIRTUAL_ENV")
-_FIXED = {
-    "PYTHONHASHSEED": "0",
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "MALLOC_ARENA_MAX": "1",
-}
-# Only `_fill_caches` leaves bytecode behind, whatever the user's own setting is.
-_NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
+_PROGRAM = "mavfi_cli.attack.kernels.template"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,8 +92,6 @@ class KernelTarget:
 
     def open(self) -> KernelPlace:
         """Start the kernel's template."""
-        if self.layout is None:
-            _fill_caches(self)
         return KernelPlace(self)
 
 
@@ -119,77 +102,6 @@ class Told:
     cpu_s: float
     wall_s: float
     data: bytes
-
-
-class _Template:
-    """A template process, and the channels to it; belongs to the thread that made it."""
-
-    def __init__(self, target: KernelTarget, *, fill_caches: bool = False) -> None:
-        """Start it and wait until it is ready.
-
-        Command line, environment and folder are the same whoever starts it, wherever the inputs
-        lie: their lengths alone would move its stack and its heap.
-
-        Raises:
-            RecordError: the inputs cannot be read.
-            TargetError: the kernel cannot be loaded.
-        """
-        self.name = target.name
-        data = _read(target.inputs)
-        self.output = os.memfd_create("mavfi-kernel-output", 0)
-        self.control, theirs = socket.socketpair()
-        self._errors = os.memfd_create("mavfi-kernel-errors", 0)
-        environment = {name: os.environ[name] for name in _KEPT if name in os.environ} | _FIXED
-        if not fill_caches:
-            environment |= _NO_BYTECODE
-        with theirs, linux.fixed_addresses():
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "mavfi_cli.attack.kernels.template", target.kernel],
-                stdin=theirs.fileno(),
-                stdout=self.output,
-                stderr=self._errors,
-                env=environment,
-                cwd="/",
-                start_new_session=True,
-            )
-        with contextlib.ExitStack() as undo:
-            undo.callback(self.close)
-            self.control.sendall(len(data).to_bytes(LENGTH_BYTES, "little"))
-            self.control.sendall(data)
-            self._receive(1)
-            undo.pop_all()
-
-    def layout(self, known: Layout | None) -> Layout:
-        """Where everything is; what is known already where it is the same."""
-        pid = self._process.pid
-        if known is not None and known.digest == _digest_of_code(pid):
-            return known
-        self.control.send(ASK_SCOPE)
-        size = int.from_bytes(self._receive(LENGTH_BYTES), "little")
-        scope: KernelScope = pickle.loads(self._receive(size))
-        return Layout(scope=scope, image=Image(pid, scope.regions), digest=_digest_of_code(pid))
-
-    def _receive(self, size: int) -> bytes:
-        data = b""
-        while len(data) < size:
-            piece = self.control.recv(size - len(data))
-            if not piece:
-                raise TargetError(self.name, f"does not load: {self._last_words()}")
-            data += piece
-        return data
-
-    def _last_words(self) -> str:
-        said = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
-        return said[-1] if said else "its process ended"
-
-    def close(self) -> None:
-        """End the process."""
-        self.control.close()
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-        os.close(self._errors)
-        os.close(self.output)
 
 
 class KernelPlace:
@@ -205,13 +117,29 @@ class KernelPlace:
             TargetError: the kernel cannot be loaded.
         """
         self.name, self.limits = target.name, target.limits
-        self._template = _Template(target)
+        self._kernel, inputs = catalogue.find(target.kernel), _read(target.inputs)
         with contextlib.ExitStack() as undo:
-            undo.callback(self.close)
-            self.layout = self._template.layout(target.layout)
-            undo.pop_all()
+            self._output = os.memfd_create("mavfi-kernel-output")
+            undo.callback(os.close, self._output)
+            self._template = ServedProcess(_PROGRAM, output=self._output)
+            undo.callback(self._template.kill)
+            self._template.begin((target.kernel, inputs), self.name)
+            self.layout = self._look_up(target.layout)
+            self._closing = undo.pop_all()
         self.target = replace(target, layout=self.layout)
-        self._kernel = catalogue.find(target.kernel)
+
+    def _look_up(self, known: Layout | None) -> Layout:
+        """Where everything is; what is known already where it is the same."""
+        pid, process = self._template.pid, self._template
+        digest_of_code = _digest_of_code(pid)
+        if known is not None and known.digest == digest_of_code:
+            return known
+        process.connection.send(ASK_SCOPE)
+        try:
+            scope: KernelScope = receive(process.connection)
+        except (OSError, EOFError):
+            raise TargetError(self.name, f"does not load: {process.last_words()}") from None
+        return Layout(scope=scope, image=Image(pid, scope.regions), digest=digest_of_code)
 
     def start(self) -> Tracee:
         """A fresh run, attached and stopped, that has not called the kernel yet.
@@ -220,8 +148,8 @@ class KernelPlace:
             TracingForbidden: the operating system refuses.
             FaultError: the template has died.
         """
-        control = self._template.control
-        os.ftruncate(self._template.output, 0)
+        control = self._template.connection
+        os.ftruncate(self._output, 0)
         control.send(RUN)
         told = control.recv(PID_BYTES)
         if len(told) < PID_BYTES:
@@ -276,8 +204,7 @@ class KernelPlace:
 
     def told(self) -> Told | None:
         """What the run that has ended left; None where it left nothing whole."""
-        output = self._template.output
-        data = os.pread(output, os.fstat(output).st_size, 0)
+        data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None
         cpu_s, wall_s = TIMES.unpack_from(data)
@@ -310,7 +237,7 @@ class KernelPlace:
 
     def close(self) -> None:
         """End the template."""
-        self._template.close()
+        self._closing.close()
 
 
 def _read(inputs: Path) -> bytes:
@@ -318,16 +245,6 @@ def _read(inputs: Path) -> bytes:
         return inputs.read_bytes()
     except OSError as error:
         raise RecordError(f"{inputs}: {error.strerror}") from None
-
-
-@functools.cache
-def _fill_caches(target: KernelTarget) -> None:
-    """Load a kernel once, so that all its compiled code is in the cache from now on.
-
-    So is the bytecode of all that it imports: a process that compiles modules has another memory
-    than one that finds them compiled.
-    """
-    _Template(target, fill_caches=True).close()
 
 
 def _digest_of_code(pid: int) -> str:

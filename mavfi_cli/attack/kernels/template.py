@@ -1,26 +1,23 @@
 """A warm process with one kernel loaded and fed, that forks itself for every run.
 
-    python -m mavfi_cli.attack.kernels.template KERNEL
+The message to it is the kernel's name and its inputs. From then on it is asked in single bytes on
+the same socket. `ASK_SCOPE` is answered by the kernel's scope. For every `RUN` a child is forked,
+which sends its process id (4 bytes), waits for `GO`, calls the kernel once, writes its output to
+standard output, a file, and ends. The next request must not come before the child has ended. The
+file holds CPU seconds and duration of the call (two float64), then the packed output, or the
+error's text where the exit code is `RAISED`.
 
-Standard input is a socket, standard output a file. On the socket the inputs of the kernel come
-in, with their length (8 bytes, little endian) before them; one byte goes out when all is loaded.
-`ASK_SCOPE` is answered by the kernel's scope, as a pickle with its length before it. For every
-`RUN` a child is forked; it sends its process id (4 bytes), waits for `GO`, calls the kernel
-once, writes its output to the file and ends. The next request must not come before the child has
-ended. The file holds CPU seconds and duration of the call (two float64), then the packed output,
-or the error's text where the exit code is `RAISED`.
-
-Every run starts from the same memory: no address randomisation, no garbage collection, and
-nothing is kept here from one fork to the next.
+Every run starts from the same memory: no garbage collection, and nothing is kept here from one fork
+to the next.
 """
 
 from __future__ import annotations
 
 import gc
 import os
-import pickle
 import resource
 import signal
+import socket
 import struct
 import sys
 import time
@@ -31,54 +28,39 @@ from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.catalogue import Call
 from mavfi_cli.attack.kernels.difference import pack
 from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
+from mavfi_cli.attack.served import channel, newest_cache_ns
+from mavfi_cli.core.channel import receive, send
 
 RAISED = 3  # exit code of a child whose kernel raised an error
 TIMES = struct.Struct("<dd")
-PID_BYTES, LENGTH_BYTES = 4, 8
+PID_BYTES = 4
 RUN, GO, ASK_SCOPE = b"r", b"g", b"s"
-CONTROL, OUTPUT = 0, 1
+OUTPUT = 1
 _EXTRA_MEMORY = 2 << 30  # a corrupted size must not take the machine down
 _LARGEST_FILE = 1 << 28
 
 
-def main(arguments: list[str]) -> None:
+def main() -> None:
     """Get warm, then fork until the other end closes."""
-    kernel = catalogue.find(arguments[0])
-    serve(kernel, kernel.prepare(inputs_of_bytes(receive_inputs())))
-
-
-def receive_inputs() -> bytes:
-    """What the other end sends first."""
-    size = int.from_bytes(_exactly(LENGTH_BYTES), "little")
-    return _exactly(size)
-
-
-def _exactly(size: int) -> bytes:
-    data = bytearray()
-    while len(data) < size:
-        piece = os.read(CONTROL, size - len(data))
-        if not piece:
-            raise EOFError
-        data += piece
-    return bytes(data)
-
-
-def serve(kernel: catalogue.Kernel, call: Call) -> None:
-    """Warm the call up, then do what the other end asks until it closes."""
+    connection = channel()
+    name, inputs = receive(connection)
+    kernel = catalogue.find(name)
+    call = kernel.prepare(inputs_of_bytes(inputs))
     for _ in range(2 if kernel.repeatable else 0):
         pack(call())
     _limit()
+    send(connection, (None, newest_cache_ns()))
+    sys.dont_write_bytecode = True  # the second run must not find what the first has compiled
     gc.collect()
     gc.freeze()
     gc.disable()
-    os.write(CONTROL, RUN)
-    while request := os.read(CONTROL, 1):
+    while request := connection.recv(1):
         if request == ASK_SCOPE:
-            status = _in_child(lambda: _tell_scope(kernel, call))
+            status = _in_child(lambda: _tell_scope(connection, kernel, call))
             if status:
                 _give_up(f"fails without a fault (wait status {status})")
         elif request == RUN:  # not the GO of a child that was killed before it took it
-            _in_child(lambda: _run(call))
+            _in_child(lambda: _run(connection, call))
 
 
 def _give_up(why: str) -> None:
@@ -109,20 +91,17 @@ def _limit() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
 
 
-def _tell_scope(kernel: catalogue.Kernel, call: Call) -> int:
+def _tell_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
     """Look up where the kernel's code is; in a child, as that leaves much in the memory."""
     call()
-    data = pickle.dumps(kernel.scope())
-    data = len(data).to_bytes(LENGTH_BYTES, "little") + data
-    while data:
-        data = data[os.write(CONTROL, data) :]
+    send(connection, kernel.scope())
     return 0
 
 
-def _run(call: Call) -> int:
+def _run(connection: socket.socket, call: Call) -> int:
     """One run of the kernel; the exit code."""
-    os.write(CONTROL, os.getpid().to_bytes(PID_BYTES, "little"))
-    if not os.read(CONTROL, 1):
+    connection.send(os.getpid().to_bytes(PID_BYTES, "little"))
+    if not connection.recv(1):
         return 0
     cpu_s, wall_s, code = time.process_time(), time.perf_counter(), 0
     try:
@@ -135,4 +114,4 @@ def _run(call: Call) -> int:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

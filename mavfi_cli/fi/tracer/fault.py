@@ -86,8 +86,6 @@ class FaultModel:
     implicit: bool = True
     field: Field = Field.ANY  # sign, exponent, mantissa: of the elements of float instructions
     count: int = 1
-    excluded: frozenset[str] = frozenset()  # operands that are never drawn (compat modes)
-    low_byte_only: bool = False  # compat rosfi-2021
 
     @classmethod
     def named(
@@ -204,7 +202,7 @@ def _registers(
     merged: dict[str, _Candidate] = {}
     for use in uses:
         site = site_of(use.register)
-        if site not in model.sites or use.operand in model.excluded:
+        if site not in model.sites:
             continue
         if not (use.explicit or model.implicit):
             continue
@@ -219,8 +217,6 @@ def _registers(
 
 
 def _field_mask(instruction: Instruction, model: FaultModel, site: Site) -> int:
-    if model.low_byte_only:
-        return 0xFF
     if model.field is Field.ANY:
         return -1
     if site is not Site.VECTOR or instruction.element is None:

@@ -8,12 +8,12 @@ the new one, never half of one.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError
+from mavfi_cli.core.files import write_text
 from mavfi_cli.fi.tracer.fault import Corruption, InstructionFault, Role, Site, Stage
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
@@ -148,21 +148,7 @@ def write(path: Path, record: Mapping[str, Any]) -> None:
     Raises:
         RecordError: the file cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with partial.open("w", encoding="utf-8") as stream:
-            json.dump(record, stream, indent=1)
-            stream.write("\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
-        directory = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
-    except OSError as error:
-        raise RecordError(f"{path}: {error.strerror}") from None
+    write_text(path, json.dumps(record, indent=1) + "\n")
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from mavfi_cli.attack.attacker import LiveAttack, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope
+from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.image import Image
@@ -19,8 +20,7 @@ from mavfi_cli.mission.companion.node_process import NodeProcess
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import SCHEMA, NoInjection
 from mavfi_cli.mission.instruction.plan import PlannedFault, plan_fault, planned_of
-from mavfi_cli.mission.instruction.server import Setup
-from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
+from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.orders import Recorder
 
 _TIMING = ("stop_s",)
@@ -38,7 +38,7 @@ class InstructionInjection(NoInjection):
     def __init__(
         self,
         planned: PlannedFault,
-        spawned: SpawnedNode,
+        spawned: ServedProcess,
         for_debugger: Callable[[int], None] | None = None,
     ) -> None:
         self._planned = planned
@@ -65,7 +65,9 @@ class InstructionInjection(NoInjection):
             BuildMismatch: the record that is repeated is of another build.
             TracingForbidden: the operating system refuses.
         """
-        scope = self._spawned.begin(Setup(config=config, briefing=briefing, node=self.node))
+        scope = self._spawned.begin(
+            Setup(config=config, briefing=briefing, node=self.node), f"node {self.node}"
+        )
         self._finished = lambda: executor.nodes[self.node].finished
         pid = self._spawned.pid
         if self._planned.recorded is not None:
@@ -187,4 +189,4 @@ def injection_of(
         planned = planned_of(repeat)
     else:
         planned = plan_fault(config, config.instruction, out, versions, fly_golden)
-    return InstructionInjection(planned, SpawnedNode(), for_debugger)
+    return InstructionInjection(planned, ServedProcess(PROGRAM), for_debugger)

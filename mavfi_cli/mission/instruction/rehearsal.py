@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
+from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.fault import Stage
@@ -22,8 +24,7 @@ from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.fi.tracer.windows import WindowTooLong
 from mavfi_cli.mission.companion.node_process import NodeProcess
-from mavfi_cli.mission.instruction.server import Setup
-from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
+from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 
 Order = tuple[Any, float]  # input, start stamp
 WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
@@ -45,10 +46,10 @@ class Rehearsal:
     def __init__(self, setup: Setup, orders: Sequence[Order], entry: int = 1) -> None:
         self._setup, self._entry = setup, entry
         self._last = orders[-1]
-        self._spawned = SpawnedNode()
+        self._spawned = ServedProcess(PROGRAM)
         with contextlib.ExitStack() as undo:
             undo.callback(self.close)
-            self.scope_of_node = self._spawned.begin(setup)
+            self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
             self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
             for value, start_s in orders[:-1]:
                 self._process.take(self._process.order(setup.node, value, start_s))
@@ -153,10 +154,10 @@ def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
     Raises:
         TracingForbidden: the operating system neither counts nor lets us trace.
     """
-    spawned, counter = SpawnedNode(), None
+    spawned, counter = ServedProcess(PROGRAM), None
     counts = []
     try:
-        scope = spawned.begin(setup)
+        scope = spawned.begin(setup, f"node {setup.node}")
         address = Image(spawned.pid, scope.regions).address(scope.entry)
         counter = EntryCounter(spawned.pid, address)
         process = NodeProcess(spawned.connection, spawned.pid)
