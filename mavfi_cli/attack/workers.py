@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -16,7 +17,7 @@ import numpy as np
 from mavfi_cli.attack.attacker import Attacker, RunResult
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.target import Golden, Target
-from mavfi_cli.core.errors import FaultError
+from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer.fault import InstructionFault
 
@@ -127,6 +128,7 @@ class Workers:
 
         Raises:
             FaultError: a worker was killed.
+            TargetError: the target cannot be handed to one.
         """
         size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
         jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
@@ -136,6 +138,11 @@ class Workers:
                     results = _work(job)
                 yield from results
             return
+        try:
+            pickle.dumps(bench)
+        except Exception as error:  # whatever the target's parts raise
+            problem = f"cannot be handed to a worker process: {error}"
+            raise TargetError(bench.target.name, problem) from None
         try:
             for results in self._pool.map(_work, jobs):
                 yield from results
