@@ -7,6 +7,7 @@ import resource
 import shutil
 import tempfile
 import time
+import weakref
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,10 @@ class Workplace:
 
     def __init__(self, target: ProgramTarget) -> None:
         self.target, self.limits = target, target.limits
-        self._scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
-        self._stdout, self._stderr = self._scratch / "stdout", self._scratch / "stderr"
-        self._folder = self._scratch / "run" if target.comparison.files else None
+        scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
+        self._remove = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
+        self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
+        self._folder = scratch / "run" if target.comparison.files else None
         self._command = target.command
         if self._folder is not None:
             self._folder.mkdir()
@@ -212,7 +214,7 @@ class Workplace:
 
     def close(self) -> None:
         """Delete the scratch folder."""
-        shutil.rmtree(self._scratch, ignore_errors=True)
+        self._remove()
 
 
 def _children_cpu_s() -> float:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import tempfile
 
 import pytest
 from click.testing import CliRunner
@@ -109,6 +110,17 @@ def test_other_arguments_that_name_files_still_do(tmp_path):
     (tmp_path / "out.txt").write_text("")
     found = absolute_arguments(["in.txt", "./out.txt", "out.txt", "5"], tmp_path, ["out.txt"])
     assert list(found) == [str(tmp_path / "in.txt"), "./out.txt", "out.txt", "5"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_nothing_is_left_behind(command, tmp_path, monkeypatch, jobs):
+    scratch = tmp_path / "tmp"
+    scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    done = command("--compare", "file:o", "--jobs", jobs, args="o")
+    assert done.exit_code == 0, done.output
+    assert not list(scratch.glob("mavfi-*"))
 
 
 # -- outputs
