@@ -27,26 +27,12 @@ from mavfi_cli.fi.tracer.fault import InstructionFault, Stage
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.sampling import Strategy, draw_fault
 from mavfi_cli.fi.tracer.symbols import short_name
-from mavfi_cli.fi.tracer.windows import Profile, Segment, record_window
+from mavfi_cli.fi.tracer.windows import Segment, Stratum, record_window
 
 STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of one marker's windows
 _FIRST = np.array([1])
 Watch = Callable[[int], None]  # called with instructions stepped since it was called last
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stratum:
-    """Windows that begin at the same instruction, and those of them that were stepped."""
-
-    marker: Location | None  # None: the start of the run
-    profile: Profile
-
-    @property
-    def instructions(self) -> float:
-        """Executed instructions of all windows, estimated from the stepped ones."""
-        profile = self.profile
-        return profile.executed / len(profile.segments) * profile.windows_in_run
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,19 +47,18 @@ class TargetProfile:
     @property
     def complete(self) -> bool:
         """Every window of the run was stepped."""
-        return all(stratum.profile.complete for stratum in self.strata)
+        return all(stratum.complete for stratum in self.strata)
 
     @property
     def windows(self) -> str:
         """How many windows of how many were stepped."""
-        profiles = [stratum.profile for stratum in self.strata]
-        stepped = sum(len(profile.segments) for profile in profiles)
-        return f"{stepped} of {sum(profile.windows_in_run for profile in profiles)}"
+        stepped = sum(len(stratum.segments) for stratum in self.strata)
+        return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
 
     @property
     def executed(self) -> int:
         """Executed instructions in scope, over the stepped windows."""
-        return sum(stratum.profile.executed for stratum in self.strata)
+        return sum(stratum.executed for stratum in self.strata)
 
     @property
     def instructions(self) -> float:
@@ -93,26 +78,25 @@ class TargetProfile:
         for number, stratum in enumerate(self.strata):
             at = stratum.marker
             if at is not None and (at.object, at.offset) == (first["object"], first["offset"]):
-                return None if stratum.profile.complete else (number, int(first["count"]))
+                return None if stratum.complete else (number, int(first["count"]))
         return None
 
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
         """One fault, uniform over the executed instructions."""
         shares = np.array([stratum.instructions for stratum in self.strata])
         which = int(rng.choice(len(shares), p=shares / shares.sum())) if len(shares) > 1 else 0
-        profile, locate = self.strata[which].profile, self.image.locate
-        return draw_fault(profile, plan, rng, code_at=self.code_at, locate=locate)
+        stratum, locate = self.strata[which], self.image.locate
+        return draw_fault(stratum, plan, rng, code_at=self.code_at, locate=locate)
 
     def after(self, begin: Stage) -> TargetProfile:
         """The same windows in a run that has to reach `begin` first."""
 
-        def later(profile: Profile) -> Profile:
+        def later(stratum: Stratum) -> Stratum:
             """All its segments after the new stage."""
-            segments = (replace(each, start=(begin, *each.start)) for each in profile.segments)
-            return replace(profile, segments=tuple(segments))
+            segments = (replace(each, start=(begin, *each.start)) for each in stratum.segments)
+            return replace(stratum, segments=tuple(segments))
 
-        strata = (replace(each, profile=later(each.profile)) for each in self.strata)
-        return replace(self, strata=tuple(strata))
+        return replace(self, strata=tuple(map(later, self.strata)))
 
     def in_words(self) -> str:
         """How the population of faults was found."""
@@ -120,12 +104,12 @@ class TargetProfile:
             return f"all {self.instructions:.0f} executed instructions in scope"
         parts = []
         for stratum in self.strata:
-            windows = stratum.profile
             if stratum.marker is None:
                 parts.append("the beginning")
                 continue
             name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
-            parts.append(f"{len(windows.segments)} of {windows.windows_in_run} windows from {name}")
+            stepped = f"{len(stratum.segments)} of {stratum.windows_in_run}"
+            parts.append(f"{stepped} windows from {name}")
         return (
             f"about {self.instructions:.3g} executed instructions in scope, by sample: "
             f"{', '.join(parts)}; {self.executed} stepped"
@@ -171,17 +155,17 @@ def profile_run(
     """
     begun = time.perf_counter()
     first = _Stepper(place, None, tuple(markers), limit, watch)
-    strata = [Stratum(marker=None, profile=first.profile(_FIRST, 1))]
+    strata = [first.step(_FIRST, 1)]
     for marker in markers:
         stepper = _Stepper(place, marker, tuple(markers), limit, watch)
         if count := stepper.count():
             order = rng.permutation(count) + 1
-            profile = stepper.profile(order[:windows], count)
-            fit = enough * windows // max(1, profile.executed)
+            stratum = stepper.step(order[:windows], count)
+            fit = enough * windows // max(1, stratum.executed)
             if windows < min(fit, count):
-                profile = stepper.profile(order[:fit], count)
-            strata.append(Stratum(marker=marker, profile=profile))
-    strata = [stratum for stratum in strata if stratum.profile.executed]
+                stratum = stepper.step(order[:fit], count)
+            strata.append(stratum)
+    strata = [stratum for stratum in strata if stratum.executed]
     if not strata:
         raise TargetError(place.name, "executes nothing that may be hit")
     return _profile(place, strata, begun)
@@ -194,8 +178,7 @@ def profile_call(place: Place, *, limit: int = STEPS) -> TargetProfile:
         WindowTooLong: too many instructions.
     """
     begun = time.perf_counter()
-    stepper = _Stepper(place, None, None, limit)
-    return _profile(place, [Stratum(marker=None, profile=stepper.profile(_FIRST, 1))], begun)
+    return _profile(place, [_Stepper(place, None, None, limit).step(_FIRST, 1)], begun)
 
 
 def profile_calls(
@@ -234,8 +217,7 @@ def profile_calls(
         which = int(np.searchsorted(np.cumsum(counts), drawn, side="right"))
     number = min(windows, counts[which])
     chosen = rng.choice(counts[which], size=number, replace=False) + 1
-    profile = steppers[which].profile(chosen, sum(counts))
-    return _profile(place, [Stratum(marker=functions[which], profile=profile)], begun)
+    return _profile(place, [steppers[which].step(chosen, sum(counts))], begun)
 
 
 def function_of(place: Place, name: str) -> Location:
@@ -292,17 +274,15 @@ class _Stepper:
         finally:
             tracee.kill()
 
-    def profile(self, numbers: NDArray[np.int64], count: int) -> Profile:
+    def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
         """The windows of these numbers, from 1, of `count`."""
-        begun, left = time.perf_counter(), sorted(numbers.tolist())
+        left = sorted(numbers.tolist())
         segments: list[Segment] = []
         while left:  # once, unless a function calls itself
             found = list(self._pass(left))
             segments += found
             left = left[len(found) :]
-        return Profile(
-            segments=tuple(segments), windows_in_run=count, cost_s=time.perf_counter() - begun
-        )
+        return Stratum(marker=self.marker, segments=tuple(segments), windows_in_run=count)
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:
         """Windows of one run, until one lies inside the window before."""

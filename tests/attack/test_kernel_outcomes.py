@@ -64,7 +64,7 @@ def known(known_target):
 
 def fault_in_r10(place, profile, bit):
     """After the instruction that sets r10."""
-    (segment,) = profile.strata[0].profile.segments
+    (segment,) = profile.strata[0].segments
     for address in map(int, segment.trace):
         instruction = decode(profile.code_at(address), address)
         if instruction.text.startswith("mov r10,"):

@@ -179,7 +179,7 @@ def profiled(nodes, node):
 
 def test_a_call_is_profiled_from_its_entry_to_its_return(profiled, node):
     (stratum,) = profiled.strata
-    (segment,) = stratum.profile.segments
+    (segment,) = stratum.segments
     assert segment.start == (Stage(entry_of(node), 1),)
     texts = {profiled.image.symbol(profiled.image.locate(int(a))) for a in segment.trace}
     assert {text.split("+")[0] for text in texts} >= {"kernel", "inner"}
@@ -214,11 +214,11 @@ def test_a_large_kernel_is_profiled_by_sample(nodes, node):
         rng = np.random.default_rng(seed)
         found = profile_calls(nodes, rng, [inner, seldom], windows=2)
         (stratum,) = found.strata
-        assert stratum.profile.windows_in_run == 3 + 1
-        for segment in stratum.profile.segments:
+        assert stratum.windows_in_run == 3 + 1
+        for segment in stratum.segments:
             assert segment.start[0].location == stratum.marker
             assert len(segment.trace) == 2  # mulsd, ret
-        drawn.append((stratum.marker, len(stratum.profile.segments)))
+        drawn.append((stratum.marker, len(stratum.segments)))
     assert set(drawn) == {(inner, 2), (seldom, 1)}
 
 
@@ -299,7 +299,7 @@ def compiled_nodes():
 
 def test_a_kernel_without_a_file_is_a_region(library, compiled_nodes, tmp_path):
     found = profile_call(compiled_nodes)
-    assert len(found.strata[0].profile.segments[0].trace) > 6
+    assert len(found.strata[0].segments[0].trace) > 6
     process = started(COMPILED_NODE)
     try:
         address = int(process.stdout.readline())

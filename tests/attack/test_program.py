@@ -211,12 +211,11 @@ def test_sampled_invocations_say_that_they_are_a_sample(target, workplace):
     program = target("counting", "50", function="body")
     profiled = workplace(program).profile(np.random.default_rng(3), windows=4)
     (stratum,) = profiled.strata
-    profile = stratum.profile
-    assert (len(profile.segments), profile.windows_in_run, profile.complete) == (4, 50, False)
+    assert (len(stratum.segments), stratum.windows_in_run, stratum.complete) == (4, 50, False)
     campaign = attacked(program, runs=6, seed=5, windows=4)
     assert campaign.profile.windows == "4 of 50"
     hit = {campaign.profile.window_of(entry) for entry in campaign.records}
-    starts = {segment.start[0].count for segment in campaign.profile.strata[0].profile.segments}
+    starts = {segment.start[0].count for segment in campaign.profile.strata[0].segments}
     assert hit <= {(0, number) for number in starts}
     assert len(hit) > 1
     assert {entry["symbol"].split("+")[0] for entry in campaign.records} == {"body"}

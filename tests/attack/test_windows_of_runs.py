@@ -68,8 +68,8 @@ def in_order(profile):
     """All stepped windows as one trace, by where they begin."""
     whole = profile.strata[0]
     assert whole.marker is None
-    traces = [segment.trace for segment in whole.profile.segments]
-    rest = [segment for stratum in profile.strata[1:] for segment in stratum.profile.segments]
+    traces = [segment.trace for segment in whole.segments]
+    rest = [segment for stratum in profile.strata[1:] for segment in stratum.segments]
     return np.concatenate(traces), rest
 
 
@@ -92,14 +92,14 @@ def test_windows_of_several_markers_share_the_run_without_gap_or_overlap(recursi
     whole = profile_run(recursive, rng)
     cut = profile_run(recursive, rng, markers=functions(recursive, "leaf", "tree"), windows=100)
     assert cut.complete
-    counts = [stratum.profile.windows_in_run for stratum in cut.strata]
+    counts = [stratum.windows_in_run for stratum in cut.strata]
     assert counts == [1, 4 + 7, 15]
     assert cut.instructions == cut.executed == whole.executed
 
     def addresses(profile):
         found = Counter()
         for stratum in profile.strata:
-            for segment in stratum.profile.segments:
+            for segment in stratum.segments:
                 found.update(segment.trace.tolist())
         return found
 
@@ -112,9 +112,9 @@ def test_calls_of_a_function_that_calls_itself_are_whole_calls(recursive):
         recursive, np.random.default_rng(1), functions(recursive, "tree"), windows=15
     )
     (stratum,) = profile.strata
-    by_depth = Counter(len(segment.trace) for segment in stratum.profile.segments)
+    by_depth = Counter(len(segment.trace) for segment in stratum.segments)
     assert sorted(by_depth.values()) == [1, 2, 4, 8]
-    assert [segment.start[0].count for segment in stratum.profile.segments] == list(range(1, 16))
+    assert [segment.start[0].count for segment in stratum.segments] == list(range(1, 16))
 
 
 def test_a_sample_estimates_the_run(recursive):
@@ -135,7 +135,7 @@ def test_short_windows_are_stepped_until_it_is_enough(place):
     marker = functions(where, "body")
     profile = profile_run(where, np.random.default_rng(2), markers=marker, windows=3)
     assert profile.complete
-    assert profile.strata[1].profile.windows_in_run == 400
+    assert profile.strata[1].windows_in_run == 400
 
 
 def test_faults_are_drawn_evenly_over_all_windows(recursive):
@@ -144,7 +144,7 @@ def test_faults_are_drawn_evenly_over_all_windows(recursive):
 
     rng = np.random.default_rng(7)
     (whole,) = profile_run(recursive, rng).strata
-    counts = Counter(whole.profile.segments[0].trace.tolist())
+    counts = Counter(whole.segments[0].trace.tolist())
     markers = functions(recursive, "leaf", "tree")
     profile = profile_run(recursive, rng, markers=markers, windows=100)
     plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
@@ -160,7 +160,7 @@ def test_a_trigger_of_a_window_stops_before_its_execution(recursive):
     markers = functions(recursive, "leaf", "tree")
     rng = np.random.default_rng(11)
     (only,) = profile_run(recursive, rng).strata
-    whole = only.profile.segments[0].trace
+    whole = only.segments[0].trace
     profile = profile_run(recursive, rng, markers=markers, windows=100)
     image, plan = profile.image, strategy("instruction-uniform")
     for _ in range(12):

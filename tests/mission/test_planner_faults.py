@@ -94,7 +94,7 @@ def test_the_instructions_of_a_search_stay_in_scope_and_windows_are_parts_of_the
         entry = place.scope_of_node.inner[1]
     finally:
         place.close()
-    trace = whole.strata[0].profile.segments[0].trace
+    trace = whole.strata[0].segments[0].trace
     assert whole.image.locate(int(trace[0])) == entry  # a test of the start comes first
     objects = Counter(whole.image.locate(int(address)).object for address in trace)
     assert set(objects) == {OMPL, SEGMENT, PIECES}
@@ -105,8 +105,8 @@ def test_the_instructions_of_a_search_stay_in_scope_and_windows_are_parts_of_the
     assert {stratum.marker.object for stratum in sampled.strata} == {OMPL, SEGMENT, PIECES}
     for stratum in sampled.strata:
         begins = np.flatnonzero(trace == whole.image.address(stratum.marker))
-        assert stratum.profile.windows_in_run == len(begins)
-        for segment in stratum.profile.segments:
+        assert stratum.windows_in_run == len(begins)
+        for segment in stratum.segments:
             request, window = segment.start
             assert (request.location.object, request.count) == (READER, 2)
             begin = begins[window.count - 1]

@@ -18,7 +18,7 @@ from mavfi_cli.fi.tracer.fault import (
     draw_corruption,
 )
 from mavfi_cli.fi.tracer.image import Location
-from mavfi_cli.fi.tracer.windows import Profile, plan_trigger
+from mavfi_cli.fi.tracer.windows import Stratum, plan_trigger
 
 
 class Rule(Enum):
@@ -95,7 +95,7 @@ def strategy(name: str, model: FaultModel | None = None, *, compat: str | None =
 
 
 def draw_fault(
-    profile: Profile,
+    stratum: Stratum,
     plan: Strategy,
     rng: np.random.Generator,
     *,
@@ -107,7 +107,7 @@ def draw_fault(
     An instruction without such an operand is drawn again, so that the rest stay equally likely.
 
     Args:
-        profile: of the fault-free run.
+        stratum: windows of the fault-free run.
         plan: the strategy; its rule is instruction-uniform.
         rng: the fault's own generator.
         code_at: 16 bytes of code at an address.
@@ -116,10 +116,10 @@ def draw_fault(
     Raises:
         FaultError: no executed instruction in scope has such an operand.
     """
-    if not profile.executed:
+    if not stratum.executed:
         raise FaultError("no instruction in scope was executed")
     for _ in range(10_000):
-        segment, index = profile.at(int(rng.integers(profile.executed)))
+        segment, index = stratum.at(int(rng.integers(stratum.executed)))
         address = int(segment.trace[index])
         instruction = decode(code_at(address), address)
         if instruction is None:

@@ -46,12 +46,17 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Profile:
-    """All stepped windows of one scope."""
+class Stratum:
+    """Windows that begin at the same instruction, and those of them that were stepped."""
 
     segments: tuple[Segment, ...]
     windows_in_run: int  # how many windows the run has; more than stepped means a sample of them
-    cost_s: float  # wall time of the stepping
+    marker: Location | None = None  # None: the start of the run
+
+    @property
+    def instructions(self) -> float:
+        """Executed instructions of all windows, estimated from the stepped ones."""
+        return self.executed / len(self.segments) * self.windows_in_run
 
     @property
     def executed(self) -> int:

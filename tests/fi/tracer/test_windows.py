@@ -132,12 +132,12 @@ def test_faults_are_uniform_over_executed_instructions(start):
     """Chi-square of the drawn addresses against the profile's counts."""
     from scipy.stats import chisquare
 
-    from mavfi_cli.fi.tracer.windows import Profile
+    from mavfi_cli.fi.tracer.windows import Stratum
 
     trace, image, _ = profile_of(start, "counting", "40")
     tracee = start("counting", "40")
     plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
-    profile = Profile(segments=(Segment(start=(), trace=trace),), windows_in_run=1, cost_s=0.0)
+    profile = Stratum(segments=(Segment(start=(), trace=trace),), windows_in_run=1)
     rng = np.random.default_rng(11)
     drawn = Counter(
         image.address(
@@ -174,11 +174,11 @@ def test_unknown_rules_objects_and_functions_name_the_nearest(start):
 
 
 def test_a_scope_without_a_matching_operand_is_an_error(start):
-    from mavfi_cli.fi.tracer.windows import Profile
+    from mavfi_cli.fi.tracer.windows import Stratum
 
     trace, image, _ = profile_of(start, "sorting")
     tracee = start("sorting")
-    profile = Profile(segments=(Segment(start=(), trace=trace),), windows_in_run=1, cost_s=0.0)
+    profile = Stratum(segments=(Segment(start=(), trace=trace),), windows_in_run=1)
     plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.MASK,))))
     with pytest.raises(FaultError, match="no executed instruction in scope has an operand"):
         draw_fault(
