@@ -13,6 +13,7 @@ injection costs is measured by `kernel_null.py`.
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 import time
 from contextlib import closing
@@ -91,8 +92,11 @@ def main() -> None:
         fed = inputs_of_flight(MissionConfig(stack="hardened"), folder)
         plan = Plan(runs=options.runs, seed=1)
         for kernel in catalogue.select(options.kernel):
-            target = KernelTarget(kernel=kernel, **fed)
-            same, count = measure(plan, target, folder, options.replays)
+            own = folder / kernel  # a folder of several kernels is one campaign
+            own.mkdir()
+            inputs = Path(shutil.copy(fed["inputs"], own))
+            target = KernelTarget(kernel=kernel, **{**fed, "inputs": inputs})
+            same, count = measure(plan, target, own, options.replays)
             equal, total = equal + same, total + count
     print(f"all kernels: {equal} of {total} replays identical")
 
