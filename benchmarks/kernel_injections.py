@@ -40,7 +40,7 @@ def starts(place: KernelPlace, runs: int = 20) -> tuple[float, float]:
         ready.append(time.perf_counter() - begun)
         while tracee.ended is None:
             tracee.resume()
-        call.append(place.told().cpu_s)
+        call.append(place.left().cpu_s)
     return float(np.median(ready)), float(np.median(call))
 
 

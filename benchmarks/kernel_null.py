@@ -75,7 +75,7 @@ def run(place: KernelPlace, way: str) -> float:
         (finish if way == "after" else finish_alone)(tracee)
     else:
         (finish if way == "ended" else finish_alone)(tracee)
-    told = place.told()
+    told = place.left()
     assert told is not None
     return told.cpu_s
 

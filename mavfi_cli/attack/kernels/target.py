@@ -96,7 +96,7 @@ class KernelTarget:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
+class CallOutput:
     """What a run left: the times of its call, and its packed output or its error."""
 
     cpu_s: float
@@ -191,29 +191,29 @@ class KernelPlace:
             TargetError: it fails.
         """
         ended = run_out(self.start())
-        told = self.told()
-        if told is None or ended.exit_code != 0:
+        output = self.left()
+        if output is None or ended.exit_code != 0:
             how = f"signal {ended.signal}" if ended.signal else f"exit code {ended.exit_code}"
-            text = told.data.decode(errors="replace") if told else how
+            text = output.data.decode(errors="replace") if output else how
             raise TargetError(self.name, f"fails without a fault: {text}")
-        return Golden(output=told.data, cpu_s=told.cpu_s, wall_s=told.wall_s)
+        return Golden(output=output.data, cpu_s=output.cpu_s, wall_s=output.wall_s)
 
     def unlike(self, golden: Golden, again: Golden) -> str:
         """How two fault-free runs differ; empty where they do not."""
         return "" if golden.output == again.output else "their outputs differ"
 
-    def told(self) -> Told | None:
+    def left(self) -> CallOutput | None:
         """What the run that has ended left; None where it left nothing whole."""
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None
         cpu_s, wall_s = TIMES.unpack_from(data)
-        return Told(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
+        return CallOutput(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
 
     def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
         """Judge the last run; `ended` is None where it was cut off."""
-        told = self.told()
-        left = None if told is None or ended is None else told.data
+        output = self.left()
+        left = None if output is None or ended is None else output.data
         tolerance = self.target.tolerance or None
         outcome, difference = judged(golden, ended, left, self._compare, tolerance=tolerance)
         raised = left is not None and ended is not None and ended.exit_code == RAISED
