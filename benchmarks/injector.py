@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.attack.campaign import TargetRuns, run_campaign
-from mavfi_cli.attack.comparison import Comparison
+from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.program import ProgramTarget, Workplace
@@ -68,7 +68,7 @@ def target_of(program: Path, ticks: int, mechanism: Mechanism | None = None) -> 
     """The program as a target."""
     return ProgramTarget(
         command=Command.of([str(program), str(ticks)]),
-        comparison=Comparison(),
+        comparison=OutputComparison(),
         mechanism=mechanism,
     )
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.outcome import Outcome
-from mavfi_cli.attack.target import Golden, JudgedPlace, Verdict
+from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.alarm import Alarm
@@ -41,7 +41,7 @@ class RunResult:
 
     outcome: Outcome
     signal: int | None
-    verdict: Verdict
+    verdict: RunVerdict
     fault: InstructionFault | None  # None where a time trigger found nothing to hit
     injection: Injection | None
     followed: Followed

@@ -17,7 +17,7 @@ from mavfi_cli.attack.attacker import Attacker, RunResult, golden_run
 from mavfi_cli.attack.journal import Journal
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.profile import TargetProfile, steps_told
-from mavfi_cli.attack.target import Golden, JudgedPlace, Target
+from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace
 from mavfi_cli.attack.workers import Bench, Workers, one_processor
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.sampling import Rule
@@ -31,7 +31,7 @@ Stage = Callable[[str], None]
 class TargetRuns:
     """All runs of one target, in order of their numbers, and what they were drawn from."""
 
-    target: Target
+    target: AttackTarget
     context: Mapping[str, Any]  # what every record says of the target
     golden: Golden
     profile: TargetProfile | None  # None for time rules
@@ -42,7 +42,7 @@ class TargetRuns:
 
 def run_campaign(
     plan: Plan,
-    targets: Sequence[Target],
+    targets: Sequence[AttackTarget],
     *,
     jobs: int = 1,
     folder: Path | None = None,
@@ -76,7 +76,7 @@ def run_campaign(
 
 def _attack(
     plan: Plan,
-    target: Target,
+    target: AttackTarget,
     workers: Workers,
     journal: Journal | None,
     progress: Progress,
@@ -103,7 +103,7 @@ def _attack(
     return replace(prepared, records=records, wall_s=time.perf_counter() - begun)
 
 
-def _prepare(plan: Plan, target: Target, stage: Stage) -> tuple[TargetRuns, JudgedPlace]:
+def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns, JudgedPlace]:
     """Golden run and profile, and the place where they were made."""
     begun = time.perf_counter()
     stage("loading")

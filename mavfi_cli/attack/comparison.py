@@ -17,7 +17,7 @@ _SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class OutputComparison:
     """Which outputs are compared, and what of them.
 
     Attributes:
@@ -35,7 +35,7 @@ class Comparison:
     @classmethod
     def of(
         cls, outputs: Iterable[str], *, tolerance: float = 0.0, ignored: Iterable[str] = ()
-    ) -> Comparison:
+    ) -> OutputComparison:
         """From the command line.
 
         Args:

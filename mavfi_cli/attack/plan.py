@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mavfi_cli.attack.target import Target
+from mavfi_cli.attack.target import AttackTarget
 from mavfi_cli.fi.tracer.fault import FaultModel
 from mavfi_cli.fi.tracer.sampling import Rule, Strategy, strategy
 
@@ -26,7 +26,7 @@ class Plan:
         """The sampling strategy."""
         return strategy(self.rule, self.model, compat=self.compat)
 
-    def to_json(self, target: Target) -> dict[str, Any]:
+    def to_json(self, target: AttackTarget) -> dict[str, Any]:
         """What results depend on; neither how many runs nor which targets there are does."""
         return {
             "seed": self.seed,

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.attack.outcome import Window
-from mavfi_cli.attack.target import Place
+from mavfi_cli.attack.target import AttackPlace
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.fault import InstructionFault, Stage
 from mavfi_cli.fi.tracer.image import Image, Location
@@ -129,7 +129,7 @@ def steps_told(stage: Callable[[str], None]) -> Watch:
 
 
 def profile_run(
-    place: Place,
+    place: AttackPlace,
     rng: np.random.Generator,
     *,
     markers: Sequence[Location] = (),
@@ -171,7 +171,7 @@ def profile_run(
     return _profile(place, strata, begun)
 
 
-def profile_call(place: Place, *, limit: int = STEPS) -> TargetProfile:
+def profile_call(place: AttackPlace, *, limit: int = STEPS) -> TargetProfile:
     """Step one call of a function: the runs of the place start at its entry.
 
     Raises:
@@ -182,7 +182,7 @@ def profile_call(place: Place, *, limit: int = STEPS) -> TargetProfile:
 
 
 def profile_calls(
-    place: Place,
+    place: AttackPlace,
     rng: np.random.Generator,
     functions: Sequence[Location],
     *,
@@ -220,7 +220,7 @@ def profile_calls(
     return _profile(place, [steppers[which].step(chosen, sum(counts))], begun)
 
 
-def function_of(place: Place, name: str) -> Location:
+def function_of(place: AttackPlace, name: str) -> Location:
     """The entry of a function in scope.
 
     Raises:
@@ -234,7 +234,7 @@ def function_of(place: Place, name: str) -> Location:
         tracee.kill()
 
 
-def _image(place: Place) -> Image:
+def _image(place: AttackPlace) -> Image:
     tracee = place.start()
     try:
         return place.image(tracee)
@@ -242,7 +242,7 @@ def _image(place: Place) -> Image:
         tracee.kill()
 
 
-def _profile(place: Place, strata: Iterable[Stratum], begun: float) -> TargetProfile:
+def _profile(place: AttackPlace, strata: Iterable[Stratum], begun: float) -> TargetProfile:
     tracee = place.start()
     try:
         image = place.image(tracee)
@@ -259,7 +259,7 @@ def _profile(place: Place, strata: Iterable[Stratum], begun: float) -> TargetPro
 class _Stepper:
     """Steps the windows that begin at one marker."""
 
-    place: Place
+    place: AttackPlace
     marker: Location | None  # None: the start of the run
     markers: tuple[Location, ...] | None  # where windows end; None: when the function returns
     limit: int

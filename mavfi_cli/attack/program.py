@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
-from mavfi_cli.attack.comparison import Comparison, compared, joined
+from mavfi_cli.attack.comparison import OutputComparison, compared, joined
 from mavfi_cli.attack.profile import TargetProfile, Watch, function_of, profile_calls, profile_run
-from mavfi_cli.attack.target import Golden, Limits, Verdict, digest, judged
+from mavfi_cli.attack.target import Golden, RunLimits, RunVerdict, digest, judged
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
@@ -31,10 +31,10 @@ class ProgramTarget:
     """A program, what of it may be hit, and what is compared."""
 
     command: Command
-    comparison: Comparison
+    comparison: OutputComparison
     objects: tuple[str, ...] = ()  # file names in scope; default the program itself
     function: str | None = None  # only within invocations of this function
-    limits: Limits = field(default_factory=Limits)
+    limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
 
     @property
@@ -198,12 +198,12 @@ class Workplace:
         where = f"at the line {text!r}" if text else "in length"
         return f"their outputs differ {where}; --ignore-lines leaves out lines that change"
 
-    def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
+    def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None where it was cut off."""
         parts, tolerance = self._parts(), self.target.comparison.tolerance
         output = joined(parts)
         outcome, difference = judged(golden, ended, output, compared, tolerance=tolerance)
-        return Verdict(
+        return RunVerdict(
             outcome=outcome,
             output_sha256=digest(output if any(parts.values()) else b""),
             details={

@@ -1,7 +1,8 @@
 """What an attack asks of its target, and how the end of a run is judged.
 
-A `Target` is plain values that can be handed to a worker process. `open` gives the `Place` where it
-runs, again and again from the same memory. A class with these methods is a target of your own.
+An `AttackTarget` is plain values that can be handed to a worker process. `open` gives the place
+where it runs, again and again from the same memory. A class with these methods is a target of your
+own.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
+class RunLimits:
     """When a run counts as hung, and how far to step."""
 
     factor: float = 10.0  # times the golden CPU time and duration
@@ -49,7 +50,7 @@ class Golden:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class RunVerdict:
     """What the end and the output of a run amount to.
 
     Attributes:
@@ -63,7 +64,7 @@ class Verdict:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Place(Protocol):
+class AttackPlace(Protocol):
     """Where a target runs, again and again from the same start."""
 
     @property
@@ -87,15 +88,15 @@ class Place(Protocol):
         """Leave nothing behind."""
 
 
-class JudgedPlace(Place, Protocol):
+class JudgedPlace(AttackPlace, Protocol):
     """A place whose runs end by themselves and leave an output."""
 
     @property
-    def target(self) -> Target:
+    def target(self) -> AttackTarget:
         """The target, with what was found out about it, so that a worker opens it faster."""
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> RunLimits:
         """When a run counts as hung."""
 
     def context(self) -> dict[str, Any]:
@@ -114,11 +115,11 @@ class JudgedPlace(Place, Protocol):
     def unlike(self, golden: Golden, again: Golden) -> str:
         """How two fault-free runs differ, in words; empty where they do not."""
 
-    def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
+    def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None where it was cut off."""
 
 
-class Target(Protocol):
+class AttackTarget(Protocol):
     """A target as plain values."""
 
     @property

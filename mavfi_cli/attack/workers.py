@@ -16,7 +16,7 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import Attacker, RunResult
 from mavfi_cli.attack.plan import Plan
-from mavfi_cli.attack.target import Golden, Target
+from mavfi_cli.attack.target import AttackTarget, Golden
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer.fault import InstructionFault
@@ -41,7 +41,7 @@ class Bench:
     """A target with its golden run, as it is handed to a worker process: plain values."""
 
     plan: Plan
-    target: Target
+    target: AttackTarget
     golden: Golden
 
     def generator(self, *what: str | int) -> np.random.Generator:

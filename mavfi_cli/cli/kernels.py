@@ -20,7 +20,7 @@ from mavfi_cli.core.errors import ConfigError
 if TYPE_CHECKING:
     from mavfi_cli.attack.campaign import TargetRuns
     from mavfi_cli.attack.plan import Plan
-    from mavfi_cli.attack.target import Target
+    from mavfi_cli.attack.target import AttackTarget
 
 
 @click.command()
@@ -138,7 +138,7 @@ def _plan(options: dict[str, Any]) -> Plan:
 
 
 def _attacked(
-    plan: Plan, targets: Sequence[Target], options: dict[str, Any], folder: Path | None
+    plan: Plan, targets: Sequence[AttackTarget], options: dict[str, Any], folder: Path | None
 ) -> list[TargetRuns]:
     from mavfi_cli.attack.campaign import run_campaign
     from mavfi_cli.cli.runs_view import runs_view
@@ -199,12 +199,12 @@ def _attack_program(options: dict[str, Any]) -> None:
     _tell(summary, program_table(summary), "kernels.json, kernels.csv, runs.jsonl", options)
 
 
-def _program(options: dict[str, Any]) -> Target:
-    from mavfi_cli.attack.comparison import Comparison, absolute_arguments
+def _program(options: dict[str, Any]) -> AttackTarget:
+    from mavfi_cli.attack.comparison import OutputComparison, absolute_arguments
     from mavfi_cli.attack.program import ProgramTarget
     from mavfi_cli.fi.tracer.spawn import Command
 
-    comparison = Comparison.of(
+    comparison = OutputComparison.of(
         options["compare"], tolerance=options["tolerance"], ignored=options["ignore_lines"]
     )
     try:

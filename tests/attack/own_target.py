@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.profile import profile_run
-from mavfi_cli.attack.target import Golden, Limits, Verdict, digest, judged
+from mavfi_cli.attack.target import Golden, RunLimits, RunVerdict, digest, judged
 from mavfi_cli.fi.tracer.image import Image, scope_of
 from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
 
@@ -28,7 +28,7 @@ class OwnTarget:
 
 class OwnPlace:
     kind = "program"
-    limits = Limits(cpu_grace_s=0.1, wall_grace_s=3.0)
+    limits = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
 
     def __init__(self, target):
         self.target, self.name = target, target.name
@@ -62,7 +62,9 @@ class OwnPlace:
     def judge(self, golden, ended):
         output = self._left()
         outcome, _ = judged(golden, ended, output, lambda *_: None, tolerance=None)
-        return Verdict(outcome=outcome, output_sha256=digest(output), details={"magnitude": None})
+        return RunVerdict(
+            outcome=outcome, output_sha256=digest(output), details={"magnitude": None}
+        )
 
     def _left(self):
         return self._output.read_bytes()[:-2]

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import golden_run
-from mavfi_cli.attack.comparison import Comparison, absolute_arguments, magnitude
+from mavfi_cli.attack.comparison import OutputComparison, absolute_arguments, magnitude
 from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.cli.kernels import kernels
@@ -28,7 +28,7 @@ def place(native_program, tmp_path):
         path.write_text(f"#!/bin/sh\n{script}\n")
         path.chmod(0o755)
         target = ProgramTarget(
-            command=Command.of([str(path)]), comparison=Comparison.of(outputs, **options)
+            command=Command.of([str(path)]), comparison=OutputComparison.of(outputs, **options)
         )
         places.append(target.open())
         return places[-1]
@@ -183,7 +183,7 @@ def test_standard_input_reaches_the_program(native_program, tmp_path):
     given = tmp_path / "given.txt"
     given.write_text("21\n")
     program = Command.of([str(native_program("writing")), "o"], stdin=given)
-    where = Workplace(ProgramTarget(command=program, comparison=Comparison.of(["file:o"])))
+    where = Workplace(ProgramTarget(command=program, comparison=OutputComparison.of(["file:o"])))
     assert golden_run(where).output == b"21 42\n"
     where.close()
 
@@ -207,8 +207,8 @@ def test_magnitude(golden, output, size):
 
 
 def test_what_can_be_compared():
-    assert Comparison.of(["file:./out.txt"]).files == ("out.txt",)
-    assert Comparison.of([]) == Comparison.of(["stdout"]) == Comparison()
-    assert Comparison.of(["stdout", "file:a", "stdout"]).to_json()["file"] == [None, "a"]
+    assert OutputComparison.of(["file:./out.txt"]).files == ("out.txt",)
+    assert OutputComparison.of([]) == OutputComparison.of(["stdout"]) == OutputComparison()
+    assert OutputComparison.of(["stdout", "file:a", "stdout"]).to_json()["file"] == [None, "a"]
     with pytest.raises(ConfigError, match="known: stdout, file:PATH"):
-        Comparison.of(["stderr"])
+        OutputComparison.of(["stderr"])

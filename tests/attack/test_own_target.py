@@ -6,7 +6,7 @@ import pytest
 from own_target import OwnTarget
 
 from mavfi_cli.attack.campaign import run_campaign
-from mavfi_cli.attack.comparison import Comparison
+from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError
@@ -27,7 +27,7 @@ def own(native_program, tmp_path):
 
 def test_a_target_of_ones_own_gets_the_faults_that_a_program_gets(own):
     command = Command.of([str(own.program), "30"])
-    program = records(ProgramTarget(command=command, comparison=Comparison()))
+    program = records(ProgramTarget(command=command, comparison=OutputComparison()))
     ours = records(own)
     assert [[e[key] for key in DRAWN] for e in ours] == [[e[key] for key in DRAWN] for e in program]
     ends = {

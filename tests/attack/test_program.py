@@ -11,12 +11,12 @@ from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import run_campaign
-from mavfi_cli.attack.comparison import Comparison
+from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.outcome import Outcome, design_effect, shares, wilson
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.attack.summary import PROGRAM_COLUMNS, csv_rows, summarise_program
-from mavfi_cli.attack.target import Limits, digest
+from mavfi_cli.attack.target import RunLimits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer import record
@@ -35,7 +35,7 @@ from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import Activation
 from mavfi_cli.fi.tracer.spawn import Command
 
-QUICK = Limits(cpu_grace_s=0.1, wall_grace_s=3.0)
+QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
 
 
 def attacked(program, jobs=1, folder=None, **plan):
@@ -48,7 +48,7 @@ def attacked(program, jobs=1, folder=None, **plan):
 def target(native_program):
     def make(name, *arguments, **options):
         command = Command.of([str(native_program(name)), *arguments])
-        options.setdefault("comparison", Comparison())
+        options.setdefault("comparison", OutputComparison())
         return ProgramTarget(command=command, limits=QUICK, **options)
 
     return make
@@ -114,7 +114,7 @@ def test_programs_of_known_outcome(target, workplace, name, bit, outcome):
 
 
 def test_a_tolerance_makes_small_differences_benign(target, workplace):
-    program = target("sdc", comparison=Comparison(tolerance=3.0))
+    program = target("sdc", comparison=OutputComparison(tolerance=3.0))
     place = workplace(program)
     attacker = Attacker(place=place, golden=golden_run(place))
     result = attacker.run(victim_fault(place, program, 4))
@@ -254,7 +254,7 @@ def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_progr
     script = tmp_path / "random"
     script.write_text("#!/bin/sh\nod -An -N8 -tx8 /dev/urandom\n")
     script.chmod(0o755)
-    program = ProgramTarget(command=Command.of([str(script)]), comparison=Comparison())
+    program = ProgramTarget(command=Command.of([str(script)]), comparison=OutputComparison())
     place = Workplace(program)
     with pytest.raises(TargetError, match="fault-free runs differ"):
         golden_run(place)

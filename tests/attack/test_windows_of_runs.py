@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from mavfi_cli.attack.comparison import Comparison
+from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.profile import function_of, profile_calls, profile_run
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.core.errors import TargetError, UnknownName
@@ -34,7 +34,7 @@ def place(native_program):
 
     def make(name, *arguments, **options):
         command = Command.of([str(native_program(name)), *arguments])
-        target = ProgramTarget(command=command, comparison=Comparison(), **options)
+        target = ProgramTarget(command=command, comparison=OutputComparison(), **options)
         places.append(Workplace(target))
         return places[-1]
 

@@ -31,7 +31,7 @@ from mavfi_cli.attack.kernels.template import (
 from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.profile import TargetProfile, Watch, profile_run
 from mavfi_cli.attack.served import ServedProcess
-from mavfi_cli.attack.target import Difference, Golden, Limits, Verdict, digest, judged
+from mavfi_cli.attack.target import Difference, Golden, RunLimits, RunVerdict, digest, judged
 from mavfi_cli.core.channel import receive
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.core.sources import own_digest
@@ -67,7 +67,7 @@ class KernelTarget:
     inputs_sha256: str = ""
     flight: str = ""
     tolerance: float = 0.0
-    limits: Limits = field(default_factory=Limits)
+    limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
     layout: Layout | None = None
 
@@ -210,7 +210,7 @@ class KernelPlace:
         cpu_s, wall_s = TIMES.unpack_from(data)
         return CallOutput(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
 
-    def judge(self, golden: Golden, ended: Ended | None) -> Verdict:
+    def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None where it was cut off."""
         output = self.left()
         left = None if output is None or ended is None else output.data
@@ -218,7 +218,7 @@ class KernelPlace:
         outcome, difference = judged(golden, ended, left, self._compare, tolerance=tolerance)
         raised = left is not None and ended is not None and ended.exit_code == RAISED
         size = 0.0 if difference is None else difference.relative
-        return Verdict(
+        return RunVerdict(
             outcome=outcome,
             output_sha256=digest(left) if left else "",
             details={

@@ -33,7 +33,7 @@ _CALLS = {"octomap": 16}  # sampled: how many calls of one inner function, of so
 
 
 class Rehearsal:
-    """The `Place` where one invocation of a node's kernel runs.
+    """The `AttackPlace` where one invocation of a node's kernel runs.
 
     Args:
         setup: of the node.
