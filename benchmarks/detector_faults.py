@@ -13,11 +13,11 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+from mavfi_cli.attack.outcome import wilson
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.fi.isolated.outcome import wilson
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import DETECTOR, FaultConfig

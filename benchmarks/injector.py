@@ -21,13 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.fi.isolated.campaign import Campaign, Plan, run_campaign
-from mavfi_cli.fi.isolated.compare import Comparison
-from mavfi_cli.fi.isolated.outcome import Outcome
-from mavfi_cli.fi.isolated.program import ProgramTarget, Workplace
-from mavfi_cli.fi.native.breakpoints import Mechanism
-from mavfi_cli.fi.native.image import Image
-from mavfi_cli.fi.native.spawn import Command
+from mavfi_cli.attack.campaign import TargetRuns, run_campaign
+from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.plan import Plan
+from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.fi.tracer.breakpoints import Mechanism
+from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer.spawn import Command
 
 SOURCE = r"""
 #include <stdio.h>
@@ -67,7 +68,7 @@ def target_of(program: Path, ticks: int, mechanism: Mechanism | None = None) -> 
     """The program as a target."""
     return ProgramTarget(
         command=Command.of([str(program), str(ticks)]),
-        comparison=Comparison(),
+        comparison=OutputComparison(),
         mechanism=mechanism,
     )
 
@@ -114,7 +115,7 @@ def starts(program: Path, runs: int = 40) -> tuple[list[float], list[float]]:
     return traced, plain
 
 
-def summarise(campaign: Campaign, say: Callable[[str], None]) -> None:
+def summarise(campaign: TargetRuns, say: Callable[[str], None]) -> None:
     """The figures of a campaign."""
     records = campaign.records
     total = sum(entry["run_s"] for entry in records)
@@ -123,7 +124,7 @@ def summarise(campaign: Campaign, say: Callable[[str], None]) -> None:
     say(f"injections per hour and core: {3600 * len(records) / total:,.0f} in all")
     say(f"  without the {hangs} hangs: {3600 * len(quick) / sum(quick):,.0f}")
     say(f"  one run: {milliseconds([entry['run_s'] for entry in records])}")
-    profile = campaign.profiled
+    profile = campaign.profile
     if profile is not None:
         say(f"  profile: {profile.executed} instructions in scope, {profile.cost_s:.2f} s, once")
     stops = [entry["injection"].get("stop_s") for entry in records]
@@ -139,7 +140,7 @@ def main() -> None:
     runs = parser.parse_args().runs
     with tempfile.TemporaryDirectory() as folder:
         program = build(Path(folder))
-        campaign = run_campaign(Plan(target=target_of(program, 50), runs=runs, seed=1))
+        (campaign,) = run_campaign(Plan(runs=runs, seed=1), [target_of(program, 50)])
         summarise(campaign, print)
         for mechanism in Mechanism:
             cost = seconds_per_hit(program, mechanism)

@@ -13,6 +13,7 @@ injection costs is measured by `kernel_null.py`.
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 import time
 from contextlib import closing
@@ -20,17 +21,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.campaign.kernels import catalogue
-from mavfi_cli.campaign.kernels.place import Place, template_of
-from mavfi_cli.campaign.kernels.profile import in_words
-from mavfi_cli.campaign.kernels.recorder import inputs_of_flight
-from mavfi_cli.campaign.kernels.replay import replay_runs
-from mavfi_cli.campaign.kernels.runs import Plan, run_kernels
-from mavfi_cli.fi.isolated.runs import one_processor
+from mavfi_cli.attack.campaign import run_campaign
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
+from mavfi_cli.attack.plan import Plan
+from mavfi_cli.attack.replay import replay_runs
+from mavfi_cli.attack.workers import one_processor
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 
 
-def starts(place: Place, runs: int = 20) -> tuple[float, float]:
+def starts(place: KernelPlace, runs: int = 20) -> tuple[float, float]:
     """Median time to have a run ready for its trigger, and CPU time of its undisturbed call."""
     ready, call = [], []
     for _ in range(runs):
@@ -39,30 +40,26 @@ def starts(place: Place, runs: int = 20) -> tuple[float, float]:
         ready.append(time.perf_counter() - begun)
         while tracee.ended is None:
             tracee.resume()
-        call.append(place.told().cpu_s)
+        call.append(place.left().cpu_s)
     return float(np.median(ready)), float(np.median(call))
 
 
-def measure(plan: Plan, folder: Path, replays: int) -> tuple[int, int]:
+def measure(plan: Plan, target: KernelTarget, folder: Path, replays: int) -> tuple[int, int]:
     """Print the figures of one kernel; identical replays and all replays."""
-    (name,) = plan.kernels
-    (runs,) = run_kernels(plan, folder=folder)
-    records, prepared = runs.records, runs.prepared
+    (runs,) = run_campaign(plan, [target], folder=folder)
+    name, records = target.name, runs.records
     run_s = np.array([entry["run_s"] for entry in records])
     stops = [entry["injection"].get("stop_s") for entry in records]
     stop_ms = 1e3 * np.array([stop for stop in stops if stop is not None])
-    with (
-        one_processor(),
-        closing(Place(name, template_of(name, plan.inputs), layout=prepared.layout)) as place,
-    ):
+    with one_processor(), closing(runs.target.open()) as place:
         ready_s, call_s = starts(place)
     hangs = sum(entry["outcome"] == "hang" for entry in records)
     mean_s = run_s.mean()
-    spread_s = mean_s + prepared.prepare_s / 5000
+    spread_s = mean_s + runs.prepare_s / 5000
     rest = max(0.0, 1.0 - (ready_s + call_s) / mean_s)
     print(
         f"{name}: {3600 / mean_s:,.0f} injections per hour and core ({3600 / spread_s:,.0f} with "
-        f"{prepared.prepare_s:.0f} s of preparation over 5,000 runs); {hangs} hangs"
+        f"{runs.prepare_s:.0f} s of preparation over 5,000 runs); {hangs} hangs"
     )
     print(
         f"  a run takes {1e3 * mean_s:.1f} ms: process start {ready_s / mean_s:.0%}, golden "
@@ -72,7 +69,7 @@ def measure(plan: Plan, folder: Path, replays: int) -> tuple[int, int]:
         f"  stop: median {np.median(stop_ms):.3f} ms, 99th percentile "
         f"{np.percentile(stop_ms, 99):.3f} ms; CPU time of the call {1e3 * call_s:.2f} ms"
     )
-    print(f"  population: {in_words(prepared.profile)}")
+    print(f"  population: {runs.profile.in_words()}")
     found = list(replay_runs(folder, (name,), replays)) if replays else []
     equal = sum(not replay.differs for replay in found)
     for replay in found:
@@ -92,13 +89,14 @@ def main() -> None:
     equal = total = 0
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        path, flight, sha256 = inputs_of_flight(MissionConfig(stack="hardened"), folder)
+        fed = inputs_of_flight(MissionConfig(stack="hardened"), folder)
+        plan = Plan(runs=options.runs, seed=1)
         for kernel in catalogue.select(options.kernel):
-            plan = Plan(
-                kernels=(kernel.name,), runs=options.runs, seed=1, inputs=path,
-                inputs_sha256=sha256, flight=flight,
-            )  # fmt: skip
-            same, count = measure(plan, folder, options.replays)
+            own = folder / kernel  # a folder of several kernels is one campaign
+            own.mkdir()
+            inputs = Path(shutil.copy(fed["inputs"], own))
+            target = KernelTarget(kernel=kernel, **{**fed, "inputs": inputs})
+            same, count = measure(plan, target, own, options.replays)
             equal, total = equal + same, total + count
     print(f"all kernels: {equal} of {total} replays identical")
 

@@ -30,14 +30,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.campaign.kernels import catalogue
-from mavfi_cli.campaign.kernels.place import Place, load, template_of
-from mavfi_cli.campaign.kernels.recorder import inputs_of_flight
-from mavfi_cli.fi.isolated.runs import one_processor
-from mavfi_cli.fi.native.breakpoints import PerfBreakpoint
-from mavfi_cli.fi.native.inject import instruction_at
-from mavfi_cli.fi.native.tracee import Tracee
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
+from mavfi_cli.attack.workers import one_processor
+from mavfi_cli.fi.tracer.breakpoints import PerfBreakpoint
+from mavfi_cli.fi.tracer.inject import instruction_at
+from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 
 WAYS = ("free", "ended", "armed", "counted", "stopped", "after")
 PAIRS = (("ended", "free"), ("armed", "free"), ("after", "stopped"))
@@ -61,7 +61,7 @@ def finish_alone(tracee: Tracee) -> None:
         os.close(process)
 
 
-def run(place: Place, way: str) -> float:
+def run(place: KernelPlace, way: str) -> float:
     """CPU time of one call, s."""
     tracee = place.start()
     entry = place.layout.image.address(place.layout.scope.entry)
@@ -75,7 +75,7 @@ def run(place: Place, way: str) -> float:
         (finish if way == "after" else finish_alone)(tracee)
     else:
         (finish if way == "ended" else finish_alone)(tracee)
-    told = place.told()
+    told = place.left()
     assert told is not None
     return told.cpu_s
 
@@ -91,16 +91,14 @@ def ratio(over: np.ndarray, under: np.ndarray) -> str:
 
 def measure(name: str, inputs: Path, rounds: int) -> None:
     """Print the figures of one kernel."""
-    template = template_of(name, inputs)
-    with one_processor():
-        load(name, template)
-        with closing(Place(name, template)) as place:
-            tracee = place.start()
-            entries = tracee.count_to_end(place.layout.image.address(place.layout.scope.entry))
-            spent: dict[str, list[float]] = {way: [] for way in WAYS}
-            for number in range(rounds):
-                for way in WAYS if number % 2 else reversed(WAYS):
-                    spent[way].append(run(place, way))
+    target = KernelTarget(kernel=name, inputs=inputs)
+    with one_processor(), closing(target.open()) as place:
+        tracee = place.start()
+        entries = tracee.count_to_end(place.layout.image.address(place.layout.scope.entry))
+        spent: dict[str, list[float]] = {way: [] for way in WAYS}
+        for number in range(rounds):
+            for way in WAYS if number % 2 else reversed(WAYS):
+                spent[way].append(run(place, way))
     cpu_s = {way: np.array(values) for way, values in spent.items()}
     cells = [ratio(cpu_s[over], cpu_s[under]) for over, under in PAIRS]
     stop_us = 1e6 * np.median(cpu_s["stopped"] - cpu_s["free"])
@@ -124,9 +122,9 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
-        inputs, _, _ = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))
+        inputs = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))["inputs"]
         for kernel in catalogue.select(options.kernel):
-            measure(kernel.name, inputs, options.rounds)
+            measure(kernel, inputs, options.rounds)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaign.outcome import MissionResult, State
@@ -18,7 +19,6 @@ from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.paired import McNemar, mcnemar
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.fi.isolated.outcome import Share
 from mavfi_cli.mission.config import MissionConfig
 
 Measure = Callable[[Mapping[str, Any]], float | None]  # of a result.json

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
+import os
 import shlex
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,21 +18,31 @@ import click
 from mavfi_cli.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from mavfi_cli.fi.isolated.campaign import Campaign, Plan
+    from mavfi_cli.attack.campaign import TargetRuns
+    from mavfi_cli.attack.plan import Plan
+    from mavfi_cli.attack.target import AttackTarget
 
 
 @click.command()
 @click.option("--kernel", multiple=True, metavar="NAME",
-              help="point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar or control. "
-                   "May be repeated  [all].")  # fmt: skip
+              help="point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar or control, or "
+                   "a Python file with a kernel of your own. May be repeated  [all].")  # fmt: skip
 @click.option("--world", default="dense", show_default=True, metavar="NAME|FILE",
               help="World of the golden flight that feeds the kernels.")  # fmt: skip
 @click.option("--world-seed", default=3, show_default=True, help="Its seed.")
 @click.option("--program", help="Attack this native program instead of our kernels.")
 @click.option("--args", help="Its arguments, quoted as in a shell.")
-@click.option("--compare", help="What of it is compared: stdout or file:PATH  [stdout].")
+@click.option("--compare", multiple=True, metavar="OUTPUT",
+              help="What of it is compared: stdout, or file:PATH that it writes, relative to the "
+                   "scratch folder in which it then runs. May be repeated  [stdout].")  # fmt: skip
+@click.option("--ignore-lines", multiple=True, metavar="REGEX",
+              help="Program: lines in which this is found are not compared. May be "
+                   "repeated.")  # fmt: skip
+@click.option("--stdin", "stdin_file", metavar="FILE",
+              type=click.Path(exists=True, dir_okay=False, path_type=Path),
+              help="Program: its standard input  [none].")  # fmt: skip
 @click.option("--tolerance", default=0.0, type=click.FloatRange(min=0.0),
-              help="Relative difference that is no SDC.")  # fmt: skip
+              help="Relative error of a number that is still counted as benign.")  # fmt: skip
 @click.option("--runs", default=1000, show_default=True, type=click.IntRange(min=1),
               help="Of each kernel, or of the program: one fault a run.")  # fmt: skip
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1),
@@ -73,20 +86,21 @@ def kernels(**options: Any) -> None:
 
     Outcomes: benign, crash, hang, SDC (silent data corruption), not injected.
     """
-    from mavfi_cli.cli.own_kernels import replay_folder, run_own_kernels
-
     if options["replay"] is not None:
         others = [name for name in options if name not in ("replay", "kernel", "runs")]
         _refuse(others, "goes without --replay: a record says how it was drawn")
         limit = options["runs"] if _given("runs") else 0
-        if not replay_folder(options["replay"], options["kernel"], limit):
+        if not _replay_folder(options["replay"], options["kernel"], limit):
             raise click.exceptions.Exit(1)
     elif options["program"] is not None:
         _refuse(("kernel", "world", "world_seed"), "goes without --program")
         _attack_program(options)
     else:
-        _refuse(("args", "compare", "scope", "function"), "needs --program")
-        run_own_kernels(options, _model(options))
+        _refuse(
+            ("args", "compare", "ignore_lines", "stdin_file", "scope", "function"),
+            "needs --program",
+        )
+        _attack_kernels(options)
 
 
 def _given(name: str) -> bool:
@@ -101,114 +115,143 @@ def _refuse(names: Sequence[str], why: str) -> None:
             raise click.UsageError(f"{option.opts[0]} {why}")
 
 
-def _attack_program(options: dict[str, Any]) -> None:
-    from mavfi_cli.cli.runs_view import runs_view
-    from mavfi_cli.fi.isolated.campaign import run_campaign
-
-    as_json, out = options["as_json"], options["out"]
-    plan = _plan(options)
-    name = Path(options["program"]).name
-    with runs_view([name], plan.runs) as view:
-        view.show(name, 0)
-        campaign = run_campaign(
-            plan,
-            jobs=options["jobs"],
-            folder=out,
-            progress=lambda done: view.show(name, done),
-            stage=view.stage,
-        )
-    if out is not None:
-        _save(campaign, out)
-    if as_json:
-        click.echo(json.dumps(campaign.summary(), indent=2))
-        return
-    click.echo(_table(campaign))
-    if out is not None:
-        click.echo(f"\nFiles  {out}: kernels.json, kernels.csv, runs.jsonl")
-
-
 def _plan(options: dict[str, Any]) -> Plan:
-    from mavfi_cli.fi.isolated.campaign import Plan
-    from mavfi_cli.fi.isolated.compare import Comparison
-    from mavfi_cli.fi.isolated.program import ProgramTarget, absolute_arguments
-    from mavfi_cli.fi.native.spawn import Command
+    from mavfi_cli.attack.plan import Plan
+    from mavfi_cli.fi.tracer.fault import FaultModel
 
-    comparison = Comparison.of(options["compare"] or "stdout", options["tolerance"])
-    try:
-        arguments: tuple[str, ...] = tuple(shlex.split(options["args"] or ""))
-    except ValueError as error:
-        raise ConfigError(str(error), key="args") from None
-    if comparison.file is not None:
-        arguments = absolute_arguments(arguments, Path.cwd())
-    return Plan(
-        target=ProgramTarget(
-            command=Command.of([options["program"], *arguments]),
-            comparison=comparison,
-            objects=tuple(options["scope"]),
-            function=options["function"],
-        ),
+    plan = Plan(
         runs=options["runs"],
         seed=options["seed"],
         rule=options["sampling"],
         compat=options["compat"],
-        model=_model(options),
+        model=FaultModel.named(
+            sites=options["site"],
+            roles=options["role"],
+            field=options["field"],
+            bits=options["bits"],
+        ),
         windows=options["windows"],
         null=options["null"],
     )
+    plan.strategy()  # says now what is wrong
+    return plan
 
 
-def _model(options: dict[str, Any]) -> Any:
-    from mavfi_cli.core.errors import UnknownName
-    from mavfi_cli.fi.bits import Field
-    from mavfi_cli.fi.native.fault import FaultModel, Role, Site
+def _attacked(
+    plan: Plan, targets: Sequence[AttackTarget], options: dict[str, Any], folder: Path | None
+) -> list[TargetRuns]:
+    from mavfi_cli.attack.campaign import run_campaign
+    from mavfi_cli.cli.runs_view import runs_view
 
-    def named(kind: Any, name: str, what: str) -> Any:
-        """A member of an enum by its value; an unknown one names the nearest."""
-        try:
-            return kind(name)
-        except ValueError:
-            raise UnknownName(what, name, [known.value for known in kind]) from None
+    with runs_view([target.name for target in targets], plan.runs) as view:
+        return run_campaign(
+            plan,
+            targets,
+            jobs=options["jobs"],
+            folder=folder,
+            progress=view.show,
+            stage=view.stage,
+        )
 
-    default = FaultModel()
-    sites = frozenset(named(Site, name, "site") for name in options["site"])
-    roles = frozenset(named(Role, name, "role") for name in options["role"])
-    return FaultModel(
-        sites=sites or default.sites,
-        roles=roles or default.roles,
-        field=named(Field, options["field"], "field"),
-        count=options["bits"],
+
+def _attack_kernels(options: dict[str, Any]) -> None:
+    from mavfi_cli.attack.kernels.catalogue import select
+    from mavfi_cli.attack.kernels.target import KernelTarget
+    from mavfi_cli.attack.summary import KERNEL_COLUMNS, summarise, table
+    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+    from mavfi_cli.report.kernel_plot import write_kernel_plot
+
+    plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
+    # Check, planner and tracker are attacked with the parameters of `hardened`.
+    config = MissionConfig(world=options["world"], seed=options["world_seed"], stack="hardened")
+    with _folder(out) as folder:
+        click.echo(f"inputs: world {config.world}, seed {config.seed}", err=True)
+        fed = inputs_of_flight(config, folder)
+        tolerance = options["tolerance"]
+        targets = [KernelTarget(kernel=each, tolerance=tolerance, **fed) for each in kernels]
+        campaign = _attacked(plan, targets, options, folder)
+        summary = summarise(plan, campaign)
+        if out is not None:
+            _save(out, summary, campaign, KERNEL_COLUMNS)
+            write_kernel_plot(summary, out / "kernels.svg")
+    _tell(summary, table(summary), "kernels.json, kernels.csv, kernels.svg, runs.jsonl", options)
+
+
+@contextlib.contextmanager
+def _folder(out: Path | None) -> Iterator[Path]:
+    if out is not None:
+        yield out
+        return
+    with tempfile.TemporaryDirectory(prefix="mavfi-kernels-") as scratch:
+        yield Path(scratch)
+
+
+def _attack_program(options: dict[str, Any]) -> None:
+    from mavfi_cli.attack.summary import PROGRAM_COLUMNS, program_table, summarise_program
+
+    plan, out = _plan(options), options["out"]
+    campaign = _attacked(plan, [_program(options)], options, out)
+    told = summarise_program(plan, campaign[0])
+    if out is not None:
+        _save(out, told, campaign, PROGRAM_COLUMNS)
+    summary = told["summary"]
+    _tell(summary, program_table(summary), "kernels.json, kernels.csv, runs.jsonl", options)
+
+
+def _program(options: dict[str, Any]) -> AttackTarget:
+    from mavfi_cli.attack.comparison import OutputComparison, absolute_arguments
+    from mavfi_cli.attack.program import ProgramTarget
+    from mavfi_cli.fi.tracer.spawn import Command
+
+    comparison = OutputComparison.of(
+        options["compare"], tolerance=options["tolerance"], ignored=options["ignore_lines"]
+    )
+    try:
+        arguments = shlex.split(options["args"] or "")
+    except ValueError as error:
+        raise ConfigError(str(error), key="args") from None
+    if comparison.files:
+        arguments = list(absolute_arguments(arguments, Path.cwd(), comparison.files))
+    stdin = (options["stdin_file"] or Path(os.devnull)).resolve()
+    return ProgramTarget(
+        command=Command.of([options["program"], *arguments], stdin=stdin),
+        comparison=comparison,
+        objects=tuple(options["scope"]),
+        function=options["function"],
     )
 
 
-def _table(campaign: Campaign) -> str:
-    from mavfi_cli.fi.isolated.outcome import Outcome
-
-    summary = campaign.summary()
-    lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
-    for name, row in summary["outcomes"].items():
-        share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
-        low, high = (100 * edge for edge in row["wilson95"])
-        lines.append(
-            f"{Outcome(name).title:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %"
-        )
-    lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
-    if summary["executed_in_scope"] is not None:
-        lines.append(
-            f"{summary['executed_in_scope']} executed instructions in scope, windows stepped: "
-            f"{summary['windows']}"
-        )
-    for title in ("crashes", "not_injected", "activation"):
-        if summary[title]:
-            parts = ", ".join(f"{name} {count}" for name, count in summary[title].items())
-            lines.append(f"{title.replace('_', ' ')}: {parts}")
-    return "\n".join(lines)
-
-
-def _save(campaign: Campaign, folder: Path) -> None:
+def _save(
+    folder: Path, told: dict[str, Any], campaign: list[TargetRuns], columns: Sequence[str]
+) -> None:
+    from mavfi_cli.attack.summary import csv_rows
     from mavfi_cli.core.files import write_json, write_text
-    from mavfi_cli.fi.isolated.campaign import csv_rows, to_json
 
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(csv_rows(campaign))
+    csv.writer(text, lineterminator="\n").writerows(csv_rows(columns, campaign))
     write_text(folder / "kernels.csv", text.getvalue())
-    write_json(folder / "kernels.json", to_json(campaign))
+    write_json(folder / "kernels.json", told)
+
+
+def _tell(summary: dict[str, Any], table: str, files: str, options: dict[str, Any]) -> None:
+    if options["as_json"]:
+        click.echo(json.dumps(summary, indent=2))
+        return
+    click.echo(table)
+    if options["out"] is not None:
+        click.echo(f"\nFiles  {options['out']}: {files}")
+
+
+def _replay_folder(folder: Path, kernels: tuple[str, ...], runs: int) -> bool:
+    """Repeat recorded runs and say which came out differently; True where none did."""
+    from mavfi_cli.attack.replay import replay_runs
+
+    equal = total = 0
+    for result in replay_runs(folder, kernels, runs):
+        total += 1
+        equal += not result.differs
+        if result.differs:
+            click.echo(f"{result.kernel} {result.run}: differs in {', '.join(result.differs)}")
+    click.echo(f"{equal} of {total} replays identical")
+    return equal == total

@@ -27,7 +27,7 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     what the fault did. Interrupted, it leaves nothing behind.
     """
     from mavfi_cli.core.errors import Interrupted
-    from mavfi_cli.fi.record import read
+    from mavfi_cli.fi.tracer.record import read
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.replay import (

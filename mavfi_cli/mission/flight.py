@@ -37,10 +37,8 @@ from mavfi_cli.mission.injection import (
     NoInjection,
     ProcessInjection,
 )
-from mavfi_cli.mission.instruction.injection import InstructionInjection
-from mavfi_cli.mission.instruction.plan import Recorder
-from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.narrator import Narrator
+from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
@@ -164,9 +162,10 @@ class Flight:
     def isolated_nodes(self) -> Iterator[None]:
         """Each node that the mission isolates works in a process of its own meanwhile."""
         assert self.companion is not None
+        assert self._briefing is not None
         executor = self.companion.executor
         try:
-            self._arm()
+            self.injection.arm(executor, self._config, self._briefing)
             for name in self._config.isolate:
                 if executor.nodes[name].process is None:
                     executor.isolate(name)
@@ -175,21 +174,6 @@ class Flight:
                 executor.settle()
         finally:
             executor.close()
-
-    def _arm(self) -> None:
-        """Put the node that a fault attacks into its process."""
-        injection = self.injection
-        assert self.companion is not None
-        assert self._briefing is not None
-        executor = self.companion.executor
-        if isinstance(injection, ProcessInjection):
-            executor.isolate(injection.node)
-            injection.kill = executor.kill
-        elif isinstance(injection, InstructionInjection):
-            name = injection.node
-            setup = Setup(config=self._config, briefing=self._briefing, node=name)
-            process = injection.start(setup, lambda: executor.nodes[name].finished)
-            executor.isolate(name, process)
 
     def fly(self, tlog: Path) -> None:
         """Fly until the mission has an outcome.

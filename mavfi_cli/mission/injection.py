@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream, generator
@@ -18,6 +18,11 @@ from mavfi_cli.fi.source.injector import SourceInjector, Strike
 from mavfi_cli.fi.source.memory import MemoryInjector
 from mavfi_cli.fi.source.schedule import Moment, Schedule
 from mavfi_cli.mission.fault_config import PROCESS, FaultConfig
+
+if TYPE_CHECKING:
+    from mavfi_cli.mission.briefing import Briefing
+    from mavfi_cli.mission.companion.executor import Executor
+    from mavfi_cli.mission.config import MissionConfig
 
 M = TypeVar("M", CollisionReport, Trajectory, Command)
 
@@ -51,6 +56,9 @@ class NoInjection:
 
     def begin(self, path: Path) -> None:
         """Nothing to record."""
+
+    def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
+        """No node needs a process of its own."""
 
     def news(self) -> list[str]:
         """Nothing to tell."""
@@ -256,6 +264,11 @@ class ProcessInjection(_Recorded):
         rng = generator(config.seed, Stream.FAULT, "process")
         self._drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
         self._schedule = Schedule(config.trigger(), config.corruption(), self._drawn_time_s)
+
+    def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
+        """Have the node that is killed work in a process of its own."""
+        executor.isolate(self.node)
+        self.kill = executor.kill
 
     def watch(self, moment: Moment) -> None:
         """Let the trigger see where the mission stands."""

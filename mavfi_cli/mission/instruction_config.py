@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.native.fault import FaultModel, Role, Site
-from mavfi_cli.fi.sampling import Rule, Strategy, strategy
 
+if TYPE_CHECKING:
+    from mavfi_cli.fi.tracer.sampling import Strategy
+
+UNIFORM = "instruction-uniform"  # the one rule whose draws can be repeated
 _NODES = {
     "perception": ("point_cloud", "octomap", "collision_check"),
     "planning": ("planner",),
@@ -39,7 +40,7 @@ class InstructionConfig:
 
     target: str
     seed: int = 1
-    sampling: str = Rule.INSTRUCTION.value
+    sampling: str = UNIFORM
     compat: str | None = None
     sites: tuple[str, ...] = ()
     roles: tuple[str, ...] = ()
@@ -69,34 +70,22 @@ class InstructionConfig:
             UnknownName: a name that does not exist.
             FaultSpecError: a rule that cannot be repeated.
         """
-        chosen = strategy(self.sampling, self._model(), compat=self.compat)
+        from mavfi_cli.fi.tracer.fault import FaultModel
+        from mavfi_cli.fi.tracer.sampling import Rule, strategy
+
+        model = FaultModel.named(
+            sites=self.sites, roles=self.roles, field=self.field, bits=self.bits
+        )
+        chosen = strategy(self.sampling, model, compat=self.compat)
         if self.compat is None and chosen.rule is not Rule.INSTRUCTION:
             raise FaultSpecError(
                 f"sampling by {self.sampling} cannot be repeated; missions take "
-                f"{Rule.INSTRUCTION.value}, `mavfi kernels` takes both"
+                f"{UNIFORM}, `mavfi kernels` takes both"
             )
         return chosen
 
     def sampling_name(self) -> str:
         """The population, as printed beside every number."""
         if self.compat is not None:
-            return f"{Rule.INSTRUCTION.value} with the operands and bits of {self.compat}"
+            return f"{UNIFORM} with the operands and bits of {self.compat}"
         return self.sampling
-
-    def _model(self) -> FaultModel:
-        default = FaultModel()
-        sites = frozenset(_member(Site, "site", name) for name in self.sites)
-        roles = frozenset(_member(Role, "role", name) for name in self.roles)
-        return FaultModel(
-            sites=sites or default.sites,
-            roles=roles or default.roles,
-            field=_member(Field, "field", self.field),
-            count=self.bits,
-        )
-
-
-def _member(kind: Any, what: str, name: str) -> Any:
-    try:
-        return kind(name)
-    except ValueError:
-        raise UnknownName(what, name, [member.value for member in kind]) from None

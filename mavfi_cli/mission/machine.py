@@ -164,8 +164,8 @@ def _physics() -> Check:
 
 def _injection() -> Iterator[Check]:
     """Tracing and counted breakpoints, tried on a real program."""
-    from mavfi_cli.fi.native.arch import SUPPORTED
-    from mavfi_cli.fi.native.doctor import check_counting, check_tracing
+    from mavfi_cli.fi.tracer.arch import SUPPORTED
+    from mavfi_cli.fi.tracer.doctor import check_counting, check_tracing
 
     if not SUPPORTED:
         yield Check(name="Tracing", verdict=Verdict.LIMITED, found="not Linux on x86-64",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import json
 import os
@@ -28,10 +29,8 @@ from mavfi_cli.mission.branching import Branching
 from mavfi_cli.mission.companion.response import response_times
 from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.flight import Flight
-from mavfi_cli.mission.instruction.injection import InstructionInjection, require_possible
-from mavfi_cli.mission.instruction.plan import PlannedFault, Recorder, plan_fault, planned_of
-from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
-from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.injection import NoInjection
+from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
@@ -163,36 +162,50 @@ def _injection(
     repeat: Mapping[str, Any] | None,
     for_debugger: Callable[[int], None] | None,
     vehicles: VehicleTemplate | None,
-) -> Iterator[InstructionInjection | None]:
+) -> Iterator[NoInjection | None]:
     """The instruction-level fault of a mission, its node's process already starting."""
     if config.instruction is None:
         yield None
         return
-    require_possible(config.link)
-    if repeat is not None:
-        planned = planned_of(repeat)
-    else:
-        planned = _plan(config, config.instruction, out, vehicles)
-    injection = InstructionInjection(planned, SpawnedNode(), for_debugger)
+    from mavfi_cli.mission.instruction.injection import injection_of  # loads the debugger
+
+    injection = injection_of(
+        config,
+        out,
+        installed_versions(),
+        functools.partial(fly_golden, vehicles=vehicles),
+        repeat=repeat,
+        for_debugger=for_debugger,
+    )
     try:
         yield injection
     finally:
         injection.close()
 
 
-def _plan(
-    config: MissionConfig, asked: InstructionConfig, out: Path, vehicles: VehicleTemplate | None
-) -> PlannedFault:
-    def fly_golden(golden: MissionConfig, folder: Path, recorder: Recorder) -> None:
-        """The flight whose invocations a fault is drawn from."""
-        flown = fly_mission(golden, folder, Watcher(), recorder=recorder, vehicles=vehicles)
-        result = json.loads(flown.result.read_text())
-        if result["outcome"] == Outcome.INTERRUPTED.value:  # cut off: others would be drawn
-            raise Interrupted("interrupted")
-        if result["referee"] is None:  # nothing to draw from
-            raise VehicleProcessError("the vehicle process of the golden flight died")
+def fly_golden(
+    config: MissionConfig,
+    out: Path,
+    recorder: Recorder,
+    *,
+    vehicles: VehicleTemplate | None = None,
+) -> dict[str, Any]:
+    """Fly a mission without a fault, from which faults or inputs are drawn.
 
-    return plan_fault(config, asked, out, installed_versions(), fly_golden)
+    Returns:
+        Its result.
+
+    Raises:
+        Interrupted: it was cut off: others would be drawn.
+        VehicleProcessError: the vehicle died: there is nothing to draw from.
+    """
+    flown = fly_mission(config, out, Watcher(), recorder=recorder, vehicles=vehicles)
+    result: dict[str, Any] = json.loads(flown.result.read_text())
+    if result["outcome"] == Outcome.INTERRUPTED.value:
+        raise Interrupted("interrupted")
+    if result["referee"] is None:
+        raise VehicleProcessError("the vehicle process of the golden flight died")
+    return result
 
 
 def _fly(sortie: Sortie) -> str | None:

@@ -6,7 +6,7 @@ import textwrap
 from typing import Any
 
 from mavfi_cli.core.columns import WIDTH
-from mavfi_cli.fi.symbols import short_name
+from mavfi_cli.fi.tracer.symbols import short_name
 from mavfi_cli.mission.record.detection_cost import detection_cost
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.replay import first_difference, largest_deviation_m

@@ -18,7 +18,7 @@ from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, State
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
-from mavfi_cli.fi.native.fault import FaultModel
+from mavfi_cli.fi.tracer.fault import FaultModel
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 

@@ -6,8 +6,8 @@ import signal
 import pytest
 
 from mavfi_cli.core.errors import Interrupted
-from mavfi_cli.fi.native.arch import SUPPORTED
-from mavfi_cli.fi.native.doctor import check_tracing
+from mavfi_cli.fi.tracer.arch import SUPPORTED
+from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission import run as run_module
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.golden import paired_golden

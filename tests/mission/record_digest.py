@@ -25,6 +25,9 @@ def record_digest(folder):
         result["config"].pop(key, None)
     for key in _NEW_OF_DETECTOR:
         (result["config"]["detector"] or {}).pop(key, None)
-    (result["fault"] or {}).pop("build_ids", None)  # of the code's file, not of the code
+    fault = result["fault"] or {}
+    fault.pop("build_ids", None)  # of the code's file, not of the code
+    if isinstance(fault.get("injection"), dict):
+        fault["injection"].pop("address", None)  # where the code was loaded: any import moves it
     digest.update(json.dumps(result, sort_keys=True).encode())
     return digest.hexdigest()

@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.replay import replay
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
-from mavfi_cli.fi import record as records
-from mavfi_cli.fi.native.arch import SUPPORTED
-from mavfi_cli.fi.native.doctor import check_tracing
+from mavfi_cli.fi.tracer import record as records
+from mavfi_cli.fi.tracer.arch import SUPPORTED
+from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission.briefing import of_config
-from mavfi_cli.mission.instruction.server import Setup
-from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
+from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
@@ -221,14 +221,14 @@ def test_a_node_that_has_filled_a_cache_is_started_again(short_config):
     setup = Setup(config=short_config, briefing=of_config(short_config), node="control")
     restarted = []
     for compiles in (True, False, False, False):
-        spawned = SpawnedNode()
+        spawned = ServedProcess(PROGRAM)
         first = spawned.pid
         if compiles:
             cache = Path(tracking.__spec__.cached).parent
             (cache / "added").touch()
             (cache / "added").unlink()
         try:
-            assert spawned.begin(setup).kernel == "control"
+            assert spawned.begin(setup, "node").kernel == "control"
             restarted.append(spawned.pid != first)
         finally:
             spawned.kill()

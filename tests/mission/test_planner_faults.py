@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mavfi_cli.fi import record as records
-from mavfi_cli.fi.isolated.profile import profile_run
-from mavfi_cli.fi.native.arch import SUPPORTED
-from mavfi_cli.fi.native.doctor import check_tracing
-from mavfi_cli.fi.native.tracer import TracerThread
+from mavfi_cli.attack.profile import profile_run
+from mavfi_cli.fi.tracer import record as records
+from mavfi_cli.fi.tracer.arch import SUPPORTED
+from mavfi_cli.fi.tracer.doctor import check_tracing
+from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.companion.node_process import NodeProcess
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.instruction.plan import draw_invocation
-from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_request
+from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
@@ -94,19 +94,19 @@ def test_the_instructions_of_a_search_stay_in_scope_and_windows_are_parts_of_the
         entry = place.scope_of_node.inner[1]
     finally:
         place.close()
-    trace = whole.strata[0].profile.segments[0].trace
+    trace = whole.strata[0].segments[0].trace
     assert whole.image.locate(int(trace[0])) == entry  # a test of the start comes first
     objects = Counter(whole.image.locate(int(address)).object for address in trace)
     assert set(objects) == {OMPL, SEGMENT, PIECES}
     assert objects[OMPL] > 1000
 
-    sampled = profile_request(*searching, 2, np.random.default_rng(1))
+    sampled = profile_invocation(*searching, 2, 1, np.random.default_rng(1))
     assert not sampled.complete
     assert {stratum.marker.object for stratum in sampled.strata} == {OMPL, SEGMENT, PIECES}
     for stratum in sampled.strata:
         begins = np.flatnonzero(trace == whole.image.address(stratum.marker))
-        assert stratum.profile.windows_in_run == len(begins)
-        for segment in stratum.profile.segments:
+        assert stratum.windows_in_run == len(begins)
+        for segment in stratum.segments:
             request, window = segment.start
             assert (request.location.object, request.count) == (READER, 2)
             begin = begins[window.count - 1]
@@ -117,8 +117,8 @@ def test_a_request_is_one_invocation_however_often_it_is_entered():
     drawn = [
         draw_invocation("planner", [1, 4, 4, 5], np.random.default_rng(seed)) for seed in range(60)
     ]
-    assert {(each.number, each.order, each.entry) for each in drawn} == {
-        (1, 1, 1), (2, 2, 2), (3, 4, 5),
+    assert {(each.number, each.order, each.entry, each.earlier) for each in drawn} == {
+        (1, 1, 1, 0), (2, 2, 2, 1), (3, 4, 5, 4),
     }  # fmt: skip
     assert {each.of for each in drawn} == {3}
 
@@ -126,7 +126,9 @@ def test_a_request_is_one_invocation_however_often_it_is_entered():
 def test_every_entry_is_an_invocation_of_another_kernel():
     rngs = map(np.random.default_rng, range(60))
     drawn = [draw_invocation("collision_check", [0, 3, 5], rng) for rng in rngs]
-    assert {(each.number, each.order) for each in drawn} == {(1, 2), (2, 2), (3, 2), (4, 3), (5, 3)}
+    assert {(each.number, each.order, each.earlier) for each in drawn} == {
+        (1, 2, 0), (2, 2, 0), (3, 2, 0), (4, 3, 3), (5, 3, 3),
+    }  # fmt: skip
     assert all(each.entry == each.number and each.of == 5 for each in drawn)
 
 

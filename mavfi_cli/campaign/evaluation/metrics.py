@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.evaluation.pairs import (
     LONGER,
     ErrorFree,
@@ -29,7 +30,6 @@ from mavfi_cli.campaign.statistics.paired import McNemar, mcnemar
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.campaign.statistics.worst_case import worst_over_own
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.fi.isolated.outcome import Share
 from mavfi_cli.link.session import SessionSettings
 
 RESAMPLES = 999

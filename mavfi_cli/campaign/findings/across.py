@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.findings.groups import Group
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import canonical
@@ -23,7 +24,6 @@ from mavfi_cli.campaign.statistics.layers import CrossLayer, cross_layer, failur
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.fi.isolated.outcome import Share
 from mavfi_cli.mission.config import MissionConfig
 
 KERNELS = "kernels.json"  # what `mavfi kernels --out` leaves

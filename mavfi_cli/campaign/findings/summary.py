@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden, protection
 from mavfi_cli.campaign.findings.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.findings.setting_columns import SettingColumns
@@ -15,7 +16,6 @@ from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.campaign.statistics.worst_case import WorstCase
 from mavfi_cli.campaign.stopping import COUNTED
-from mavfi_cli.fi.isolated.outcome import Share
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.fi.isolated.outcome import Share
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from statistics import NormalDist
 
+from mavfi_cli.attack.outcome import Share, wilson
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.fi.isolated.outcome import Share, wilson
 
 
 def z_of(confidence: float) -> float:

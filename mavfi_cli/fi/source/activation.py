@@ -1,7 +1,7 @@
 """What became of a struck value: was it read at all before it was replaced?
 
 A flip in a value that nobody reads is not a fault that the system survived. It is told apart, in
-the words of the instruction level (`fi.native.inject.Activation`).
+the words of the instruction level (`fi.tracer.inject.Activation`).
 """
 
 from __future__ import annotations

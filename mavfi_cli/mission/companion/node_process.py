@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import os
-import pickle
 import resource
 import select
 import signal
@@ -22,8 +21,9 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
+from mavfi_cli.core.channel import receive, send
+
 Run = Callable[[Any, float], Any]
-_LENGTH = 8
 
 # A node hangs when one invocation takes this much of the processor, or of the wall clock where it
 # waits for something. The slowest healthy one takes well under half a second; what the limits are
@@ -241,32 +241,3 @@ def _rehearse(connection: socket.socket, runs: Mapping[str, Run]) -> None:
     order: _Order = receive(connection)
     runs[order.node](order.input, order.start_s)
     os._exit(0)
-
-
-def send(connection: socket.socket, value: Any) -> None:
-    """Send one value as a pickle."""
-    data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
-    connection.sendall(len(data).to_bytes(_LENGTH, "little") + data)
-
-
-def receive(connection: socket.socket) -> Any:
-    """Receive one value.
-
-    Raises:
-        EOFError: the other end has closed.
-    """
-    size = int.from_bytes(_exactly(connection, _LENGTH), "little")
-    return pickle.loads(_exactly(connection, size))
-
-
-def _exactly(connection: socket.socket, size: int) -> bytearray:
-    """In one buffer whatever the pieces, so that the memory of a node is the same each time."""
-    data = bytearray(size)
-    view, filled = memoryview(data), 0
-    while filled < size:
-        count = connection.recv_into(view[filled:])
-        if not count:
-            raise EOFError
-        filled += count
-    view.release()
-    return data

@@ -7,17 +7,21 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.attack.attacker import LiveAttack, attack_live
+from mavfi_cli.attack.kernels.scope import KernelScope
+from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.core.errors import FaultError
-from mavfi_cli.fi import record
-from mavfi_cli.fi.native.image import Image
-from mavfi_cli.fi.native.node import Attack, attack
-from mavfi_cli.fi.native.tracer import TracerThread
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer.thread import TracerThread
+from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.companion.executor import Executor
 from mavfi_cli.mission.companion.node_process import NodeProcess
+from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import SCHEMA, NoInjection
-from mavfi_cli.mission.instruction.plan import PlannedFault
-from mavfi_cli.mission.instruction.scope import KernelScope
-from mavfi_cli.mission.instruction.server import Setup
-from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
+from mavfi_cli.mission.instruction.plan import PlannedFault, plan_fault, planned_of
+from mavfi_cli.mission.instruction.server import PROGRAM, Setup
+from mavfi_cli.mission.orders import Recorder
 
 _TIMING = ("stop_s",)
 
@@ -34,14 +38,14 @@ class InstructionInjection(NoInjection):
     def __init__(
         self,
         planned: PlannedFault,
-        spawned: SpawnedNode,
+        spawned: ServedProcess,
         for_debugger: Callable[[int], None] | None = None,
     ) -> None:
         self._planned = planned
         self._spawned = spawned
         self._for_debugger = for_debugger
         self._path: Path | None = None
-        self._tracer: TracerThread[Attack] | None = None
+        self._tracer: TracerThread[LiveAttack] | None = None
         self._told = False
         self._finished: Callable[[], int] = lambda: 0
 
@@ -54,35 +58,34 @@ class InstructionInjection(NoInjection):
         """Where the record goes."""
         self._path = path
 
-    def start(self, setup: Setup, finished: Callable[[], int]) -> NodeProcess:
-        """Arm the fault; the process that serves the node.
-
-        Args:
-            setup: of the node.
-            finished: how many invocations of the node are over.
+    def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
+        """Have the attacked node work in its process, the fault armed there.
 
         Raises:
             BuildMismatch: the record that is repeated is of another build.
             TracingForbidden: the operating system refuses.
         """
-        scope = self._spawned.begin(setup)
-        self._finished = finished
+        scope = self._spawned.begin(
+            Setup(config=config, briefing=briefing, node=self.node), f"node {self.node}"
+        )
+        self._finished = lambda: executor.nodes[self.node].finished
         pid = self._spawned.pid
         if self._planned.recorded is not None:
             record.require_same_build(self._planned.recorded, Image(pid, scope.regions))
         self._tracer = TracerThread(lambda armed: self._attack(pid, scope, armed))
         self._tracer.await_armed()
-        return NodeProcess(
+        process = NodeProcess(
             self._spawned.connection,
             pid,
             ending=self._ending,
             patient=self._for_debugger is not None,
         )
+        executor.isolate(self.node, process)
 
-    def _attack(self, pid: int, scope: KernelScope, armed: Callable[[], None]) -> Attack:
+    def _attack(self, pid: int, scope: KernelScope, armed: Callable[[], None]) -> LiveAttack:
         assert self._path is not None
         debugging = self._for_debugger is not None
-        done = attack(
+        done = attack_live(
             pid,
             self._planned.fault,
             path=self._path,
@@ -154,14 +157,36 @@ def attack_text(written: Mapping[str, Any]) -> str:
     return f"fault in {where}: bit {bits} of {corruption['role']} {what}, {activation}"
 
 
-def require_possible(link: str | None) -> None:
-    """Refuse what cannot work.
+def injection_of(
+    config: MissionConfig,
+    out: Path,
+    versions: Mapping[str, str],
+    fly_golden: Callable[[MissionConfig, Path, Recorder], object],
+    *,
+    repeat: Mapping[str, Any] | None = None,
+    for_debugger: Callable[[int], None] | None = None,
+) -> InstructionInjection:
+    """The instruction-level fault of a mission, its node's process already starting.
+
+    Args:
+        config: the mission.
+        out: the folder below which golden flight and profiles are kept.
+        versions: of the libraries.
+        fly_golden: flies a mission into a folder and records it.
+        repeat: the record of a fault to repeat, instead of drawing one.
+        for_debugger: called when the node waits for a debugger at the injected instruction.
 
     Raises:
-        FaultError: the flight does not repeat.
+        FaultError: the flight does not repeat, or nothing can be hit in it.
     """
-    if link is not None:
+    assert config.instruction is not None
+    if config.link is not None:
         raise FaultError(
             "an instruction-level fault is drawn from the golden flight, and a foreign autopilot "
             "flies no two alike: leave out --link"
         )
+    if repeat is not None:
+        planned = planned_of(repeat)
+    else:
+        planned = plan_fault(config, config.instruction, out, versions, fly_golden)
+    return InstructionInjection(planned, ServedProcess(PROGRAM), for_debugger)

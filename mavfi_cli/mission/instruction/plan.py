@@ -16,19 +16,20 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mavfi_cli.attack.kernels.scope import kernel_of_node
+from mavfi_cli.attack.profile import TargetProfile
 from mavfi_cli.core.errors import FaultError, RecordError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.sources import own_digest
-from mavfi_cli.fi import record
-from mavfi_cli.fi.isolated.profile import TargetProfile
-from mavfi_cli.fi.native.fault import InstructionFault
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.instruction.profile import Order, count_entries, profile_kernel
-from mavfi_cli.mission.instruction.scope import kernel_of_node
+from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.mission.orders import Recorder
 
 T = TypeVar("T")
 CACHE = ".profiles"
@@ -50,18 +51,6 @@ class PlannedFault:
     order: int
     context: Mapping[str, Any]
     recorded: Mapping[str, Any] | None = None
-
-
-class Recorder:
-    """Keeps what a flight asks of its nodes."""
-
-    def __init__(self) -> None:
-        self.briefing: Briefing | None = None
-        self.orders: dict[str, list[Order]] = {}
-
-    def on_start(self, node: str, value: Any, start_s: float) -> None:
-        """An invocation begins."""
-        self.orders.setdefault(node, []).append((value, start_s))
 
 
 def plan_fault(
@@ -109,7 +98,9 @@ def plan_fault(
     profiling = generator(config.seed, Stream.FAULT, "profile", kernel, drawn.number)
     found: TargetProfile = _kept(
         folder / f"profile-{kernel}-{drawn.number}.pickle",
-        lambda: profile_kernel(setup, orders[: drawn.order], drawn.entry, profiling),
+        lambda: profile_invocation(
+            setup, orders[: drawn.order], drawn.entry, drawn.earlier, profiling
+        ),
     )
     fault = found.draw(replace(strategy, whole_process=False), rng)
     context = {
@@ -137,6 +128,7 @@ class Invocation:
     of: int
     order: int  # of the node, from 1, in which it happens
     entry: int  # of the kernel, from 1, with which it begins
+    earlier: int  # entries in the orders before
 
 
 def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> Invocation:
@@ -150,16 +142,17 @@ def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) 
         counts: entries up to each order of the golden flight, ascending; some.
         rng: draws.
     """
-    if node != "planner":
-        entry = int(rng.integers(counts[-1])) + 1
-        order = int(np.searchsorted(counts, entry)) + 1
-        return Invocation(number=entry, of=counts[-1], order=order, entry=entry)
     before = np.array([0, *counts[:-1]])
-    orders = np.flatnonzero(np.array(counts) > before)
-    which = int(rng.integers(len(orders)))
-    order = int(orders[which])
+    if node != "planner":
+        number = entry = int(rng.integers(counts[-1])) + 1
+        order, of = int(np.searchsorted(counts, entry)), counts[-1]
+    else:
+        orders = np.flatnonzero(np.array(counts) > before)
+        which, of = int(rng.integers(len(orders))), len(orders)
+        order, number = int(orders[which]), which + 1
+        entry = int(before[order]) + 1
     return Invocation(
-        number=which + 1, of=len(orders), order=order + 1, entry=int(before[order]) + 1
+        number=number, of=of, order=order + 1, entry=entry, earlier=int(before[order])
     )
 
 

@@ -1,52 +1,55 @@
-"""Which instructions a planner node executes for one request of a mission, found without flying.
+"""A node of a mission as a target: one of its orders, again and again, without flying.
 
-A request has no native function round it: it is a row of calls of compiled functions from Python,
-with a search among them or without. So its window is a whole run: from where the node begins the
-request until it would answer. The node works through the orders before; then a fork of it is
-stepped, or many, each for a part of the request, and each ends instead of answering.
+A node is a function of its orders. The orders of the golden flight are given again to a node of its
+own, at the speed of the machine. For the last of them it forks, as often as it is asked: a fork
+works on the order and ends instead of answering.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from mavfi_cli.attack.kernels.scope import KernelScope
+from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
+from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.isolated.profile import TargetProfile, profile_run
-from mavfi_cli.fi.native import linux
-from mavfi_cli.fi.native.fault import Stage
-from mavfi_cli.fi.native.image import Image, Scope, scope_of
-from mavfi_cli.fi.native.profile import WindowTooLong
-from mavfi_cli.fi.native.tracee import Tracee
-from mavfi_cli.fi.native.tracer import TracerThread
+from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.fault import Stage
+from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
+from mavfi_cli.fi.tracer.tracee import Tracee
+from mavfi_cli.fi.tracer.windows import WindowTooLong
 from mavfi_cli.mission.companion.node_process import NodeProcess
-from mavfi_cli.mission.instruction.server import Setup
-from mavfi_cli.mission.instruction.spawned_node import SpawnedNode
+from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 
-WHOLE_LIMIT = 600_000  # instructions of a request without a search, or of one window
-WINDOWS, ENOUGH = 4, 50_000  # of a request with a search: see `profile_run`
+Order = tuple[Any, float]  # input, start stamp
+WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
+WINDOWS, ENOUGH = 4, 50_000  # of a planner's request with a search: see `profile_run`
+_CALLS = {"octomap": 16}  # sampled: how many calls of one inner function, of some 300 instructions
 
 
 class Rehearsal:
-    """The `Place` where one request of a planner node runs, again and again.
+    """The `AttackPlace` where one invocation of a node's kernel runs.
 
     Args:
         setup: of the node.
-        orders: input and start stamp of the requests up to that one.
+        orders: input and start stamp, up to the one with the invocation.
+        entry: which entry of the kernel in that order begins it, from 1.
     """
 
     kind = "node"
 
-    def __init__(self, setup: Setup, orders: Sequence[tuple[object, float]]) -> None:
-        self._setup = setup
+    def __init__(self, setup: Setup, orders: Sequence[Order], entry: int = 1) -> None:
+        self._setup, self._entry = setup, entry
         self._last = orders[-1]
-        self._spawned = SpawnedNode()
+        self._spawned = ServedProcess(PROGRAM)
         with contextlib.ExitStack() as undo:
             undo.callback(self.close)
-            self.scope_of_node = self._spawned.begin(setup)
+            self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
             self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
             for value, start_s in orders[:-1]:
                 self._process.take(self._process.order(setup.node, value, start_s))
@@ -55,20 +58,15 @@ class Rehearsal:
 
     @property
     def name(self) -> str:
-        """Of the kernel."""
+        """Name of the kernel."""
         return self.scope_of_node.kernel
 
-    @property
-    def pid(self) -> int:
-        """Of the node, which is never traced itself."""
-        return self._spawned.pid
-
     def start(self) -> Tracee:
-        """A fork of the node, stopped where it begins the request."""
+        """A fork of the node, stopped where it begins the invocation."""
         tracee = Tracee.attach(self._process.rehearse())
         self._process.order(self._setup.node, *self._last)
-        if not tracee.run_to(self._image.address(self.scope_of_node.entry)):
-            raise TargetError(f"node {self._setup.node}", "does not begin its request again")
+        if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
+            raise TargetError(f"node {self._setup.node}", "does not begin its invocation again")
         return tracee
 
     def image(self, _: Tracee) -> Image:
@@ -79,71 +77,95 @@ class Rehearsal:
         """The code that may be hit."""
         return scope_of(image, self.scope_of_node.objects)
 
+    def profile(self, rng: np.random.Generator) -> TargetProfile:
+        """Step the invocation, or a sample of it.
+
+        Works on the node's own processor: handing over between two would cost as much again.
+        """
+        linux.share_processor(self._spawned.pid)
+        node, inner = self._setup.node, self.scope_of_node.inner
+        if node == "planner":
+            return self._profile_request(rng)
+        if node in _CALLS:
+            return profile_calls(self, rng, inner, windows=_CALLS[node], limit=WHOLE_LIMIT)
+        return profile_call(self, limit=WHOLE_LIMIT)
+
+    def _profile_request(self, rng: np.random.Generator) -> TargetProfile:
+        """Step a request that is answered without a search whole, one with a search by sample.
+
+        A request has no native function round it: it is a row of calls of compiled functions from
+        Python, with a search among them or without. So it goes on to the end of the run.
+        """
+        if not self._searches():
+            try:
+                return profile_run(self, rng, limit=WHOLE_LIMIT)
+            except WindowTooLong:  # smoothing tries again and again
+                pass
+        return profile_run(
+            self,
+            rng,
+            markers=self.scope_of_node.inner,
+            windows=WINDOWS,
+            enough=ENOUGH,
+            limit=WHOLE_LIMIT,
+        )
+
+    def _searches(self) -> bool:
+        tracee = self.start()
+        try:
+            search = self.scope_of_node.inner[0]
+            return tracee.count_to_end(self._image.address(search)) > 0
+        finally:
+            tracee.kill()
+
     def close(self) -> None:
         """End the node."""
         self._spawned.kill()
 
 
-def profile_request(
-    setup: Setup, orders: Sequence[tuple[object, float]], entries: int, rng: np.random.Generator
+def profile_invocation(
+    setup: Setup, orders: Sequence[Order], entry: int, earlier: int, rng: np.random.Generator
 ) -> TargetProfile:
-    """Profile what a planner node executes for the last of the orders.
-
-    A request that is answered without a search is stepped whole; one with a search by sample.
+    """Profile one invocation of a node's kernel, which happens in the last of the orders.
 
     Args:
         setup: of the node.
-        orders: input and start stamp, up to the request.
-        entries: which entry of the node's scope the request begins with, from 1.
-        rng: draws the windows.
+        orders: up to the one with the invocation.
+        entry: how many entries of the kernel there have been when it begins, itself included.
+        earlier: how many of them are in the orders before.
+        rng: draws what is stepped, where that is a sample.
 
     Raises:
         TracingForbidden: the operating system refuses.
+        WindowTooLong: too long to be stepped.
         TargetError: nothing in scope executes.
     """
-    place = Rehearsal(setup, orders)
+    place = Rehearsal(setup, orders, entry - earlier)
     try:
-        found = TracerThread(lambda _armed: _profile(place, rng)).result()
+        found = TracerThread(lambda _armed: place.profile(rng)).result()
     finally:
         place.close()
-    begin = Stage(place.scope_of_node.entry, entries)
-    return replace(
-        found,
-        strata=tuple(
-            replace(stratum, profile=replace(
-                stratum.profile,
-                segments=tuple(
-                    replace(segment, start=(begin, *segment.start))
-                    for segment in stratum.profile.segments
-                ),
-            ))
-            for stratum in found.strata
-        ),
-    )  # fmt: skip
+    return found.after(Stage(place.scope_of_node.entry, entry))
 
 
-def _profile(place: Rehearsal, rng: np.random.Generator) -> TargetProfile:
-    """On the node's own processor: handing over between two would cost as much again."""
-    linux.share_processor(place.pid)
-    if not _searches(place):
-        try:
-            return profile_run(place, rng, limit=WHOLE_LIMIT)
-        except WindowTooLong:  # smoothing tries again and again
-            pass
-    return profile_run(
-        place,
-        rng,
-        markers=place.scope_of_node.inner,
-        windows=WINDOWS,
-        enough=ENOUGH,
-        limit=WHOLE_LIMIT,
-    )
+def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
+    """How often the kernel had been entered after each order.
 
-
-def _searches(place: Rehearsal) -> bool:
-    tracee = place.start()
+    Raises:
+        TracingForbidden: the operating system neither counts nor lets us trace.
+    """
+    spawned, counter = ServedProcess(PROGRAM), None
+    counts = []
     try:
-        search = place.scope_of_node.inner[0]
-        return tracee.count_to_end(place.image(tracee).address(search)) > 0
+        scope = spawned.begin(setup, f"node {setup.node}")
+        address = Image(spawned.pid, scope.regions).address(scope.entry)
+        counter = EntryCounter(spawned.pid, address)
+        process = NodeProcess(spawned.connection, spawned.pid)
+        for value, start_s in orders:
+            process.take(process.order(setup.node, value, start_s))
+            counts.append(counter.read())
     finally:
-        tracee.kill()
+        if counter is not None:
+            counter.close()
+        spawned.kill()
+    return counts

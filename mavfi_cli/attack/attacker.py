@@ -1,0 +1,269 @@
+"""One fault in one run: reach the place, flip, follow, run to the end, judge."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.alarm import Alarm
+from mavfi_cli.fi.tracer.fault import InstructionFault, Stage
+from mavfi_cli.fi.tracer.image import Image, Regions, Scope
+from mavfi_cli.fi.tracer.inject import (
+    NOTHING,
+    Followed,
+    Injection,
+    instruction_at,
+    reach,
+    strike,
+)
+from mavfi_cli.fi.tracer.sampling import Rule, Strategy
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+
+GOLDEN_RUNS = 3
+_HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunResult:
+    """One faulty run."""
+
+    outcome: Outcome
+    signal: int | None
+    verdict: RunVerdict
+    fault: InstructionFault | None  # None where a time trigger found nothing to hit
+    injection: Injection | None
+    followed: Followed
+    reason: str  # why not injected
+    run_s: float  # wall time of the whole run
+
+
+def golden_run(place: JudgedPlace) -> Golden:
+    """Run without a fault several times; the target must repeat itself.
+
+    Raises:
+        TargetError: it fails, or its outputs differ.
+    """
+    runs = [place.fault_free() for _ in range(GOLDEN_RUNS)]
+    for again in runs[1:]:
+        if unlike := place.unlike(runs[0], again):
+            problem = f"fault-free runs differ, so outcomes cannot be told: {unlike}"
+            raise TargetError(place.name, problem)
+    slowest = max(run.cpu_s for run in runs), max(run.wall_s for run in runs)
+    return replace(runs[0], cpu_s=slowest[0], wall_s=slowest[1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attacker:
+    """Runs faults in one place against one golden run."""
+
+    place: JudgedPlace
+    golden: Golden
+
+    def run(self, fault: InstructionFault) -> RunResult:
+        """One run with a fault at an exact execution of an instruction.
+
+        Raises:
+            FaultError: the instruction at the place is not the one that was drawn.
+        """
+        start = time.perf_counter()
+        tracee = self.place.start()
+        try:
+            hits = sum(stage.count for stage in fault.trigger)
+            wall_s = self._wall_limit_s + hits * _HIT_LIMIT_S
+            with Alarm(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
+                reason = reach(tracee, self.place.image(tracee), fault)
+            if reason:
+                return self._result(start, tracee.ended, fault, None, NOTHING, reason)
+            return self._corrupt(start, tracee, fault)
+        finally:
+            tracee.kill()
+
+    def run_timed(self, plan: Strategy, rng: np.random.Generator) -> RunResult:
+        """One run with a fault at a drawn moment of the CPU time or duration of the golden run."""
+        start = time.perf_counter()
+        cpu = plan.rule is Rule.CPU_TIME
+        moment_s = float(rng.uniform(0.0, self.golden.cpu_s if cpu else self.golden.wall_s))
+        tracee = self.place.start()
+        try:
+            fault, reason = self._fault_at_moment(tracee, plan, rng, moment_s)
+            if fault is not None:
+                return self._corrupt(start, tracee, fault)
+            with self._deadline(tracee) if tracee.ended is None else nullcontext():
+                ended = run_out(tracee)
+            return self._result(start, ended, None, None, NOTHING, reason)
+        finally:
+            tracee.kill()
+
+    @property
+    def _wall_limit_s(self) -> float:
+        limits = self.place.limits
+        return limits.factor * self.golden.wall_s + limits.wall_grace_s
+
+    def _deadline(self, tracee: Tracee) -> AbstractContextManager[Alarm]:
+        limits = self.place.limits
+        cpu_s = limits.factor * self.golden.cpu_s + limits.cpu_grace_s
+        return Alarm(tracee.pid, signal.SIGKILL, cpu_s=cpu_s, wall_s=self._wall_limit_s)
+
+    def _fault_at_moment(
+        self, tracee: Tracee, plan: Strategy, rng: np.random.Generator, moment_s: float
+    ) -> tuple[InstructionFault | None, str]:
+        image, cpu = self.place.image(tracee), plan.rule is Rule.CPU_TIME
+        scope, reason = self.place.scope(image), ""
+        for _ in range(plan.attempts):
+            alarm = Alarm(
+                tracee.pid,
+                signal.SIGTRAP,
+                cpu_s=moment_s if cpu else None,
+                wall_s=None if cpu else moment_s,
+            )
+            if isinstance(tracee.resume_until_alarm(alarm), Ended):
+                return None, f"the {self.place.kind} ended before the moment"
+            moment_s = plan.retry_s
+            fault, reason = _fault_here(tracee, image, scope, plan, rng)
+            if fault is not None:
+                return fault, ""
+        return None, reason
+
+    def _corrupt(self, start: float, tracee: Tracee, fault: InstructionFault) -> RunResult:
+        """Stopped in front of the attacked instruction: flip, follow, run to the end."""
+        with self._deadline(tracee) as alarm:
+            window = self.place.limits.follow_window
+            injection, followed = strike(tracee, fault, window=window)
+            ended = run_out(tracee)
+        reason = injection.reason if injection is not None else ""
+        hung = alarm.fired and ended.signal == signal.SIGKILL
+        return self._result(start, None if hung else ended, fault, injection, followed, reason)
+
+    def _result(
+        self,
+        start: float,
+        ended: Ended | None,
+        fault: InstructionFault | None,
+        injection: Injection | None,
+        followed: Followed,
+        reason: str,
+    ) -> RunResult:
+        verdict = self.place.judge(self.golden, ended)
+        planned = fault is None or fault.corruption is not None
+        missed = planned and not (injection is not None and injection.applied)
+        return RunResult(
+            outcome=Outcome.NOT_INJECTED if missed else verdict.outcome,
+            signal=None if ended is None else ended.signal,
+            verdict=verdict,
+            fault=fault,
+            injection=injection,
+            followed=followed,
+            reason=reason,
+            run_s=time.perf_counter() - start,
+        )
+
+
+def _fault_here(
+    tracee: Tracee, image: Image, scope: Scope, plan: Strategy, rng: np.random.Generator
+) -> tuple[InstructionFault | None, str]:
+    here = tracee.registers.ip
+    if tracee.registers.system_call is not None and not plan.in_system_calls:
+        return None, f"inside system call {tracee.registers.system_call}"
+    if here not in scope and not plan.whole_process:
+        return None, f"outside the scope, in {image.locate(here).object}"
+    instruction = instruction_at(tracee, here)
+    corruption = None if instruction is None else plan.draw_at(instruction, rng)
+    if instruction is None or corruption is None:
+        return None, "no operand that the fault model allows"
+    fault = InstructionFault(
+        trigger=(Stage(image.locate(here), 1),),
+        execution=0,
+        instruction=instruction.text,
+        instruction_bytes=instruction.raw,
+        corruption=corruption,
+    )
+    return fault, ""
+
+
+def run_out(tracee: Tracee) -> Ended:
+    """Let a run go on to its end."""
+    while tracee.ended is None:
+        tracee.resume()
+    return tracee.ended
+
+
+# -- a process that goes on
+
+Notice = Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveAttack:
+    """What came of a fault in a process that somebody else runs."""
+
+    injection: Injection | None  # None: the trigger was not reached, or null injection
+    followed: Followed
+    reason: str
+    ended: Ended | None  # None: the process lives on, detached
+    record: dict[str, Any]
+
+
+def attack_live(
+    pid: int,
+    fault: InstructionFault,
+    *,
+    path: Path,
+    regions: Regions | None = None,
+    window: int = 64,
+    armed: Notice = lambda: None,
+    leave_stopped: bool = False,
+    **context: Any,
+) -> LiveAttack:
+    """Apply one fault in a running process, a node of a mission say, and let it go on.
+
+    The record is on the disk before the process runs to the trigger. The process must be a child of
+    the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached, the tracer
+    hears of it first: take its end from the result, not from `Popen.wait`.
+
+    Args:
+        pid: the process.
+        fault: its trigger counts from now on.
+        path: of the record.
+        regions: as `Image` takes them.
+        window: how many instructions a destination fault is followed.
+        armed: called once the process runs towards the trigger.
+        leave_stopped: let the process go stopped (SIGSTOP) after the flip, for a debugger.
+        context: what else belongs in the record: kernel, stage, sampling rule, seed, scope.
+
+    Raises:
+        TracingForbidden: the operating system refuses.
+        FaultError: another instruction is at the place.
+    """
+    tracee = Tracee.attach(pid)
+    try:
+        image = Image(pid, regions)
+        planned = record.planned(fault, image, **context)
+        record.write(path, planned)
+        armed()
+        reason = reach(tracee, image, fault)
+        injection, followed = None, NOTHING
+        if not reason:
+            injection, followed = strike(tracee, fault, window=window)
+            reason = "" if injection is None else injection.reason
+            if leave_stopped and tracee.ended is None:
+                os.kill(pid, signal.SIGSTOP)
+    finally:
+        if tracee.ended is None:
+            tracee.detach()
+    done = record.completed(planned, injection, followed, not_injected_reason=reason)
+    record.write(path, done)
+    return LiveAttack(
+        injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
+    )

@@ -1,0 +1,190 @@
+"""What of a program is compared with the golden run: standard output, files that it writes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from mavfi_cli.attack.target import Difference
+from mavfi_cli.core.errors import ConfigError
+
+STDOUT = "stdout"
+_SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputComparison:
+    """Which outputs are compared, and what of them.
+
+    Attributes:
+        files: that the program writes, relative to the folder in which it runs.
+        stdout: standard output is compared, too.
+        tolerance: largest relative difference of a number that still counts as equal.
+        ignored: patterns (bytes); a line in which one is found is left out.
+    """
+
+    files: tuple[str, ...] = ()
+    stdout: bool = True
+    tolerance: float = 0.0
+    ignored: tuple[bytes, ...] = ()
+
+    @classmethod
+    def of(
+        cls, outputs: Iterable[str], *, tolerance: float = 0.0, ignored: Iterable[str] = ()
+    ) -> OutputComparison:
+        """From the command line.
+
+        Args:
+            outputs: each `stdout`, or `file:PATH` relative to where the program runs; none for
+                standard output.
+            tolerance: as above.
+            ignored: regular expressions.
+
+        Raises:
+            ConfigError: neither of the two, a path that leads out of the program's folder, or no
+                regular expression.
+        """
+        chosen = tuple(dict.fromkeys(outputs)) or (STDOUT,)
+        return cls(
+            files=tuple(_inside(text) for text in chosen if text != STDOUT),
+            stdout=STDOUT in chosen,
+            tolerance=tolerance,
+            ignored=tuple(_pattern(text) for text in ignored),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """What results depend on."""
+        names: list[str | None] = [None] if self.stdout else []
+        names += self.files
+        told: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
+        if self.ignored:
+            told["ignored"] = [pattern.decode() for pattern in self.ignored]
+        return told | {"tolerance": self.tolerance}
+
+    def parts(self, folder: Path, stdout: Path) -> dict[str, bytes | None]:
+        """What a run left, by name of the output; None for a file that it did not write.
+
+        Args:
+            folder: in which it ran.
+            stdout: file of its standard output.
+        """
+        found: dict[str, bytes | None] = {}
+        if self.stdout:
+            found[STDOUT] = self._kept(stdout.read_bytes())
+        for name in self.files:
+            data = _read_inside(folder, name)
+            found[name] = None if data is None else self._kept(data)
+        return found
+
+    def _kept(self, data: bytes) -> bytes:
+        if not self.ignored:
+            return data
+        lines = re.findall(rb"[^\n]*\n|[^\n]+", data)
+        return b"".join(
+            line for line in lines if not any(re.search(each, line) for each in self.ignored)
+        )
+
+    def same(self, golden: bytes, output: bytes) -> bool:
+        """Whether two outputs are equal, or differ in numbers within the tolerance only."""
+        if golden == output:
+            return True
+        size = magnitude(golden, output) if self.tolerance > 0.0 else None
+        return size is not None and size <= self.tolerance
+
+
+def joined(parts: dict[str, bytes | None]) -> bytes:
+    """All outputs as one: the one that there is, or each with its name in front of it."""
+    pieces = [b"\0missing" if data is None else data for data in parts.values()]
+    if len(pieces) == 1:
+        return pieces[0]
+    names = (f"== {name}\n".encode() for name in parts)
+    return b"".join(name + piece for name, piece in zip(names, pieces, strict=True))
+
+
+def _inside(text: str) -> str:
+    kind, _, name = text.partition(":")
+    if kind != "file" or not name:
+        raise ConfigError(f"cannot compare {text!r}; known: stdout, file:PATH", key="compare")
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or not path.parts:
+        raise ConfigError(
+            f"{name!r} leads out of the scratch folder in which the program runs: name a file "
+            "relative to it, without '..'",
+            key="compare",
+        )
+    return str(path)
+
+
+def _pattern(text: str) -> bytes:
+    try:
+        re.compile(text.encode())
+    except re.error as error:
+        raise ConfigError(
+            f"{text!r} is no regular expression: {error}", key="ignore_lines"
+        ) from None
+    return text.encode()
+
+
+def _read_inside(folder: Path, name: str) -> bytes | None:
+    """A regular file below the folder; a link that leads out of it is none."""
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()) or not path.is_file():
+        return None
+    return path.read_bytes()
+
+
+def compared(golden: bytes, output: bytes) -> Difference | None:
+    """The difference between the numbers of two texts; None where other things differ."""
+    size = magnitude(golden, output)
+    return None if size is None else Difference(relative=size, absolute=size)
+
+
+def magnitude(golden: bytes, output: bytes) -> float | None:
+    """Largest relative difference between the numbers of two texts.
+
+    Relative to the golden number's size, absolute where that is 0; infinite where one of the two
+    is not finite and they differ. None where the texts differ in more than their numbers.
+    """
+    ours, theirs = _SEPARATORS.split(golden), _SEPARATORS.split(output)
+    if len(ours) != len(theirs):
+        return None
+    largest = 0.0
+    for a, b in zip(ours, theirs, strict=True):
+        size = 0.0 if a == b else _size(a, b)
+        if size is None or math.isinf(size):
+            return size
+        largest = max(largest, size)
+    return largest
+
+
+def _size(golden: bytes, other: bytes) -> float | None:
+    try:
+        expected, got = float(golden), float(other)
+    except ValueError:
+        return None
+    if not (math.isfinite(expected) and math.isfinite(got)):
+        return math.inf
+    return abs(got - expected) / (abs(expected) or 1.0)
+
+
+def absolute_arguments(
+    argv: Iterable[str], directory: Path, written: Iterable[str]
+) -> Iterator[str]:
+    """Arguments that name existing files, made absolute: the program runs in a scratch folder.
+
+    Args:
+        argv: the arguments.
+        directory: that they are relative to.
+        written: files that the program writes: of these it writes its own, not the user's.
+    """
+    own = {str(PurePosixPath(name)) for name in written}
+    for argument in argv:
+        path = directory / argument
+        if str(PurePosixPath(argument)) in own or argument.startswith("/") or not path.is_file():
+            yield argument
+        else:
+            yield str(path.resolve())

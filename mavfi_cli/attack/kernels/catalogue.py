@@ -1,0 +1,211 @@
+"""The kernels that can be attacked in isolation: how each is called and how outputs compare."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.attack.kernels.difference import Compare, Output, numbers, paths, voxels
+from mavfi_cli.attack.kernels.inputs import KernelInputs
+from mavfi_cli.attack.kernels.scope import KernelScope, compiled_region, kernel_scope
+from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, tracking
+from mavfi_cli.autonomy.grid import segment_free
+from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
+from mavfi_cli.core.errors import TargetError, UnknownName
+
+Call = Callable[[], Output]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kernel:
+    """One kernel with everything that an isolated run of it needs.
+
+    Attributes:
+        name: as `--kernel` takes it.
+        title: as tables print it.
+        prepare: from the inputs to a call; everything before the kernel itself happens here.
+        compare: size of the difference of two outputs.
+        repeatable: the call leaves no state behind, so it is warmed up by calling it.
+        too_long: to be stepped as a whole; a sample of windows is.
+        inner: compiled functions where windows begin, beside those of its scope.
+        code: entry and scope of a kernel that is not ours, asked where it has run.
+    """
+
+    name: str
+    title: str
+    prepare: Callable[[KernelInputs], Call]
+    compare: Compare = numbers
+    repeatable: bool = True
+    too_long: bool = False
+    inner: tuple[Any, ...] = ()
+    code: Callable[[], KernelScope] | None = None
+
+    def scope(self) -> KernelScope:
+        """Its machine code that can be hit, in a process in which it has run."""
+        found = kernel_scope(self.name) if self.code is None else self.code()
+        more = tuple(compiled_region(function)[1] for function in self.inner)
+        return replace(found, inner=(*found.inner, *more))
+
+
+def _point_cloud(inputs: KernelInputs) -> Call:
+    params = point_cloud.PointCloudParams()
+
+    def call() -> Output:
+        """One depth frame to points, ENU, m."""
+        cloud = point_cloud.generate(inputs.frame, params)
+        return {"points_enu_m": cloud.points_enu_m, "origin_enu_m": cloud.origin_enu_m}
+
+    return call
+
+
+def _octomap(inputs: KernelInputs) -> Call:
+    world = occupancy.OccupancyMap(occupancy.OccupancyParams())
+    for cloud in inputs.mapped:
+        world.insert(cloud)
+
+    def call() -> Output:
+        """One more cloud into the map; its serialised tree and number of nodes."""
+        world.insert(inputs.cloud)
+        payload = np.frombuffer(world.snapshot().payload, np.uint8)
+        return {"payload": payload, "nodes": np.array(world.nodes)}
+
+    return call
+
+
+def _collision_check(inputs: KernelInputs) -> Call:
+    params = collision.CollisionParams()
+
+    def call() -> Output:
+        """One check of the rest of a trajectory."""
+        _, report = collision.step(collision.CollisionState(), inputs.check, params)
+        return {
+            "collision": np.array(report.collision),
+            "time_to_collision_s": np.array(report.time_to_collision_s),
+            "future_collision_seq": np.array(report.future_collision_seq),
+        }
+
+    return call
+
+
+def _planner(name: str) -> Callable[[KernelInputs], Call]:
+    def prepare(inputs: KernelInputs) -> Call:
+        """A planner's call on the recorded task, the problem posed beforehand."""
+        task, planner = inputs.task, planners.find(name)
+        problem = pose_problem(
+            task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
+        )
+
+        def call() -> Output:
+            """One search; the path (n, 3), ENU, m."""
+            result = planner.plan(problem, task.seed)
+            return {"found": np.array(result.found), "path_enu_m": result.path_enu_m}
+
+        return call
+
+    return prepare
+
+
+def _control(inputs: KernelInputs) -> Call:
+    def call() -> Output:
+        """One control tick: the command and the integral part of its PID."""
+        state, command = tracking.step(
+            inputs.tracking_state, inputs.tracking, inputs.tracking_params
+        )
+        return {
+            "velocity_enu_mps": command.velocity_enu_mps,
+            "acceleration_enu_mps2": command.acceleration_enu_mps2,
+            "yaw_rad": np.array(command.yaw_rad),
+            "integral_mps": state.integral_mps,
+        }
+
+    return call
+
+
+KERNELS = {
+    kernel.name: kernel
+    for kernel in (
+        Kernel(name="point_cloud", title="Point cloud", prepare=_point_cloud),
+        Kernel(
+            name="octomap",
+            title="OctoMap",
+            prepare=_octomap,
+            compare=voxels,
+            repeatable=False,
+            too_long=True,
+        ),
+        Kernel(
+            name="collision_check",
+            title="Collision check",
+            prepare=_collision_check,
+            too_long=True,
+        ),
+        Kernel(name="rrt", title="RRT", prepare=_planner("rrt"), compare=paths),
+        Kernel(
+            name="rrtconnect", title="RRTConnect", prepare=_planner("rrtconnect"), compare=paths
+        ),
+        Kernel(
+            name="rrtstar",
+            title="RRT*",
+            prepare=_planner("rrtstar"),
+            compare=paths,
+            too_long=True,
+            inner=(segment_free,),
+        ),
+        Kernel(name="control", title="PID", prepare=_control),
+    )
+}
+
+
+@functools.cache
+def find(name: str) -> Kernel:
+    """A kernel by its name, or the `KERNEL` of a Python file of the user's own.
+
+    Raises:
+        UnknownName: there is none; names the nearest.
+        TargetError: the file has none.
+    """
+    if name.endswith(".py"):
+        return _own(Path(name))
+    try:
+        return KERNELS[name]
+    except KeyError:
+        raise UnknownName("kernel", name, KERNELS) from None
+
+
+def _own(path: Path) -> Kernel:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise TargetError(str(path), "no such file")
+    sys.path.insert(0, str(path.parent))  # as of a script: what lies beside it can be imported
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the user's file raises
+        raise TargetError(str(path), f"cannot be loaded: {error!r}") from None
+    kernel = getattr(module, "KERNEL", None)
+    if not isinstance(kernel, Kernel):
+        raise TargetError(str(path), "has no Kernel of the name KERNEL")
+    return kernel
+
+
+def select(names: Iterable[str]) -> tuple[str, ...]:
+    """What `find` knows the named kernels by; all of ours where none is named.
+
+    Ours come first, in the order of the pipeline.
+
+    Raises:
+        UnknownName: there is none of a name; names the nearest.
+    """
+    chosen = list(names)
+    files = [str(Path(name).resolve()) for name in chosen if name.endswith(".py")]
+    wanted = {find(name).name for name in chosen if not name.endswith(".py")}
+    if not chosen:
+        wanted = set(KERNELS)
+    return (*(name for name in KERNELS if name in wanted), *dict.fromkeys(files))

@@ -1,0 +1,317 @@
+"""What "the kernel" is for an instruction-level fault: its native entry, and the code in scope.
+
+Of a planner there are two answers. In isolation the kernel is a search, since there is always one:
+OMPL's `solve`. In a mission it is what the planner node does for one request, whether the straight
+way is free or has to be searched for (`node_scope`).
+
+Ask in the process in which the kernel runs, after it has run once (`autonomy.warm_up`): a
+just-in-time compiled kernel has an address only then. The answer can be sent to a tracer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from elftools.elf.elffile import ELFFile
+
+from mavfi_cli.core.errors import FaultError, UnknownName
+from mavfi_cli.fi.tracer.elf import ElfFacts, Function, elf_facts
+from mavfi_cli.fi.tracer.image import Image, Location, Part, Region, executable_mapping
+
+PLANNERS = ("rrtstar", "rrt", "rrtconnect")
+KERNELS = ("point_cloud", "octomap", "collision_check", *PLANNERS, "control")
+
+# Code of libompl that belongs to a planner lies together: what the compiler made of its source
+# file, templates included, and the classes that every planner here calls.
+_OMPL_CLASS = {
+    "rrtstar": "ompl9geometric7RRTstar",
+    "rrt": "ompl9geometric3RRTE",
+    "rrtconnect": "ompl9geometric10RRTConnect",
+}
+_OMPL_MOTION = {
+    "rrtstar": "geometric7RRTstar6Motion",
+    "rrt": "geometric3RRT6Motion",
+    "rrtconnect": "geometric10RRTConnect6Motion",
+}
+_OMPL_SHARED = ("4ompl4base20RealVectorStateSpace", "4ompl4base29PathLengthOptimizationObjective")
+_OMPL_SOLVE = {
+    "rrtstar": "_ZN4ompl9geometric7RRTstar5solveERKNS_4base27PlannerTerminationConditionE",
+    "rrt": "_ZN4ompl9geometric3RRT5solveERKNS_4base27PlannerTerminationConditionE",
+    "rrtconnect": "_ZN4ompl9geometric10RRTConnect5solveERKNS_4base27PlannerTerminationConditionE",
+}
+_OCTOMAP_INSERT = (
+    "_ZN7octomap19OccupancyOcTreeBaseINS_10OcTreeNodeEE16insertPointCloudE"
+    "RKNS_10PointcloudERKN8octomath7Vector3Edbb"
+)
+_OCTOMAP_INNER = (
+    "_ZNK7octomap14OcTreeBaseImplINS_10OcTreeNodeENS_23AbstractOccupancyOcTreeEE14computeRayKeysE"
+    "RKN8octomath7Vector3ES7_RNS_6KeyRayE",
+    "_ZN7octomap19OccupancyOcTreeBaseINS_10OcTreeNodeEE10updateNodeERKNS_9OcTreeKeyEfb",
+)
+_FCL_COLLIDE = (
+    "_ZN3fcl7collideIdEEmPKNS_15CollisionObjectIT_EES5_RKNS_16CollisionRequestIS2_EE"
+    "RNS_15CollisionResultIS2_EE"
+)
+_FCL_USED = (
+    "3fcl7collideIdE", "3fcl6OcTreeIdE", "11obbDisjointIdE", "3fcl3OBBIdE7overlap",
+    "ConvertBVImplIdNS_4AABBIdEENS_3OBBIdEE", "14computeChildBVIdE", "3fcl19CollisionGeometryIdE",
+    "16collisionRecurseIdE", "3fcl4AABBIdE6center",
+)  # fmt: skip
+_PAGE = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelScope:
+    """Entry and scope of one kernel in one process.
+
+    Attributes:
+        entry: its invocation counts as one invocation of the kernel. The collision check enters
+            once for every point that it tries. Of a planner node it is where a request begins.
+        objects: in scope, by name; regions among them.
+        regions: for `Image`: compiled code without a file, and objects of which a part only is
+            in scope.
+        inner: functions of the kernel. Where it executes too many instructions for a profile of
+            all, invocations of these are sampled; of a planner node, windows that begin at them,
+            and the first is the search.
+    """
+
+    kernel: str
+    entry: Location
+    objects: tuple[str, ...]
+    regions: Mapping[str, Region | Part]
+    inner: tuple[Location, ...] = ()
+
+
+def kernel_scope(kernel: str) -> KernelScope:
+    """Entry and scope of a kernel in this process.
+
+    Raises:
+        UnknownName: no such kernel; names the nearest.
+        FaultError: it has not run in this process yet.
+    """
+    if kernel in PLANNERS:
+        return _planner(kernel)
+    known: dict[str, Callable[[], KernelScope]] = {
+        "point_cloud": _point_cloud,
+        "octomap": _octomap,
+        "collision_check": _collision_check,
+        "control": _control,
+    }
+    if kernel not in known:
+        raise UnknownName("kernel", kernel, KERNELS)
+    return known[kernel]()
+
+
+def library_scope(library: str, function: str) -> KernelScope:
+    """Entry and scope of a kernel that is a function of a shared library; all its code counts.
+
+    Args:
+        library: file name of the library, which this process has loaded.
+        function: its symbol.
+
+    Raises:
+        UnknownName: no such library or function; names the nearest.
+    """
+    entry = Image(os.getpid()).function(function, [library])
+    return KernelScope(kernel=function, entry=entry, objects=(library,), regions={})
+
+
+def node_scope(node: str, planner: str) -> KernelScope:
+    """Entry and scope of what a mission's node does, in this process.
+
+    A planner node begins a request with reading the map, which is not in scope, as building the
+    obstacle grid of it is not. In scope is what follows up to the answer: each test whether a
+    straight segment or a piece of the trajectory is free, and the search where there is one.
+
+    Raises:
+        UnknownName: no such node or planner; names the nearest.
+        FaultError: its kernel has not run in this process yet.
+    """
+    kernel = kernel_of_node(node, planner)
+    found = kernel_scope(kernel)
+    return found if kernel not in PLANNERS else _whole_request(found)
+
+
+def _whole_request(search: KernelScope) -> KernelScope:
+    from mavfi_cli.autonomy.grid import path_free, segment_free
+    from mavfi_cli.autonomy.octree import decode_leaves
+
+    reader, begin, reading = compiled_region(decode_leaves)
+    pieces, piece, testing = compiled_region(path_free)
+    _, segment, _ = compiled_region(segment_free)
+    return replace(
+        search,
+        entry=begin,
+        objects=(*search.objects, pieces),
+        regions={**search.regions, pieces: testing, reader: reading},
+        inner=(search.entry, segment, piece, *search.inner),
+    )
+
+
+def kernel_of_node(node: str, planner: str) -> str:
+    """The kernel that a mission's node runs; `planner` is the mission's."""
+    if node != "planner":
+        return node
+    name = planner.lower().replace("*", "star").replace("-", "").replace("_", "")
+    if name not in PLANNERS:
+        raise UnknownName("planner with a known scope", planner, PLANNERS)
+    return name
+
+
+def _point_cloud() -> KernelScope:
+    from mavfi_cli.autonomy.point_cloud import back_project
+
+    return _compiled_kernel("point_cloud", back_project)
+
+
+def _control() -> KernelScope:
+    from mavfi_cli.autonomy.tracking import track
+
+    return _compiled_kernel("control", track)
+
+
+def _compiled_kernel(kernel: str, dispatcher: Any) -> KernelScope:
+    name, entry, region = compiled_region(dispatcher)
+    return KernelScope(kernel=kernel, entry=entry, objects=(name,), regions={name: region})
+
+
+def _octomap() -> KernelScope:
+    image = Image(os.getpid())
+    library = _object_of(image, "liboctomap", _package_of("pyoctomap"))
+    inner = tuple(image.function(name, [library]) for name in _OCTOMAP_INNER)
+    return KernelScope(
+        kernel="octomap",
+        entry=image.function(_OCTOMAP_INSERT, [library]),
+        objects=(library,),
+        regions={},
+        inner=inner,
+    )
+
+
+def _collision_check() -> KernelScope:
+    image = Image(os.getpid())
+    library = _object_of(image, "libfcl")
+    part = _part([f for f in _facts(image, library).functions_with("OcTree", *_FCL_USED)
+                  if _tests_spheres(f.name)])  # fmt: skip
+    entry = image.function(_FCL_COLLIDE, [library])
+    return KernelScope(
+        kernel="collision_check", entry=entry, objects=(library,), regions={library: part}
+    )
+
+
+def _tests_spheres(symbol: str) -> bool:
+    """Whether a function of FCL takes part in testing a sphere against an octree."""
+    if "OcTree" in symbol and "Sphere" in symbol:
+        return "libccd" in symbol
+    return any(name in symbol for name in _FCL_USED)
+
+
+def _planner(kernel: str) -> KernelScope:
+    from mavfi_cli.autonomy.grid import segment_free
+
+    image = Image(os.getpid())
+    library = _object_of(image, "libompl")
+    wanted = (_OMPL_CLASS[kernel], _OMPL_MOTION[kernel], *_OMPL_SHARED)
+    part = _part(_facts(image, library).functions_with(*wanted))
+    segment, _, region = compiled_region(segment_free)
+    return KernelScope(
+        kernel=kernel,
+        entry=image.function(_OMPL_SOLVE[kernel], [library]),
+        objects=(library, segment),
+        regions={library: part, segment: region},
+        inner=_nearest(image, library, kernel),
+    )
+
+
+def _nearest(image: Image, library: str, kernel: str) -> tuple[Location, ...]:
+    """The nearest-neighbour searches of a planner's tree, those that it may call."""
+    found = [
+        Location(library, function.start)
+        for function in _facts(image, library).functions_with(_OMPL_MOTION[kernel])
+        if "NearestNeighborsGNATNoThreadSafety" in function.name
+        and ("E7nearestE" in function.name or "E8nearestKE" in function.name)
+        and "4Node" not in function.name
+    ]
+    return tuple(found)
+
+
+def _facts(image: Image, library: str) -> ElfFacts:
+    path = image.named(library).path
+    assert path is not None
+    return elf_facts(path)
+
+
+def _package_of(module: str) -> str:
+    return f"/{module}.libs/"
+
+
+def _object_of(image: Image, prefix: str, folder: str = "") -> str:
+    for name in image.names:
+        if name.startswith(prefix) and folder in image.path_of(name):
+            return name
+    raise FaultError(f"{prefix} is not loaded: run the kernel once before asking for its scope")
+
+
+def _part(functions: Iterable[Function]) -> Part:
+    """The code of functions; what lies between two of them on a page counts too."""
+    spans: list[range] = []
+    for function in functions:
+        start, end = function.start, function.start + function.size
+        if spans and function.size and start - spans[-1].stop < _PAGE:
+            spans[-1] = range(spans[-1].start, max(spans[-1].stop, end))
+        elif function.size:
+            spans.append(range(start, end))
+    return Part(text=tuple(spans))
+
+
+def compiled_region(dispatcher: Any) -> tuple[str, Location, Region]:
+    """Name, entry and code of a function that `core.compiled` compiled and that has run.
+
+    The entry is the one that Python calls. The build is told by the compiled object itself, since
+    the code in memory holds addresses of the process.
+
+    Raises:
+        FaultError: it has not run in this process yet.
+    """
+    overloads = list(getattr(dispatcher, "overloads", {}).items())
+    if not overloads:
+        raise FaultError(f"{dispatcher} has not run yet: it has no machine code")
+    signature, result = overloads[0]
+    wrapper = result.fndesc.llvm_cpython_wrapper_name
+    address = int(result.library.get_pointer_to_function(wrapper))
+    name = f"numba:{dispatcher.__name__}"
+    region = _object_region(dispatcher, signature, wrapper, address)
+    return name, Location(name, address - region.span.start), region
+
+
+def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) -> Region:
+    """The text of the compiled object; the whole executable mapping where no cache has it."""
+    code = _cached_object(dispatcher, signature)
+    if code is not None:
+        elf: Any = ELFFile(io.BytesIO(code))
+        symbols = elf.get_section_by_name(".symtab").get_symbol_by_name(wrapper)
+        if symbols:
+            section = elf.get_section(symbols[0]["st_shndx"])
+            start = address - symbols[0]["st_value"]
+            return Region(
+                span=range(start, start + section["sh_size"]),
+                build_id="sha256:" + hashlib.sha256(code).hexdigest()[:40],
+            )
+    return Region(span=executable_mapping(os.getpid(), address))
+
+
+def _cached_object(dispatcher: Any, signature: Any) -> bytes | None:
+    """The relocatable object in numba's cache, as it was loaded."""
+    cache = getattr(dispatcher, "_cache", None)
+    try:
+        key = cache._index_key(signature, dispatcher.targetctx.codegen())  # type: ignore[union-attr]
+        payload = cache._cache_file.load(key)  # type: ignore[union-attr]
+        kind, data = payload[0][1], payload[0][2]
+    except (AttributeError, TypeError, IndexError):
+        return None
+    return bytes(data[0]) if kind == "object" else None

@@ -1,0 +1,255 @@
+"""One kernel as a target: a template process that forks itself for every run.
+
+The attacker's side of `attack.kernels.template`: it starts a run, stopped, takes its output
+afterwards, and judges it in terms of what the kernel computes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.attack.attacker import run_out
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.difference import unpack
+from mavfi_cli.attack.kernels.scope import KernelScope
+from mavfi_cli.attack.kernels.template import (
+    ASK_SCOPE,
+    GO,
+    PID_BYTES,
+    RAISED,
+    RUN,
+    TIMES,
+)
+from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.profile import TargetProfile, Watch, profile_run
+from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.attack.target import Difference, Golden, RunLimits, RunVerdict, digest, judged
+from mavfi_cli.core.channel import receive
+from mavfi_cli.core.errors import FaultError, RecordError, TargetError
+from mavfi_cli.core.sources import own_digest
+from mavfi_cli.fi.tracer.breakpoints import Mechanism
+from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+
+_PROGRAM = "mavfi_cli.attack.kernels.template"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Where everything is in the memory of a kernel's runs; the same in every template."""
+
+    scope: KernelScope
+    image: Image
+    digest: str  # of the addresses of all code
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelTarget:
+    """A kernel and what it is fed.
+
+    Attributes:
+        kernel: name of one of ours, or the file of a kernel of the user's own.
+        inputs: file of the inputs of one flight, which `flight` names in words.
+        tolerance: relative difference of an output that is no silent corruption.
+        layout: of a template that was started before; looking it up takes seconds.
+    """
+
+    kernel: str
+    inputs: Path
+    inputs_sha256: str = ""
+    flight: str = ""
+    tolerance: float = 0.0
+    limits: RunLimits = field(default_factory=RunLimits)
+    mechanism: Mechanism | None = None
+    layout: Layout | None = None
+
+    @property
+    def name(self) -> str:
+        """The kernel's name."""
+        return catalogue.find(self.kernel).name
+
+    @property
+    def stream(self) -> tuple[str, ...]:
+        """A kernel's faults do not depend on which others are attacked."""
+        return (self.name,)
+
+    def known(self) -> dict[str, Any]:
+        """What its results depend on."""
+        return {
+            "inputs_sha256": self.inputs_sha256,
+            "flight": self.flight,
+            "tolerance": self.tolerance,
+            "sources": own_digest(),
+        }
+
+    def open(self) -> KernelPlace:
+        """Start the kernel's template."""
+        return KernelPlace(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CallOutput:
+    """What a run left: the times of its call, and its packed output or its error."""
+
+    cpu_s: float
+    wall_s: float
+    data: bytes
+
+
+class KernelPlace:
+    """Where one kernel runs: forks of one template. Belongs to the thread that made it."""
+
+    kind = "kernel"
+
+    def __init__(self, target: KernelTarget) -> None:
+        """Start the template.
+
+        Raises:
+            RecordError: the inputs cannot be read.
+            TargetError: the kernel cannot be loaded.
+        """
+        self.name, self.limits = target.name, target.limits
+        self._kernel, inputs = catalogue.find(target.kernel), _read(target.inputs)
+        with contextlib.ExitStack() as undo:
+            self._output = os.memfd_create("mavfi-kernel-output")
+            undo.callback(os.close, self._output)
+            self._template = ServedProcess(_PROGRAM, output=self._output)
+            undo.callback(self._template.kill)
+            self._template.begin((target.kernel, inputs), self.name)
+            self.layout = self._look_up(target.layout)
+            self._closing = undo.pop_all()
+        self.target = replace(target, layout=self.layout)
+
+    def _look_up(self, known: Layout | None) -> Layout:
+        """Where everything is; what is known already where it is the same."""
+        pid, process = self._template.pid, self._template
+        digest_of_code = _digest_of_code(pid)
+        if known is not None and known.digest == digest_of_code:
+            return known
+        process.connection.send(ASK_SCOPE)
+        try:
+            scope: KernelScope = receive(process.connection)
+        except (OSError, EOFError):
+            raise TargetError(self.name, f"does not load: {process.last_words()}") from None
+        return Layout(scope=scope, image=Image(pid, scope.regions), digest=digest_of_code)
+
+    def start(self) -> Tracee:
+        """A fresh run, attached and stopped, that has not called the kernel yet.
+
+        Raises:
+            TracingForbidden: the operating system refuses.
+            FaultError: the template has died.
+        """
+        control = self._template.connection
+        os.ftruncate(self._output, 0)
+        control.send(RUN)
+        told = control.recv(PID_BYTES)
+        if len(told) < PID_BYTES:
+            raise FaultError(f"the process that loads {self.name} has died")
+        tracee = Tracee.attach(int.from_bytes(told, "little"), mechanism=self.target.mechanism)
+        control.send(GO)
+        return tracee
+
+    def image(self, _: Tracee) -> Image:
+        """What a run has in its memory: the same in all."""
+        return self.layout.image
+
+    def scope(self, image: Image) -> Scope:
+        """The code that may be hit."""
+        return scope_of(image, self.layout.scope.objects)
+
+    def context(self) -> dict[str, Any]:
+        """What every record says of the kernel."""
+        objects = list(self.layout.scope.objects)
+        return {"scope": objects, "inputs_sha256": self.target.inputs_sha256}
+
+    def profile(
+        self, rng: np.random.Generator, *, windows: int, watch: Watch | None = None
+    ) -> TargetProfile:
+        """Step a fault-free run of the kernel, or a sample of it where that is too long.
+
+        Raises:
+            TargetError: the kernel never enters its native code.
+            WindowTooLong: too many instructions.
+        """
+        scope, limit = self.layout.scope, self.limits.profile_steps
+        markers = (scope.inner or (scope.entry,)) if self._kernel.too_long else ()
+        return profile_run(self, rng, markers=markers, windows=windows, limit=limit, watch=watch)
+
+    def fault_free(self) -> Golden:
+        """One run without a fault.
+
+        Raises:
+            TargetError: it fails.
+        """
+        ended = run_out(self.start())
+        output = self.left()
+        if output is None or ended.exit_code != 0:
+            how = f"signal {ended.signal}" if ended.signal else f"exit code {ended.exit_code}"
+            text = output.data.decode(errors="replace") if output else how
+            raise TargetError(self.name, f"fails without a fault: {text}")
+        return Golden(output=output.data, cpu_s=output.cpu_s, wall_s=output.wall_s)
+
+    def unlike(self, golden: Golden, again: Golden) -> str:
+        """How two fault-free runs differ; empty where they do not."""
+        return "" if golden.output == again.output else "their outputs differ"
+
+    def left(self) -> CallOutput | None:
+        """What the run that has ended left; None where it left nothing whole."""
+        data = os.pread(self._output, os.fstat(self._output).st_size, 0)
+        if len(data) < TIMES.size:
+            return None
+        cpu_s, wall_s = TIMES.unpack_from(data)
+        return CallOutput(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
+
+    def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
+        """Judge the last run; `ended` is None where it was cut off."""
+        output = self.left()
+        left = None if output is None or ended is None else output.data
+        tolerance = self.target.tolerance or None
+        outcome, difference = judged(golden, ended, left, self._compare, tolerance=tolerance)
+        raised = left is not None and ended is not None and ended.exit_code == RAISED
+        size = 0.0 if difference is None else difference.relative
+        return RunVerdict(
+            outcome=outcome,
+            output_sha256=digest(left) if left else "",
+            details={
+                "error": left.decode(errors="replace") if raised and left is not None else "",
+                "magnitude": None if difference is None else difference.to_json(),
+                "within_tolerance": outcome is Outcome.BENIGN and size > 0.0,
+            },
+        )
+
+    def _compare(self, golden: bytes, output: bytes) -> Difference:
+        try:
+            return self._kernel.compare(unpack(golden), unpack(output))
+        except (ValueError, KeyError) as damage:
+            text = f"unreadable: {damage}"
+            return Difference(relative=math.inf, absolute=math.inf, text=text)
+
+    def close(self) -> None:
+        """End the template."""
+        self._closing.close()
+
+
+def _read(inputs: Path) -> bytes:
+    try:
+        return inputs.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{inputs}: {error.strerror}") from None
+
+
+def _digest_of_code(pid: int) -> str:
+    """Of the addresses of everything executable in a process."""
+    maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    code = [line.split() for line in maps if "x" in line.split()[1]]
+    known = [f"{part[0]} {part[2]} {part[-1]}" for part in code]
+    return hashlib.sha256("\n".join(known).encode()).hexdigest()

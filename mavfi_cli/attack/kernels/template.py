@@ -1,0 +1,117 @@
+"""A warm process with one kernel loaded and fed, that forks itself for every run.
+
+The message to it is the kernel's name and its inputs. From then on it is asked in single bytes on
+the same socket. `ASK_SCOPE` is answered by the kernel's scope. For every `RUN` a child is forked,
+which sends its process id (4 bytes), waits for `GO`, calls the kernel once, writes its output to
+standard output, a file, and ends. The next request must not come before the child has ended. The
+file holds CPU seconds and duration of the call (two float64), then the packed output, or the
+error's text where the exit code is `RAISED`.
+
+Every run starts from the same memory: no garbage collection, and nothing is kept here from one fork
+to the next.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import resource
+import signal
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.catalogue import Call
+from mavfi_cli.attack.kernels.difference import pack
+from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
+from mavfi_cli.attack.served import channel, newest_cache_ns
+from mavfi_cli.core.channel import receive, send
+
+RAISED = 3  # exit code of a child whose kernel raised an error
+TIMES = struct.Struct("<dd")
+PID_BYTES = 4
+RUN, GO, ASK_SCOPE = b"r", b"g", b"s"
+OUTPUT = 1
+_EXTRA_MEMORY = 2 << 30  # a corrupted size must not take the machine down
+_LARGEST_FILE = 1 << 28
+
+
+def main() -> None:
+    """Get warm, then fork until the other end closes."""
+    connection = channel()
+    name, inputs = receive(connection)
+    kernel = catalogue.find(name)
+    call = kernel.prepare(inputs_of_bytes(inputs))
+    for _ in range(2 if kernel.repeatable else 0):
+        pack(call())
+    _limit()
+    send(connection, (None, newest_cache_ns()))
+    sys.dont_write_bytecode = True  # the second run must not find what the first has compiled
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    while request := connection.recv(1):
+        if request == ASK_SCOPE:
+            status = _in_child(lambda: _tell_scope(connection, kernel, call))
+            if status:
+                _give_up(f"fails without a fault (wait status {status})")
+        elif request == RUN:  # not the GO of a child that was killed before it took it
+            _in_child(lambda: _run(connection, call))
+
+
+def _give_up(why: str) -> None:
+    """End without the libraries' own last words, which would hide ours."""
+    os.write(2, f"{why}\n".encode())
+    os._exit(1)
+
+
+def _in_child(work: Callable[[], int]) -> int:
+    """Do work in a fork of this process, and wait for its end; its wait status."""
+    child = os.fork()
+    if child:
+        return os.waitpid(child, 0)[1]
+    code = 1
+    try:
+        code = work()
+    finally:
+        os._exit(code)
+
+
+def _limit() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + _EXTRA_MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
+
+
+def _tell_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
+    """Look up where the kernel's code is; in a child, as that leaves much in the memory."""
+    call()
+    send(connection, kernel.scope())
+    return 0
+
+
+def _run(connection: socket.socket, call: Call) -> int:
+    """One run of the kernel; the exit code."""
+    connection.send(os.getpid().to_bytes(PID_BYTES, "little"))
+    if not connection.recv(1):
+        return 0
+    cpu_s, wall_s, code = time.process_time(), time.perf_counter(), 0
+    try:
+        data = pack(call())
+    except Exception as error:  # whatever the corrupted kernel raises is a result
+        data, code = f"{type(error).__name__}: {error}".encode(), RAISED
+    times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
+    os.pwrite(OUTPUT, times + data, 0)
+    return code
+
+
+if __name__ == "__main__":
+    main()

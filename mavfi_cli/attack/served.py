@@ -1,0 +1,133 @@
+"""A Python program that is attacked, or whose forks are: started afresh, always the same.
+
+Its memory depends on what it is told only, so a corrupted pointer meets the same things in every
+repetition: no address randomisation, a fixed environment, and all bytecode in its place. A fork of
+the process that attacks would carry the traces of everything that ran there before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import time
+from typing import Any
+
+from mavfi_cli.core.channel import receive, send
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer import linux
+
+CHANNEL = 3  # file descriptor of the program's end
+_FILE_CLOCK = 5  # CLOCK_REALTIME_COARSE, which stamps files; `time.time_ns` runs ahead of it
+# Nothing else of the environment reaches it, so that its memory does not depend on the shell.
+_KEPT = (
+    "HOME", "LANG", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "PATH", "PYTHONPATH", "VIRTUAL_ENV",
+)  # fmt: skip
+_FIXED = {
+    "PYTHONHASHSEED": "0",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "1",
+}
+
+
+class ServedProcess:
+    """A started program; it may load much before it is told what to be, so start it early.
+
+    A program that compiles its modules has another memory than one that finds their bytecode. So
+    one that has left something in a cache is ended, and another started, which finds it there.
+
+    Attributes:
+        pid: its process id.
+        connection: our end of the socket to it.
+
+    Args:
+        module: the program. It takes one message, and answers with a value and `newest_cache_ns`.
+        output: file descriptor of its standard output; None: nowhere.
+    """
+
+    def __init__(self, module: str, *, output: int | None = None) -> None:
+        self._module, self._output = module, output
+        self._errors = os.memfd_create("mavfi-errors")
+        self._start()
+
+    def _start(self) -> None:
+        self.connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
+        output = (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)
+        actions = [
+            (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
+            output if self._output is None else (os.POSIX_SPAWN_DUP2, self._output, 1),
+            (os.POSIX_SPAWN_DUP2, self._errors, 2),
+            (os.POSIX_SPAWN_DUP2, theirs.fileno(), CHANNEL),
+        ]
+        # -P: where we stand must not decide what is imported, and so how its memory lies.
+        line = [sys.executable, "-P", "-m", self._module]
+        self._started_ns = time.clock_gettime_ns(_FILE_CLOCK)
+        with theirs, linux.fixed_addresses():
+            self.pid = os.posix_spawn(
+                sys.executable, line, {**environment, **_FIXED},
+                file_actions=actions, setsid=True,
+            )  # fmt: skip
+
+    def begin(self, message: Any, name: str) -> Any:
+        """Tell it what to be, and wait until it is ready; its answer.
+
+        Args:
+            message: to it.
+            name: what it is, for the error.
+
+        Raises:
+            TargetError: it could not start; says why.
+        """
+        answer, cached_ns = self._ask(message, name)
+        if cached_ns >= self._started_ns:
+            self._end()
+            self._start()
+            answer, _ = self._ask(message, name)
+        return answer
+
+    def _ask(self, message: Any, name: str) -> tuple[Any, int]:
+        try:
+            send(self.connection, message)
+            answer: tuple[Any, int] = receive(self.connection)
+        except (OSError, EOFError):
+            raise TargetError(name, f"does not load: {self.last_words()}") from None
+        return answer
+
+    def last_words(self) -> str:
+        """The last line that it wrote to its standard error."""
+        said = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
+        return said[-1] if said else "its process ended"
+
+    def _end(self) -> None:
+        self.connection.close()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(self.pid, 0)
+
+    def kill(self) -> None:
+        """End it, if nobody else did."""
+        self._end()
+        if self._errors >= 0:
+            os.close(self._errors)
+            self._errors = -1
+
+
+def channel() -> socket.socket:
+    """In the program: its end of the socket."""
+    return socket.socket(fileno=CHANNEL)
+
+
+def newest_cache_ns() -> int:
+    """When a file was last added to a cache of the code that this process has loaded.
+
+    Bytecode, or compiled kernels beside it; ns since the epoch.
+    """
+    specs = [getattr(module, "__spec__", None) for module in sys.modules.values()]
+    files = [spec.cached for spec in specs if spec is not None and spec.cached is not None]
+    folders = sorted({os.path.dirname(file) for file in files})
+    return max((os.stat(each).st_mtime_ns for each in folders if os.path.isdir(each)), default=0)

@@ -1,0 +1,210 @@
+"""Counts, shares and intervals of a campaign, with all that the numbers depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from mavfi_cli.attack.campaign import Record, TargetRuns
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.target import KernelTarget
+from mavfi_cli.attack.outcome import Outcome, counted, shares, shares_to_json, signal_name
+from mavfi_cli.attack.plan import Plan
+from mavfi_cli.core.columns import blocks
+
+SCHEMA = 1
+_OF_EVERY_RUN = (
+    "object offset symbol instruction k site role operand bits before after activation "
+    "not_injected_reason stop_s run_s output_sha256"
+)
+KERNEL_COLUMNS = (
+    "kernel run outcome signal error relative absolute unit text within_tolerance " + _OF_EVERY_RUN
+).split()
+PROGRAM_COLUMNS = f"run outcome signal exit_code magnitude {_OF_EVERY_RUN}".split()
+_SHOWN = (Outcome.BENIGN, Outcome.CRASH, Outcome.HANG, Outcome.SDC, Outcome.NOT_INJECTED)
+
+
+def _counts(runs: TargetRuns) -> dict[str, Any]:
+    """What is counted of every target."""
+    records, profile = runs.records, runs.profile
+    windows = [] if profile is None else [profile.window_of(entry) for entry in records]
+    found = shares((Outcome(entry["outcome"]) for entry in records), windows)
+    return {
+        "outcomes": shares_to_json(found),
+        "crashes": counted(_crash(entry) for entry in _with(records, Outcome.CRASH)),
+        "not_injected": counted(
+            entry["not_injected_reason"] for entry in records if entry["not_injected_reason"]
+        ),
+        "activation": counted(entry["activation"]["activation"] for entry in records),
+    }
+
+
+def _with(records: Iterable[Record], outcome: Outcome) -> Iterator[Record]:
+    return (entry for entry in records if entry["outcome"] == outcome.value)
+
+
+def _crash(entry: Mapping[str, Any]) -> str:
+    if entry["signal"]:
+        return signal_name(entry["signal"])
+    if "exit_code" in entry:
+        return f"exit {entry['exit_code']}"
+    return str(entry["error"]).partition(":")[0] or "exit"
+
+
+def _count_lines(counts: Mapping[str, Any], indent: str) -> Iterator[str]:
+    for title in ("crashes", "not_injected", "activation"):
+        if counts[title]:
+            parts = ", ".join(f"{name} {count}" for name, count in counts[title].items())
+            yield f"{indent}{title.replace('_', ' ')}: {parts}"
+
+
+# -- kernels
+
+
+def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
+    """The whole campaign on kernels as plain values."""
+    return {
+        "schema": SCHEMA,
+        "plan": plan.to_json(campaign[0].target),
+        "sampling": plan.strategy().name,
+        "kernels": [_kernel(runs) for runs in campaign],
+    }
+
+
+def _kernel(runs: TargetRuns) -> dict[str, Any]:
+    target, records, profile = runs.target, runs.records, runs.profile
+    assert isinstance(target, KernelTarget)
+    sizes = [entry["magnitude"]["relative"] for entry in _with(records, Outcome.SDC)]
+    finite = sorted(size for size in sizes if size is not None)
+    run_s = sum(entry["run_s"] for entry in records)
+    return {
+        "kernel": target.name,
+        "title": catalogue.find(target.kernel).title,
+        "runs": len(records),
+        "population": "moments of one call" if profile is None else profile.in_words(),
+        "complete": None if profile is None else profile.complete,
+        "instructions": None if profile is None else profile.instructions,
+        "scope": runs.context["scope"],
+        "golden": {
+            "sha256": runs.golden.sha256,
+            "cpu_s": runs.golden.cpu_s,
+            "wall_s": runs.golden.wall_s,
+        },
+        **_counts(runs),
+        "sdc_relative": {
+            "median": finite[len(finite) // 2] if finite else None,
+            "largest": finite[-1] if finite else None,
+            "incomparable": len(sizes) - len(finite),
+        },
+        "within_tolerance": sum(bool(entry["within_tolerance"]) for entry in records),
+        "prepare_s": runs.prepare_s,
+        "wall_s": runs.wall_s,
+        "injections_per_core_hour": 3600.0 * len(records) / run_s if run_s else None,
+    }
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """The summary as text: one row a kernel, shares of injected runs with 95 % intervals."""
+    head = ["kernel", "runs", *(outcome.title for outcome in _SHOWN)]
+    rows = [
+        [each["title"], str(each["runs"]), *(_cell(each["outcomes"][o.value]) for o in _SHOWN)]
+        for each in summary["kernels"]
+    ]
+    lines = blocks([head, *rows], labels=1)
+    lines.append("")
+    lines.append(
+        f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
+        "95 % Wilson interval,"
+    )
+    lines.append("widened by the likeness of faults in a window where windows are sampled")
+    lines.append(f"inputs: {summary['plan']['flight']}; tolerance {summary['plan']['tolerance']:g}")
+    for kernel in summary["kernels"]:
+        lines += _notes(kernel)
+    return "\n".join(lines)
+
+
+def _cell(row: Mapping[str, Any]) -> str:
+    if row["share"] is None:
+        return "-"
+    low, high = (100.0 * edge for edge in row["wilson95"])
+    return f"{100.0 * row['share']:.1f} % ({low:.1f} to {high:.1f})"
+
+
+def _notes(kernel: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"{kernel['title']}: {kernel['population']}; scope {', '.join(kernel['scope'])}",
+        *_count_lines(kernel, "  "),
+    ]
+    sdc = kernel["sdc_relative"]
+    if sdc["median"] is not None:
+        lines.append(
+            f"  SDC, relative size: median {sdc['median']:.2g}, largest {sdc['largest']:.2g}; "
+            f"{sdc['incomparable']} of another shape or not a number"
+        )
+    return lines
+
+
+# -- a program
+
+
+def summarise_program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
+    """The campaign on one program as plain values: summary, golden run and all records."""
+    return {
+        "summary": _program(plan, runs),
+        "golden": {
+            "exit_code": runs.golden.exit_code,
+            "cpu_s": runs.golden.cpu_s,
+            "wall_s": runs.golden.wall_s,
+        },
+        "runs": list(runs.records),
+    }
+
+
+def _program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
+    profile = runs.profile
+    return {
+        **runs.context,
+        "sampling": plan.strategy().name,
+        "seed": plan.seed,
+        "runs": len(runs.records),
+        "executed_in_scope": None if profile is None else profile.executed,
+        "profile_complete": None if profile is None else profile.complete,
+        "windows": None if profile is None else profile.windows,
+        "profile_s": None if profile is None else profile.cost_s,
+        "golden_wall_s": runs.golden.wall_s,
+        "wall_s": runs.wall_s,
+        **_counts(runs),
+    }
+
+
+def program_table(summary: Mapping[str, Any]) -> str:
+    """The summary of a program as text: one row an outcome."""
+    lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
+    for name, row in summary["outcomes"].items():
+        share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
+        low, high = (100 * edge for edge in row["wilson95"])
+        lines.append(
+            f"{Outcome(name).title:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %"
+        )
+    lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
+    if summary["executed_in_scope"] is not None:
+        lines.append(
+            f"{summary['executed_in_scope']} executed instructions in scope, windows stepped: "
+            f"{summary['windows']}"
+        )
+    return "\n".join([*lines, *_count_lines(summary, "")])
+
+
+# -- both
+
+
+def csv_rows(columns: Sequence[str], campaign: Iterable[TargetRuns]) -> Iterator[list[str]]:
+    """Header and one row a run; what a record does not have is empty."""
+    yield list(columns)
+    for entry in (entry for runs in campaign for entry in runs.records):
+        flat = {**entry, **(entry.get("corruption") or {}), **entry["injection"]}
+        if isinstance(entry["magnitude"], Mapping):
+            flat.update(entry["magnitude"])
+        flat["activation"] = entry["activation"]["activation"]
+        flat["bits"] = " ".join(str(bit) for bit in flat.get("bits", ()))
+        yield ["" if flat.get(name) is None else str(flat[name]) for name in columns]

@@ -1,1 +1,0 @@
-"""Isolated campaigns: golden run, then one fault a run, and what became of the output."""

@@ -1,0 +1,216 @@
+"""Registers of a stopped x86-64 thread: general, flags, x87, MMX, XMM, YMM, ZMM, opmask.
+
+Layouts: `user_regs_struct` of `<sys/user.h>`; FXSAVE and XSAVE areas of Intel SDM volume 1,
+sections 10.5 and 13.4. The XSAVE offsets come from CPUID.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from dataclasses import dataclass
+
+from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.arch.traits import Traits
+from mavfi_cli.fi.tracer.arch.x86_64.cpuid import xsave_components
+
+NT_PRSTATUS, NT_X86_XSTATE = 1, 0x202
+XSTATE_BV = 512
+X87, SSE, AVX, OPMASK, ZMM_HIGH, ZMM_UPPER = 0, 1, 2, 5, 6, 7
+
+_USER_REGS = (
+    "r15 r14 r13 r12 rbp rbx r11 r10 r9 r8 rax rcx rdx rsi rdi orig_rax rip cs rflags rsp ss "
+    "fs_base gs_base ds es fs gs"
+)
+_GENERAL_NAMES = "rax rbx rcx rdx rsi rdi rbp rsp r8 r9 r10 r11 r12 r13 r14 r15"
+_GENERAL_ORDER = _USER_REGS.split()
+_SLOT = {name: index for index, name in enumerate(_GENERAL_ORDER)}
+GENERAL = tuple(_GENERAL_NAMES.split())
+FLAG_BITS = {"cf": 0, "pf": 2, "af": 4, "zf": 6, "sf": 7, "df": 10, "of": 11}
+TRAP_FLAG = 1 << 8
+RESUME_FLAG = 1 << 16
+_VECTOR = re.compile(r"(xmm|ymm|zmm)(\d+)$")
+_X87 = re.compile(r"(st|mm|k)(\d)$")
+
+
+TRAITS = Traits(
+    instruction_pointer="rip",
+    stack_pointer="rsp",
+    vector_bits=512,
+    breakpoint=b"\xcc",
+    breakpoint_advance=1,
+    breakpoint_length=8,
+    perf_event_open=298,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Span:
+    """Bytes of the extended state that hold part of a register, and the component's number."""
+
+    component: int
+    offset: int
+    size: int
+
+
+def width_of(name: str) -> int:
+    """Width of a full register in bits.
+
+    Raises:
+        KeyError: no such register.
+    """
+    if name in _SLOT:
+        return 64
+    if match := _VECTOR.match(name):
+        return {"xmm": 128, "ymm": 256, "zmm": 512}[match[1]]
+    if match := _X87.match(name):
+        return 80 if match[1] == "st" else 64
+    raise KeyError(name)
+
+
+def register_kind(name: str) -> str:
+    """The class of a full register: the value of its `Site`."""
+    if name == "rflags":
+        return "flags"
+    if name == "rip":
+        return "instruction-pointer"
+    if name.startswith(("xmm", "ymm", "zmm")):
+        return "vector"
+    if name.startswith(("st", "mm")):
+        return "x87"
+    return "mask" if name.startswith("k") else "general"
+
+
+def _vector_spans(kind: str, index: int) -> list[_Span]:
+    parts = {"xmm": 1, "ymm": 2, "zmm": 3}[kind]
+    components = xsave_components()
+    if index >= 16:
+        base = components[ZMM_UPPER].offset + 64 * index - 1024
+        return [_Span(ZMM_UPPER, base, {"xmm": 16, "ymm": 32, "zmm": 64}[kind])]
+    spans = [_Span(SSE, 160 + 16 * index, 16)]
+    if parts > 1:
+        spans.append(_Span(AVX, components[AVX].offset + 16 * index, 16))
+    if parts > 2:
+        spans.append(_Span(ZMM_HIGH, components[ZMM_HIGH].offset + 32 * index, 32))
+    return spans
+
+
+class Registers:
+    """All registers of one stopped thread, read lazily and written through."""
+
+    __slots__ = ("_extended", "_general", "tid")
+
+    def __init__(self, tid: int) -> None:
+        self.tid = tid
+        self._general: list[int] | None = None
+        self._extended: bytes | None = None
+
+    def forget(self) -> None:
+        """Drop what was read; call after the thread has run."""
+        self._general = None
+        self._extended = None
+
+    def general(self) -> list[int]:
+        """`user_regs_struct` as 27 integers."""
+        if self._general is None:
+            buffer = ctypes.create_string_buffer(216)
+            linux.get_registers(self.tid, NT_PRSTATUS, buffer)
+            words = (ctypes.c_uint64 * 27).from_buffer(buffer)
+            self._general = list(words)
+        return self._general
+
+    def extended(self) -> bytes:
+        """The XSAVE area in standard format."""
+        if self._extended is None:
+            buffer = ctypes.create_string_buffer(16384)
+            size = linux.get_registers(self.tid, NT_X86_XSTATE, buffer)
+            self._extended = buffer.raw[:size]
+        return self._extended
+
+    def read(self, name: str) -> int:
+        """The value of a full register.
+
+        Raises:
+            KeyError: no such register on this processor.
+        """
+        if name in _SLOT:
+            return self.general()[_SLOT[name]]
+        area = self.extended()
+        parts = [area[span.offset : span.offset + span.size] for span in self._spans(name)]
+        return int.from_bytes(b"".join(parts), "little")
+
+    def write(self, name: str, value: int) -> None:
+        """Write a full register. What the kernel made of it is seen by reading again.
+
+        Raises:
+            OSError: the kernel refuses the value.
+        """
+        if name in _SLOT:
+            words = list(self.general())
+            words[_SLOT[name]] = value
+            data = bytes((ctypes.c_uint64 * 27)(*words))
+            self.forget()
+            linux.set_registers(self.tid, NT_PRSTATUS, data)
+            return
+        area = bytearray(self.extended())
+        data = value.to_bytes(width_of(name) // 8, "little")
+        present = int.from_bytes(area[XSTATE_BV : XSTATE_BV + 8], "little")
+        for span in self._spans(name):
+            area[span.offset : span.offset + span.size] = data[: span.size]
+            data = data[span.size :]
+            # A component in its initial state is ignored by the kernel unless its bit is set.
+            present |= 1 << span.component
+        area[XSTATE_BV : XSTATE_BV + 8] = present.to_bytes(8, "little")
+        self.forget()
+        linux.set_registers(self.tid, NT_X86_XSTATE, bytes(area))
+
+    def _spans(self, name: str) -> list[_Span]:
+        if match := _VECTOR.match(name):
+            return _vector_spans(match[1], int(match[2]))
+        match = _X87.match(name)
+        if match is None:
+            raise KeyError(name)
+        index = int(match[2])
+        if match[1] == "st":  # FXSAVE stores the stack top-relative
+            return [_Span(X87, 32 + 16 * index, 10)]
+        if match[1] == "mm":  # MMX names physical registers
+            top = self.extended()[3] >> 3 & 7
+            return [_Span(X87, 32 + 16 * ((index - top) & 7), 8)]
+        return [_Span(OPMASK, xsave_components()[OPMASK].offset + 8 * index, 8)]
+
+    def rearm(self) -> None:
+        """Let a breakpoint on the very next instruction hit.
+
+        A stop at an instruction breakpoint leaves the resume flag set, which hides the next
+        execution (Intel SDM volume 3, section 18.3.1.1).
+        """
+        flags = self.read("rflags")
+        if flags & RESUME_FLAG:
+            self.write("rflags", flags & ~RESUME_FLAG)
+
+    @property
+    def ip(self) -> int:
+        """The instruction pointer."""
+        return self.read("rip")
+
+    @property
+    def sp(self) -> int:
+        """The stack pointer."""
+        return self.read("rsp")
+
+    @property
+    def system_call(self) -> int | None:
+        """Number of the system call that this stop interrupted, or None outside of one."""
+        number = self.read("orig_rax")
+        return None if number >> 63 else number
+
+
+def all_registers() -> tuple[str, ...]:
+    """Every full register of this processor that can be flipped."""
+    components = xsave_components()
+    names = [*GENERAL, "rflags", "rip", *(f"st{i}" for i in range(8))]
+    widest = "zmm" if ZMM_HIGH in components else "ymm" if AVX in components else "xmm"
+    names += [f"{widest}{i}" for i in range(32 if ZMM_UPPER in components else 16)]
+    if OPMASK in components:
+        names += [f"k{i}" for i in range(8)]
+    return tuple(names)

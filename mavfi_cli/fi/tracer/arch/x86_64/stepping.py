@@ -1,0 +1,92 @@
+"""Stepping and stopping on x86-64: the recording loop, the trap flag's traces, debug registers."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.arch.instruction import Instruction
+from mavfi_cli.fi.tracer.arch.traits import StepEnd, Steps
+from mavfi_cli.fi.tracer.arch.x86_64.registers import TRAP_FLAG
+
+if TYPE_CHECKING:
+    from mavfi_cli.fi.tracer.tracee import Tracee
+
+_USER_OFFSETS = (128, 152)  # of rip and rsp in `struct user`
+_DEBUG_REGISTERS = 848  # offset of debug register 0 in it
+
+
+def record_steps(
+    tid: int, spans: NDArray[np.int64], trace: NDArray[np.int64], stop: NDArray[np.int64]
+) -> Steps:
+    """Single-step a stopped thread and record the address of each instruction in scope.
+
+    Args:
+        tid: the thread.
+        spans: (n, 2) addresses in scope.
+        trace: (m,) filled from the start; a repeated string instruction is one entry.
+        stop: (2,) the window ends at this address once the stack pointer is above the second.
+    """
+    from mavfi_cli.fi.tracer.arch.x86_64 import stepper  # numba takes half a second to import
+
+    status = np.zeros(1, np.int32)
+    offsets = np.array(_USER_OFFSETS, np.int64)
+    count, why = stepper.run(tid, spans, trace, stop, offsets, status)
+    return Steps(count=int(count), why=StepEnd(int(why)), status=int(status[0]))
+
+
+def erase_trap(tracee: Tracee, instruction: Instruction) -> None:
+    """After a single step of `instruction`: the target must not see that it was stepped.
+
+    `pushf` has pushed the trap flag, and a system call has saved it in r11.
+    """
+    if instruction.mnemonic in ("pushfq", "pushf"):
+        stack = tracee.registers.sp
+        size = 2 if instruction.mnemonic == "pushf" else 8
+        image = int.from_bytes(tracee.read_memory(stack, size), "little")
+        tracee.write_memory(stack, (image & ~TRAP_FLAG).to_bytes(size, "little"))
+    elif instruction.mnemonic == "syscall":
+        saved = tracee.registers.read("r11")
+        if saved & TRAP_FLAG:
+            tracee.registers.write("r11", saved & ~TRAP_FLAG)
+
+
+def return_address(tracee: Tracee) -> int:
+    """Where the function returns to at whose first instruction the target is stopped."""
+    return int.from_bytes(tracee.read_memory(tracee.registers.sp, 8), "little")
+
+
+class DebugBreakpoint:
+    """A debug register of a *stopped* thread: traps before every execution at `address`.
+
+    Intel SDM volume 3, section 18.2. A thread has four.
+
+    Args:
+        tid: the thread.
+        address: of the instruction.
+        slot: which register, 0 to 3.
+    """
+
+    def __init__(self, tid: int, address: int, slot: int = 0) -> None:
+        self._tid = tid
+        self._enabled = 1 << 2 * slot  # for the thread; type execute, length 1: zeros
+        self._taken = 3 << 2 * slot | 0xF << 16 + 4 * slot
+        self._enable(0)
+        self._poke(slot, address)
+        self._enable(self._enabled)
+
+    def close(self) -> None:
+        """Take the breakpoint away; the thread must be stopped, or gone."""
+        with contextlib.suppress(ProcessLookupError):
+            self._enable(0)
+
+    def _enable(self, bits: int) -> None:
+        others = linux.peek_user(self._tid, _DEBUG_REGISTERS + 8 * 7) & ~self._taken
+        self._poke(7, others | bits)
+
+    def _poke(self, register: int, value: int) -> None:
+        linux.request(linux.POKEUSER, self._tid, _DEBUG_REGISTERS + 8 * register, value)

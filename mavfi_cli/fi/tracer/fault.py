@@ -1,0 +1,271 @@
+"""An instruction-level fault, fully resolved: trigger x corruption, and how one is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mavfi_cli.core.errors import BitOutsideWidth, FaultError, UnknownName
+from mavfi_cli.fi import bits
+from mavfi_cli.fi.bits import Field
+from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, RegisterUse, register_kind, width_of
+from mavfi_cli.fi.tracer.image import Location
+
+E = TypeVar("E", bound=Enum)
+
+
+class Site(Enum):
+    """What kind of state a fault corrupts."""
+
+    GENERAL = "general"
+    FLAGS = "flags"
+    VECTOR = "vector"
+    X87 = "x87"
+    MASK = "mask"  # AVX-512 opmask
+    INSTRUCTION_POINTER = "instruction-pointer"
+    OPCODE = "opcode"
+    MEMORY = "memory"
+
+
+DATA_REGISTERS = frozenset((Site.GENERAL, Site.FLAGS, Site.VECTOR, Site.X87, Site.MASK))
+
+
+class Role(Enum):
+    """Whether the corrupted operand is read or written by the instruction."""
+
+    SOURCE = "source"  # corrupted before the instruction executes
+    DESTINATION = "destination"  # corrupted after the instruction has written it
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """Run until `location` is about to execute for the `count`-th time since the stage before."""
+
+    location: Location
+    count: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Corruption:
+    """Which bits of what are inverted, relative to one execution of one instruction."""
+
+    site: Site
+    role: Role
+    register: str  # full register; empty for opcode and memory
+    operand: str  # as the assembler names it
+    bits: tuple[int, ...]  # of the full register, of the opcode bytes, or of the memory operand
+    memory_operand: int = 0  # which of the instruction's memory operands
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstructionFault:
+    """One fault. The last stage of the trigger is the attacked instruction itself."""
+
+    trigger: tuple[Stage, ...]
+    execution: int  # k: how often the instruction had run in the profiled scope, counted from 1
+    instruction: str
+    instruction_bytes: bytes
+    corruption: Corruption | None  # None: null injection, everything but the flip
+
+    @property
+    def target(self) -> Location:
+        """The attacked instruction."""
+        return self.trigger[-1].location
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultModel:
+    """From which operands and bits a corruption is drawn."""
+
+    sites: frozenset[Site] = DATA_REGISTERS
+    roles: frozenset[Role] = frozenset((Role.SOURCE, Role.DESTINATION))
+    implicit: bool = True
+    field: Field = Field.ANY  # sign, exponent, mantissa: of the elements of float instructions
+    count: int = 1
+
+    @classmethod
+    def named(
+        cls, *, sites: Iterable[str], roles: Iterable[str], field: str, bits: int
+    ) -> FaultModel:
+        """From names; no site stands for the data registers, no role for both.
+
+        Raises:
+            UnknownName: a name that does not exist; names the nearest.
+        """
+        default = cls()
+        return cls(
+            sites=frozenset(_member(Site, "site", name) for name in sites) or default.sites,
+            roles=frozenset(_member(Role, "role", name) for name in roles) or default.roles,
+            field=_member(Field, "field", field),
+            count=bits,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """What is drawn from, but for the habits of compat modes."""
+        return {
+            "sites": sorted(site.value for site in self.sites),
+            "roles": sorted(role.value for role in self.roles),
+            "field": self.field.value,
+            "bits": self.count,
+        }
+
+
+def _member(kind: type[E], what: str, name: str) -> E:
+    try:
+        return kind(name)
+    except ValueError:
+        raise UnknownName(what, name, [member.value for member in kind]) from None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Candidate:
+    site: Site
+    role: Role
+    register: str
+    operand: str
+    mask: int
+    memory_operand: int = 0
+
+
+def draw_corruption(
+    instruction: Instruction, model: FaultModel, rng: np.random.Generator
+) -> Corruption | None:
+    """An operand of the instruction, uniformly, then distinct bits of it, uniformly.
+
+    Returns:
+        None where the instruction has no operand that the model allows.
+    """
+    candidates = [
+        candidate
+        for candidate in _candidates(instruction, model)
+        if candidate.mask.bit_count() >= model.count
+    ]
+    if not candidates:
+        return None
+    chosen = candidates[int(rng.integers(len(candidates)))]
+    available = bits.bits_of(chosen.mask)
+    picked = rng.choice(len(available), size=model.count, replace=False)
+    return Corruption(
+        site=chosen.site,
+        role=chosen.role,
+        register=chosen.register,
+        operand=chosen.operand,
+        bits=tuple(sorted(available[int(index)] for index in picked)),
+        memory_operand=chosen.memory_operand,
+    )
+
+
+def site_of(register: str) -> Site:
+    """The class of a full register."""
+    return Site(register_kind(register))
+
+
+def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> Corruption:
+    """A corruption that the user names.
+
+    Raises:
+        FaultError: no such register.
+        BitOutsideWidth: the register has no such bit.
+    """
+    try:
+        width = width_of(register)
+    except KeyError:
+        raise FaultError(f"no register {register!r} on this processor") from None
+    if not 0 <= bit < width:
+        raise BitOutsideWidth(bit, register, width)
+    return Corruption(
+        site=site_of(register), role=role, register=register, operand=register, bits=(bit,)
+    )
+
+
+def _candidates(instruction: Instruction, model: FaultModel) -> list[_Candidate]:
+    found: list[_Candidate] = []
+    for role, uses in (
+        (Role.SOURCE, instruction.reads),
+        (Role.DESTINATION, instruction.writes),
+    ):
+        if role in model.roles:
+            found += _registers(instruction, model, role, uses)
+            found += _memory(instruction, model, role)
+    if model.field is Field.ANY:
+        found += _control(instruction, model)
+    return found
+
+
+def _registers(
+    instruction: Instruction, model: FaultModel, role: Role, uses: tuple[RegisterUse, ...]
+) -> list[_Candidate]:
+    merged: dict[str, _Candidate] = {}
+    for use in uses:
+        site = site_of(use.register)
+        if site not in model.sites:
+            continue
+        if not (use.explicit or model.implicit):
+            continue
+        mask, operand = use.mask & _field_mask(instruction, model, site), use.operand
+        known = merged.get(use.register)
+        if known is not None:  # the flags of one instruction are one operand
+            mask, operand = mask | known.mask, use.register
+        merged[use.register] = _Candidate(
+            site=site, role=role, register=use.register, operand=operand, mask=mask
+        )
+    return [candidate for candidate in merged.values() if candidate.mask]
+
+
+def _field_mask(instruction: Instruction, model: FaultModel, site: Site) -> int:
+    if model.field is Field.ANY:
+        return -1
+    if site is not Site.VECTOR or instruction.element is None:
+        return 0
+    kind = bits.NUMPY_TYPES[instruction.element]
+    lane = bits.mask_of(kind.field_bits(model.field), kind)
+    if instruction.scalar:
+        return lane
+    return sum(lane << shift for shift in range(0, TRAITS.vector_bits, kind.width))
+
+
+def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Candidate]:
+    if Site.MEMORY not in model.sites or model.field is not Field.ANY:
+        return []
+    return [
+        _Candidate(
+            site=Site.MEMORY,
+            role=role,
+            register="",
+            operand=use.operand,
+            mask=(1 << 8 * use.size) - 1,
+            memory_operand=index,
+        )
+        for index, use in enumerate(instruction.memory)
+        if (use.reads if role is Role.SOURCE else use.writes)
+    ]
+
+
+def _control(instruction: Instruction, model: FaultModel) -> list[_Candidate]:
+    found = []
+    if Site.INSTRUCTION_POINTER in model.sites:
+        pointer = TRAITS.instruction_pointer
+        found.append(
+            _Candidate(
+                site=Site.INSTRUCTION_POINTER,
+                role=Role.DESTINATION,
+                register=pointer,
+                operand=pointer,
+                mask=(1 << width_of(pointer)) - 1,
+            )
+        )
+    if Site.OPCODE in model.sites:
+        found.append(
+            _Candidate(
+                site=Site.OPCODE,
+                role=Role.SOURCE,
+                register="",
+                operand="opcode",
+                mask=(1 << 8 * len(instruction.raw)) - 1,
+            )
+        )
+    return found

@@ -1,0 +1,246 @@
+"""Corrupt a stopped thread, prove that the corruption is there, and follow what becomes of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from enum import Enum
+
+from mavfi_cli.core.errors import FaultError
+from mavfi_cli.fi import bits
+from mavfi_cli.fi.tracer.arch import (
+    TRAITS,
+    Instruction,
+    address_of,
+    decode,
+    erase_trap,
+    width_of,
+)
+from mavfi_cli.fi.tracer.fault import Corruption, InstructionFault, Role, Site
+from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee, Trap
+
+
+class Activation(Enum):
+    """What became of the corrupted bits within the followed window."""
+
+    READ = "read"
+    OVERWRITTEN = "overwritten"
+    NOT_READ_IN_WINDOW = "not_read_in_window"
+    ENDED_BEFORE_READ = "ended_before_read"
+    NOT_FOLLOWED = "not_followed"
+    NOT_INJECTED = "not_injected"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Injection:
+    """What was done at the stop."""
+
+    applied: bool
+    reason: str  # why not applied, empty otherwise
+    address: int  # of the corrupted memory or opcode, else of the instruction
+    before: int  # the full register, the opcode bytes or the memory operand
+    after: int  # as read back
+    stop_s: float  # from the report of the stop until the thread runs on
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Followed:
+    """The activation, and the instruction that decided it."""
+
+    activation: Activation
+    after_instructions: int  # 0: the attacked instruction itself
+    instruction: str = ""
+
+
+NOTHING = Followed(activation=Activation.NOT_INJECTED, after_instructions=0)
+
+
+def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
+    """Run to the exact execution that the trigger names.
+
+    Returns:
+        Why it was not reached, or the empty string.
+    """
+    for stage in fault.trigger:
+        if not tracee.run_to(image.address(stage.location), stage.count):
+            return f"the program ended before execution {stage.count} of {stage.location}"
+    return ""
+
+
+def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
+    """Decode what the target is about to execute."""
+    try:
+        return decode(tracee.read_memory(address, 16), address)
+    except OSError:
+        return None
+
+
+def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
+    """Execute one whole instruction and leave no trace of the trap flag in the target."""
+    if instruction is not None and instruction.run_over:
+        if tracee.run_to(instruction.next_address):
+            return Trap(code=0)
+        assert tracee.ended is not None
+        return tracee.ended
+    result = tracee.step()
+    if not isinstance(result, Ended) and instruction is not None:
+        erase_trap(tracee, instruction)
+    return result
+
+
+def apply(tracee: Tracee, instruction: Instruction, corruption: Corruption) -> Injection:
+    """Invert the bits at the stop in front of `instruction`.
+
+    A destination is corrupted after the instruction has executed. The result is read back; what
+    the operating system discards or refuses is not applied.
+    """
+    start = time.perf_counter_ns()
+    place = instruction.address
+    if corruption.site is Site.MEMORY:
+        use = instruction.memory[corruption.memory_operand]
+        place = address_of(use, instruction, tracee.registers.read)
+    if corruption.role is Role.DESTINATION and isinstance(clean_step(tracee, instruction), Ended):
+        return _not_applied("the program ended in the instruction", place, 0, start)
+    try:
+        before, after = _invert(tracee, instruction, corruption, place)
+    except OSError as error:
+        return _not_applied(f"refused by the operating system: {error.strerror}", place, 0, start)
+    lost = [bit for bit in corruption.bits if not (before ^ after) >> bit & 1]
+    reason = f"discarded by the operating system: bits {lost}" if lost else ""
+    stop_s = (time.perf_counter_ns() - start) * 1e-9
+    return Injection(
+        applied=not lost, reason=reason, address=place, before=before, after=after, stop_s=stop_s
+    )
+
+
+def _not_applied(reason: str, place: int, value: int, start: int) -> Injection:
+    return Injection(
+        applied=False,
+        reason=reason,
+        address=place,
+        before=value,
+        after=value,
+        stop_s=(time.perf_counter_ns() - start) * 1e-9,
+    )
+
+
+def _invert(
+    tracee: Tracee, instruction: Instruction, corruption: Corruption, place: int
+) -> tuple[int, int]:
+    if corruption.site is Site.OPCODE:
+        return _execute_corrupted(tracee, instruction, corruption)
+    if corruption.site is Site.MEMORY:
+        size = instruction.memory[corruption.memory_operand].size
+        data = tracee.read_memory(place, size)
+        tracee.write_memory(place, bits.flip_bytes(data, corruption.bits))
+        return _number(data), _number(tracee.read_memory(place, size))
+    registers = tracee.registers
+    before = registers.read(corruption.register)
+    kind = bits.raw(width_of(corruption.register) // 8)
+    registers.write(corruption.register, bits.flip_pattern(before, corruption.bits, kind))
+    return before, registers.read(corruption.register)
+
+
+def _execute_corrupted(
+    tracee: Tracee, instruction: Instruction, corruption: Corruption
+) -> tuple[int, int]:
+    """A transient fetch error: the corrupted bytes execute once, then the code is whole again."""
+    corrupted = bits.flip_bytes(instruction.raw, corruption.bits)
+    tracee.write_memory(instruction.address, corrupted)
+    seen = tracee.read_memory(instruction.address, len(corrupted))
+    decoded = decode(tracee.read_memory(instruction.address, 16), instruction.address)
+    if not isinstance(clean_step(tracee, decoded), Ended):
+        tracee.write_memory(instruction.address, instruction.raw)
+    return _number(instruction.raw), _number(seen)
+
+
+def _number(data: bytes) -> int:
+    return int.from_bytes(data, "little")
+
+
+def follow(
+    tracee: Tracee,
+    instruction: Instruction,
+    corruption: Corruption,
+    injection: Injection,
+    *,
+    window: int,
+) -> Followed:
+    """Step on until the corrupted bits are read or overwritten, at most `window` instructions."""
+    if not injection.applied:
+        return NOTHING
+    if corruption.role is Role.SOURCE or corruption.site is Site.INSTRUCTION_POINTER:
+        return Followed(
+            activation=Activation.READ, after_instructions=0, instruction=instruction.text
+        )
+    remaining = bits.mask_of(corruption.bits, bits.raw(TRAITS.vector_bits))
+    for distance in range(1, window + 1):
+        current = instruction_at(tracee, tracee.registers.ip)
+        if current is None:
+            break
+        read, remaining = _touch(tracee, current, corruption, injection.address, remaining)
+        if read or not remaining:
+            what = Activation.READ if read else Activation.OVERWRITTEN
+            return Followed(activation=what, after_instructions=distance, instruction=current.text)
+        if isinstance(clean_step(tracee, current), Ended):
+            return Followed(activation=Activation.ENDED_BEFORE_READ, after_instructions=distance)
+    what = Activation.NOT_READ_IN_WINDOW if window else Activation.NOT_FOLLOWED
+    return Followed(activation=what, after_instructions=window)
+
+
+def strike(
+    tracee: Tracee, fault: InstructionFault, *, window: int
+) -> tuple[Injection | None, Followed]:
+    """At the stop in front of the attacked instruction: corrupt as the fault says, and follow.
+
+    Args:
+        tracee: stopped there.
+        fault: with its corruption; without one nothing is done.
+        window: how many instructions a destination fault is followed.
+
+    Raises:
+        FaultError: another instruction is at the place.
+    """
+    instruction = instruction_at(tracee, tracee.registers.ip)
+    if instruction is None or instruction.raw != fault.instruction_bytes:
+        found = "nothing" if instruction is None else instruction.text
+        raise FaultError(f"{fault.target} holds {found!r}, expected {fault.instruction!r}")
+    if fault.corruption is None:
+        return None, NOTHING
+    injection = apply(tracee, instruction, fault.corruption)
+    steps = window if tracee.ended is None else 0
+    return injection, follow(tracee, instruction, fault.corruption, injection, window=steps)
+
+
+def _touch(
+    tracee: Tracee, current: Instruction, corruption: Corruption, place: int, remaining: int
+) -> tuple[bool, int]:
+    """Whether an instruction reads the remaining bits, and which it leaves."""
+    if corruption.site is Site.MEMORY:
+        return _touch_memory(tracee, current, place, remaining)
+    register = corruption.register
+    for use in current.reads:
+        if use.register == register and use.mask & remaining:
+            return True, remaining
+    for use in current.writes:
+        if use.register == register:
+            remaining &= ~use.clears
+    return False, remaining
+
+
+def _touch_memory(
+    tracee: Tracee, current: Instruction, place: int, remaining: int
+) -> tuple[bool, int]:
+    for reads in (True, False):
+        for use in current.memory:
+            if not (use.reads if reads else use.writes):
+                continue
+            start = address_of(use, current, tracee.registers.read) - place
+            mask = (1 << 8 * use.size) - 1
+            mask = mask << 8 * min(start, 64) if start >= 0 else mask >> min(-8 * start, 1024)
+            if mask & remaining:
+                if reads:
+                    return True, remaining
+                remaining &= ~mask
+    return False, remaining

@@ -1,0 +1,166 @@
+"""The fault record: one JSON file that says what is going to be hit, then what was hit.
+
+It is written and flushed to the disk *before* the target runs to the trigger, so that it
+survives whatever the fault does, and completed afterwards. Each write leaves the old file or
+the new one, never half of one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.core.errors import BuildMismatch, RecordError
+from mavfi_cli.core.files import write_text
+from mavfi_cli.fi.tracer.fault import Corruption, InstructionFault, Role, Site, Stage
+from mavfi_cli.fi.tracer.image import Image, Location
+from mavfi_cli.fi.tracer.inject import Followed, Injection
+
+VERSION = 1
+
+
+def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, Any]:
+    """The record before the flip.
+
+    Args:
+        fault: as drawn.
+        image: of the process, for symbols and build ids.
+        context: what else belongs in it: seed, sampling rule, scope, kernel, program, run.
+    """
+    target = fault.target
+    return {
+        "version": VERSION,
+        "state": "planned",
+        "level": "instruction",
+        "object": target.object,
+        "offset": target.offset,
+        "symbol": image.symbol(target),
+        "instruction": fault.instruction,
+        "instruction_bytes": fault.instruction_bytes.hex(),
+        "k": fault.execution,
+        "trigger": [
+            {"object": s.location.object, "offset": s.location.offset, "count": s.count}
+            for s in fault.trigger
+        ],
+        "corruption": corruption_to_json(fault.corruption),
+        "build_ids": {
+            name: image.named(name).build_id
+            for name in sorted({stage.location.object for stage in fault.trigger})
+        },
+        **context,
+    }
+
+
+def corruption_to_json(corruption: Corruption | None) -> dict[str, Any] | None:
+    """The corruption part of a record; null for a null injection."""
+    if corruption is None:
+        return None
+    return {
+        "site": corruption.site.value,
+        "role": corruption.role.value,
+        "register": corruption.register,
+        "operand": corruption.operand,
+        "bits": list(corruption.bits),
+        "memory_operand": corruption.memory_operand,
+    }
+
+
+def completed(
+    record: Mapping[str, Any], injection: Injection | None, followed: Followed, **result: Any
+) -> dict[str, Any]:
+    """The record after the run; `injection` is None where the trigger was not reached."""
+    what: dict[str, Any] = {"applied": False}
+    if injection is not None:
+        what = {
+            "applied": injection.applied,
+            "reason": injection.reason,
+            "address": injection.address,
+            "before": hex(injection.before),
+            "after": hex(injection.after),
+            "stop_s": injection.stop_s,
+        }
+    activation = {
+        "activation": followed.activation.value,
+        "after_instructions": followed.after_instructions,
+        "instruction": followed.instruction,
+    }
+    return {**record, "state": "completed", "injection": what, "activation": activation, **result}
+
+
+def fault_of(record: Mapping[str, Any]) -> InstructionFault:
+    """The fault that a record describes, to repeat it.
+
+    Raises:
+        RecordError: not a fault record, or one of another version.
+    """
+    if record.get("version") != VERSION:
+        raise RecordError(f"not a fault record of version {VERSION}")
+    try:
+        corruption = record["corruption"]
+        return InstructionFault(
+            trigger=tuple(
+                Stage(Location(stage["object"], stage["offset"]), stage["count"])
+                for stage in record["trigger"]
+            ),
+            execution=record["k"],
+            instruction=record["instruction"],
+            instruction_bytes=bytes.fromhex(record["instruction_bytes"]),
+            corruption=None if corruption is None else corruption_of(corruption),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordError(f"the fault record is damaged: {error!r}") from None
+
+
+def corruption_of(data: Mapping[str, Any]) -> Corruption:
+    """The corruption part of a record, read back."""
+    return Corruption(
+        site=Site(data["site"]),
+        role=Role(data["role"]),
+        register=data["register"],
+        operand=data["operand"],
+        bits=tuple(data["bits"]),
+        memory_operand=data["memory_operand"],
+    )
+
+
+def require_same_build(record: Mapping[str, Any], image: Image) -> None:
+    """Refuse a record whose objects are not the loaded ones.
+
+    Raises:
+        BuildMismatch: names each object that is missing or of another build.
+    """
+    differences = []
+    for name, build_id in record["build_ids"].items():
+        loaded = image.find(name)
+        if loaded is None:
+            differences.append(f"{name} is not loaded")
+        elif loaded.build_id != build_id:
+            differences.append(f"{name} has build id {loaded.build_id}, recorded is {build_id}")
+    if differences:
+        raise BuildMismatch(differences)
+
+
+def write(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a record and flush it to the disk before returning.
+
+    Raises:
+        RecordError: the file cannot be written.
+    """
+    write_text(path, json.dumps(record, indent=1) + "\n")
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a record.
+
+    Raises:
+        RecordError: no such file, or not a fault record.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RecordError(f"{path}: {error}") from None
+    if not isinstance(record, dict) or "trigger" not in record:
+        raise RecordError(f"{path}: not a fault record")
+    return record

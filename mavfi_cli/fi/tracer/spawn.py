@@ -1,0 +1,128 @@
+"""Start a program under the tracer, stopped at its first instruction or its entry point."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.breakpoints import Mechanism
+from mavfi_cli.fi.tracer.tracee import ENTRY_ADDRESS, Tracee, best_mechanism
+
+# The shell says that it runs (so that its own exec is over) and waits for one line (so that the
+# tracer is attached before the program starts).
+# No core files, and no endless output of a corrupted program (in blocks of 512 bytes).
+_LAUNCHER = (
+    "ulimit -c 0; ulimit -f 2097152; echo >&3 && read -r go <&3 && "
+    'cd -- "$1" && shift && exec "$@" 3<&-'
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """A program as it is started: fixed addresses, fixed environment, output in files."""
+
+    argv: tuple[str, ...]
+    directory: Path
+    environment: tuple[tuple[str, str], ...]
+    stdin: Path = Path(os.devnull)
+
+    @classmethod
+    def of(
+        cls,
+        argv: Sequence[str],
+        *,
+        directory: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+        stdin: Path = Path(os.devnull),
+    ) -> Command:
+        """A command with its program found on the path.
+
+        Raises:
+            TargetError: no such program, or it cannot be executed.
+        """
+        found = shutil.which(argv[0])
+        if found is None:
+            raise TargetError(argv[0], "no such program, or it is not executable")
+        chosen = os.environ if environment is None else environment
+        return cls(
+            argv=(str(Path(found).resolve()), *argv[1:]),
+            directory=(directory or Path.cwd()).resolve(),
+            environment=tuple(sorted(chosen.items())),
+            stdin=stdin,
+        )
+
+
+def spawn(
+    command: Command, *, stdout: Path, stderr: Path, mechanism: Mechanism | None = None
+) -> Tracee:
+    """Start a program without address randomisation, stopped before its first instruction.
+
+    Raises:
+        TracingForbidden: the operating system refuses to trace.
+        TargetError: the program cannot be executed.
+    """
+    ours, theirs = socket.socketpair()
+    with ours:
+        with theirs:
+            pid = _launch(command, stdout, stderr, theirs.fileno())
+        tracee = Tracee(pid, pid, -pid, mechanism or best_mechanism())
+        with contextlib.ExitStack() as undo:
+            undo.callback(os.waitpid, pid, 0)
+            undo.callback(os.kill, pid, signal.SIGKILL)
+            if not ours.recv(1):
+                raise TargetError(command.argv[0], "the launching shell could not start")
+            linux.seize(pid, kill_with_tracer=True)
+            ours.send(b"\n")
+            undo.pop_all()
+    _await_exec(tracee, command)
+    return tracee
+
+
+def run_to_entry(tracee: Tracee) -> bool:
+    """Run to the program's entry point, where its shared libraries are mapped.
+
+    Returns:
+        False if the program ended before (a library is missing).
+    """
+    entry = linux.auxiliary(tracee.pid, ENTRY_ADDRESS)
+    return entry is not None and tracee.run_to(entry)
+
+
+def _launch(command: Command, stdout: Path, stderr: Path, channel: int) -> int:
+    truncate = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+    actions = [
+        (os.POSIX_SPAWN_OPEN, 0, str(command.stdin), os.O_RDONLY, 0),
+        (os.POSIX_SPAWN_OPEN, 1, str(stdout), truncate, 0o644),
+        (os.POSIX_SPAWN_OPEN, 2, str(stderr), truncate, 0o644),
+        (os.POSIX_SPAWN_DUP2, channel, 3),
+    ]
+    arguments = ["sh", "-c", _LAUNCHER, "sh", str(command.directory), *command.argv]
+    with linux.fixed_addresses():
+        return os.posix_spawn(
+            "/bin/sh",
+            arguments,
+            dict(command.environment),
+            file_actions=actions,
+            setsid=True,
+            setsigmask=[],
+            setsigdef=[signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT],
+        )
+
+
+def _await_exec(tracee: Tracee, command: Command) -> None:
+    while True:
+        status = linux.wait(tracee.pid)
+        if status.ended:
+            raise TargetError(command.argv[0], "cannot be executed")
+        if status.event == linux.EVENT_EXEC:
+            return
+        number = status.signal if status.event == 0 else 0
+        linux.request(linux.CONT, tracee.pid, 0, number)

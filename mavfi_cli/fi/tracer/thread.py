@@ -1,0 +1,98 @@
+"""Work beside a running process: a thread that traces it, a counter that does not stop it.
+
+Ptrace obeys only the thread that attached.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from mavfi_cli.fi.tracer.breakpoints import ExecutionCounter, Mechanism
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee, best_mechanism
+
+T = TypeVar("T")
+
+
+class TracerThread(Generic[T]):
+    """Work that traces a node, in a thread of its own: ptrace belongs to a thread.
+
+    Args:
+        work: gets a function to call once the node runs towards what is awaited.
+    """
+
+    def __init__(self, work: Callable[[Callable[[], None]], T]) -> None:
+        self._armed = threading.Event()
+        self._result: list[T] = []
+        self._error: BaseException | None = None
+
+        def run() -> None:
+            """The thread's whole life."""
+            try:
+                self._result.append(work(self._armed.set))
+            except BaseException as error:  # the thread's boundary: who awaits it raises it again
+                self._error = error
+            finally:
+                self._armed.set()
+
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+
+    def await_armed(self) -> None:
+        """Wait until the node runs towards what is awaited; raises what went wrong before."""
+        self._armed.wait()
+        if self._error is not None:
+            raise self._error
+
+    def result(self) -> T:
+        """Wait for the end of the work, and raise what it raised."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._result[0]
+
+
+class EntryCounter:
+    """Counts the executions of one instruction of a running node, which goes on meanwhile.
+
+    Where the operating system does not count, a tracer stops at each; the count is right whenever
+    the node has answered all the same, since it answers after its last stop.
+
+    Args:
+        pid: the node; closing the counter may end it.
+        address: of the instruction.
+    """
+
+    def __init__(self, pid: int, address: int) -> None:
+        self._pid, self._address, self._stops = pid, address, 0
+        self._counter: ExecutionCounter | None = None
+        self._tracer: TracerThread[None] | None = None
+        if best_mechanism() is Mechanism.PERF:
+            self._counter = ExecutionCounter(pid, address)
+        else:
+            self._tracer = TracerThread(self._count)
+            self._tracer.await_armed()
+
+    def read(self) -> int:
+        """Executions since the counter was made."""
+        return self._stops if self._counter is None else self._counter.read()
+
+    def close(self) -> None:
+        """Take the counter away, and with it a node that had to be traced."""
+        if self._counter is not None:
+            self._counter.close()
+        if self._tracer is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGKILL)
+            self._tracer.result()
+
+    def _count(self, armed: Callable[[], None]) -> None:
+        tracee = Tracee.attach(self._pid)
+        tracee.breakpoint_at(self._address)
+        armed()
+        while not isinstance(tracee.resume(), Ended):
+            self._stops += tracee.registers.ip == self._address

@@ -1,0 +1,357 @@
+"""One traced process: start or attach, stop exactly, step, resume, and hear how it ended.
+
+Every thread and child of the process is traced, so that none outlives the tracer; the *target*
+thread is the one that is stopped and corrupted, the others keep running. There is no sleep and
+no polling: each step waits for the kernel's report. All methods must be called from the thread
+that attached.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from dataclasses import dataclass, field
+
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.alarm import Alarm
+from mavfi_cli.fi.tracer.arch import DebugBreakpoint, Registers
+from mavfi_cli.fi.tracer.breakpoints import (
+    SI_KERNEL,
+    TRAP_BRKPT,
+    TRAP_HWBKPT,
+    TRAP_PERF,
+    TRAP_TRACE,
+    ExecutionCounter,
+    Mechanism,
+    PerfBreakpoint,
+    perf_allowed,
+)
+
+_TRACER_TRAPS = frozenset((TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL))
+_NOT_FROM_OTHERS = 0x2000_0000  # __WNOTHREAD: only tracees and children of this thread
+_ANY_CHILD = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ended:
+    """How a process ended: exactly one of the two is set."""
+
+    exit_code: int | None
+    signal: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trap:
+    """The target thread stopped by a trap of ours."""
+
+    code: int  # si_code: TRAP_TRACE, TRAP_PERF, ...
+
+
+@dataclass(slots=True)
+class Tracee:
+    """A traced process whose target thread is stopped between calls."""
+
+    pid: int
+    tid: int
+    group: int  # what waitpid waits for: -process group, or any child of this thread
+    mechanism: Mechanism = Mechanism.PERF
+    ended: Ended | None = None
+    signals: list[int] = field(default_factory=list)  # delivered to the process, in order
+    registers: Registers = field(init=False)
+    _pending_signal: int = 0
+    _interrupting: bool = False
+    _expecting_alarm: bool = False
+    _memory: int = -1  # file descriptor of the process's memory
+
+    def __post_init__(self) -> None:
+        self.registers = Registers(self.tid)
+
+    @classmethod
+    def attach(
+        cls, pid: int, *, tid: int | None = None, mechanism: Mechanism | None = None
+    ) -> Tracee:
+        """Attach to every thread of a running process and stop its target thread.
+
+        The attaching thread must have no other children that somebody else waits for.
+
+        Args:
+            pid: the process.
+            tid: the target thread; default the main thread.
+            mechanism: how executions are counted; default the best that is allowed.
+
+        Raises:
+            TracingForbidden: the operating system refuses.
+            TargetError: no such process.
+        """
+        seized: set[int] = set()
+        while missing := [t for t in linux.threads_of(pid) if t not in seized]:
+            for thread in missing:
+                # It may have ended between the listing and the attach.
+                with contextlib.suppress(ProcessLookupError):
+                    linux.seize(thread, kill_with_tracer=True)
+                seized.add(thread)
+        if not seized:
+            raise TargetError(f"process {pid}", "does not exist")
+        tracee = cls(pid, tid or pid, _ANY_CHILD, mechanism or best_mechanism())
+        tracee.interrupt()
+        return tracee
+
+    def interrupt(self) -> None:
+        """Stop the running target thread wherever it is, without disturbing a system call."""
+        linux.request(linux.INTERRUPT, self.tid)
+        self._interrupting = True
+        self._await()
+        self._interrupting = False
+
+    def step(self) -> Trap | Ended:
+        """Execute one instruction (one iteration of a repeated string instruction)."""
+        return self._go(linux.SINGLESTEP)
+
+    def resume(self) -> Trap | Ended:
+        """Run until a trap of ours stops the target thread, or to the end."""
+        return self._go(linux.CONT)
+
+    def resume_until_alarm(self, alarm: Alarm) -> Trap | Ended:
+        """Run until `alarm` sends its SIGTRAP; that signal is not delivered to the program."""
+        self._expecting_alarm = True
+        try:
+            with alarm:
+                return self.resume()
+        finally:
+            self._expecting_alarm = False
+
+    def release(self) -> None:
+        """Let the stopped target thread run without waiting for it."""
+        self.registers.forget()
+        linux.request(linux.CONT, self.tid, 0, self._take_signal())
+
+    def run_to(self, address: int, count: int = 1) -> bool:
+        """Run until the target thread is about to execute `address` for the `count`-th time.
+
+        An execution that the thread is stopped in front of counts as the first.
+
+        Returns:
+            False if the process ended before.
+        """
+        self.registers.rearm()
+        if self.mechanism is Mechanism.PERF:
+            return self._run_to_counted(address, count)
+        return self._run_to_stepwise(address, count)
+
+    def count_to_end(self, address: int) -> int:
+        """Run to the end of the program and count the executions of `address` on the way."""
+        self.registers.rearm()
+        if self.mechanism is Mechanism.PERF:
+            counter = ExecutionCounter(self.tid, address)
+            try:
+                while not isinstance(self.resume(), Ended):
+                    pass
+                return counter.read()
+            finally:
+                counter.close()
+        count = 0
+        breakpoint_ = self.breakpoint_at(address)
+        try:
+            while not isinstance(self.resume(), Ended):
+                count += self.registers.ip == address
+            return count
+        finally:
+            breakpoint_.close()
+
+    def breakpoint_at(self, address: int) -> PerfBreakpoint | DebugBreakpoint:
+        """A breakpoint that stops at the next execution of `address`, until it is closed."""
+        if self.mechanism is Mechanism.PERF:
+            return PerfBreakpoint(self.tid, address, 1)
+        return DebugBreakpoint(self.tid, address)
+
+    def read_memory(self, address: int, size: int) -> bytes:
+        """Bytes of the process's memory, whatever their protection.
+
+        Raises:
+            OSError: nothing is mapped there.
+        """
+        return os.pread(self._memory_file(), size, address)
+
+    def write_memory(self, address: int, data: bytes) -> None:
+        """Write the process's memory; a private copy of a file's page is made by the kernel.
+
+        Raises:
+            OSError: nothing is mapped there.
+        """
+        os.pwrite(self._memory_file(), data, address)
+
+    def _memory_file(self) -> int:
+        if self._memory < 0:
+            self._memory = os.open(f"/proc/{self.pid}/mem", os.O_RDWR | os.O_CLOEXEC)
+        return self._memory
+
+    def _close_memory(self) -> None:
+        if self._memory >= 0:
+            os.close(self._memory)
+            self._memory = -1
+
+    def detach(self) -> None:
+        """Let the process go on without a tracer; the target thread must be stopped."""
+        self._close_memory()
+        for thread in linux.threads_of(self.pid):
+            if thread != self.tid:
+                self._detach_running(thread)
+        linux.request(linux.DETACH, self.tid, 0, self._take_signal())
+
+    def kill(self) -> Ended:
+        """End the process now, with what it started itself, and wait until all is gone."""
+        if self.ended is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+            self._await_end()
+        if self.group < _ANY_CHILD:
+            self._kill_descendants()
+        assert self.ended is not None
+        return self.ended
+
+    def _kill_descendants(self) -> None:
+        """A program that was started by us has a process group of its own."""
+        try:
+            os.killpg(-self.group, signal.SIGKILL)
+            while True:
+                os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS)
+        except (ProcessLookupError, ChildProcessError):
+            return
+
+    # -- waiting
+
+    def _go(self, how: int) -> Trap | Ended:
+        self.registers.forget()
+        linux.request(how, self.tid, 0, self._take_signal())
+        return self._await(how)
+
+    def _take_signal(self) -> int:
+        number, self._pending_signal = self._pending_signal, 0
+        if number:
+            self.signals.append(number)
+        return number
+
+    def _await(self, how: int = linux.CONT) -> Trap | Ended:
+        """Handle reports until the target thread stops for us or the process ends."""
+        return self.handle(self._wait(), how)
+
+    def handle(self, status: linux.Status, how: int) -> Trap | Ended:
+        """Act on a report, and on all that follow, until the target stops for us or it ends.
+
+        Args:
+            status: the first report.
+            how: the request that the target goes on with after a passing stop.
+        """
+        while True:
+            if status.ended:
+                if self._note_end(status):
+                    assert self.ended is not None
+                    return self.ended
+            elif status.tid == self.tid:
+                trap = self._target_stopped(status)
+                if trap is not None:
+                    return trap
+                self._continue(status, how)
+            else:
+                self._continue(status, linux.CONT)
+            status = self._wait()
+
+    def _wait(self) -> linux.Status:
+        found, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS)
+        return linux.Status(found, raw)
+
+    def _note_end(self, status: linux.Status) -> bool:
+        if status.tid != self.pid:
+            return False
+        self._close_memory()
+        if os.WIFSIGNALED(status.raw):
+            self.ended = Ended(exit_code=None, signal=os.WTERMSIG(status.raw))
+        else:
+            self.ended = Ended(exit_code=os.WEXITSTATUS(status.raw), signal=None)
+        return True
+
+    def _await_end(self) -> None:
+        while self.ended is None:
+            try:
+                status = self._wait()
+            except ChildProcessError:
+                self.ended = Ended(exit_code=None, signal=signal.SIGKILL)
+                return
+            if status.ended:
+                self._note_end(status)
+            else:
+                self._continue(status, linux.CONT)
+
+    def _target_stopped(self, status: linux.Status) -> Trap | None:
+        """The trap that the caller waits for, or None if this stop is only passing."""
+        if status.event == linux.EVENT_STOP:
+            return Trap(code=TRAP_BRKPT) if self._interrupting else None
+        if status.trapped:
+            code = linux.signal_info(self.tid).code
+            if self._expecting_alarm and code <= 0:  # sent by a process
+                return Trap(code=code)
+            return Trap(code=code) if code in _TRACER_TRAPS else None
+        if self._interrupting and status.event == 0:
+            # A signal came first. It is delivered when the thread goes on; the interrupt is
+            # still pending and would stop the thread again: consume it now.
+            self._pending_signal = status.signal
+            self._interrupting = False
+            return Trap(code=TRAP_BRKPT)
+        return None
+
+    def _continue(self, status: linux.Status, how: int) -> None:
+        """Let a thread go on from a stop that concerns nobody; signals are delivered."""
+        if status.event == linux.EVENT_STOP and status.signal != signal.SIGTRAP:
+            how, number = linux.LISTEN, 0  # group-stop: stay stopped until SIGCONT
+        else:
+            number = status.signal if status.event == 0 else 0
+        if number:
+            self.signals.append(number)
+        # Killed meanwhile? Then its end is reported next.
+        with contextlib.suppress(ProcessLookupError):
+            linux.request(how, status.tid, 0, number)
+
+    def _detach_running(self, thread: int) -> None:
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):
+            linux.request(linux.INTERRUPT, thread)
+            status = linux.wait(thread)
+            number = status.signal if status.stopped and status.event == 0 else 0
+            linux.request(linux.DETACH, thread, 0, number)
+
+    # -- counted stops
+
+    def _run_to_counted(self, address: int, count: int) -> bool:
+        try:
+            breakpoint_ = PerfBreakpoint(self.tid, address, count)
+        except OSError:
+            self.mechanism = Mechanism.DEBUG
+            return self._run_to_stepwise(address, count)
+        try:
+            while True:
+                if isinstance(self.resume(), Ended):
+                    return False
+                if self.registers.ip == address:
+                    return True
+        finally:
+            breakpoint_.close()
+
+    def _run_to_stepwise(self, address: int, count: int) -> bool:
+        breakpoint_ = DebugBreakpoint(self.tid, address)
+        try:
+            while count:
+                if isinstance(self.resume(), Ended):
+                    return False
+                count -= self.registers.ip == address
+            return True
+        finally:
+            breakpoint_.close()
+
+
+def best_mechanism() -> Mechanism:
+    """The best counting mechanism that this machine allows."""
+    return Mechanism.PERF if perf_allowed() is None else Mechanism.DEBUG
+
+
+ENTRY_ADDRESS = 9  # AT_ENTRY of the auxiliary vector

@@ -1,0 +1,82 @@
+"""Native programs; inputs of the kernels, recorded once, and a campaign on them."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from native_programs import native_program, start  # noqa: F401
+
+from mavfi_cli.attack.campaign import run_campaign
+from mavfi_cli.attack.kernels.inputs import load_inputs, save_inputs
+from mavfi_cli.attack.kernels.target import KernelTarget
+from mavfi_cli.attack.plan import Plan
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.kernel_inputs import record_inputs
+
+
+@pytest.fixture(scope="session")
+def tracing():
+    """Skips where nothing can be traced."""
+    import platform
+
+    if platform.machine() != "x86_64":
+        pytest.skip("instruction-level injection does not know this processor")
+    from mavfi_cli.fi.tracer.doctor import check_tracing
+
+    problem = check_tracing().problem
+    if problem:
+        pytest.skip(problem)
+
+
+@pytest.fixture(scope="session")
+def kernel_inputs(tmp_path_factory) -> Path:
+    """A file of kernel inputs, from a flight round a row of boxes."""
+    folder = tmp_path_factory.mktemp("inputs")
+    world = folder / "posts.toml"
+    world.write_text(
+        'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
+        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
+        "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
+    )
+    path = folder / "inputs.pickle"
+    save_inputs(path, record_inputs(MissionConfig(world=str(world), seed=2, stack="hardened")))
+    return path
+
+
+@pytest.fixture(scope="session")
+def attack(tracing, kernel_inputs):
+    """Function that runs a campaign on those inputs."""
+    inputs, sha256 = load_inputs(kernel_inputs)
+
+    def run(*kernels, runs=10, jobs=1, folder=None, seed=5, tolerance=0.0, **changes):
+        plan = Plan(runs=runs, seed=seed, **changes)
+        targets = [
+            KernelTarget(
+                kernel=kernel, inputs=kernel_inputs, inputs_sha256=sha256, flight=inputs.flight,
+                tolerance=tolerance,
+            )
+            for kernel in kernels
+        ]  # fmt: skip
+        return plan, run_campaign(plan, targets, jobs=jobs, folder=folder)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def control_folder(tmp_path_factory, kernel_inputs):
+    """The folder of the campaign on the controller; copy it before you change it."""
+    folder = tmp_path_factory.mktemp("control")
+    (folder / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    return folder
+
+
+@pytest.fixture(scope="session")
+def control_campaign(attack, control_folder):
+    """Thirty faults in the controller."""
+    return attack("control", runs=30, folder=control_folder)
+
+
+@pytest.fixture
+def control_copy(control_campaign, control_folder, tmp_path):
+    """A copy of that campaign's folder."""
+    return Path(shutil.copytree(control_folder, tmp_path / "control"))

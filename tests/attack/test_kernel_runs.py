@@ -1,0 +1,234 @@
+"""Isolated campaigns on our own kernels: repeatable, resumable, tolerant, told in full."""
+
+import csv
+import io
+import json
+from functools import partial
+
+import pytest
+
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels import target as kernel_target
+from mavfi_cli.attack.kernels.difference import pack
+from mavfi_cli.attack.kernels.inputs import load_inputs
+from mavfi_cli.attack.profile import profile_run
+from mavfi_cli.attack.replay import replay_runs
+from mavfi_cli.attack.summary import KERNEL_COLUMNS, csv_rows, summarise, table
+from mavfi_cli.attack.target import digest
+from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
+from mavfi_cli.core.files import write_json
+from mavfi_cli.report.kernel_plot import write_kernel_plot
+
+OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
+
+
+def untimed(runs):
+    """Records without what only says how long things took."""
+    records = json.loads(json.dumps(runs.records))
+    for entry in records:
+        del entry["run_s"]
+        entry["injection"].pop("stop_s", None)
+    return records
+
+
+def test_the_number_of_workers_changes_nothing(attack, control_campaign):
+    _, (control,) = control_campaign
+    _, (cloud,) = attack("point_cloud", runs=12)
+    _, together = attack("control", "point_cloud", runs=12, jobs=2)
+    for alone, two in zip((control, cloud), together, strict=True):
+        assert untimed(two) == untimed(alone)[:12]
+        assert {entry["outcome"] for entry in two.records} <= OUTCOMES
+        assert any(entry["injection"]["applied"] for entry in two.records)
+
+
+def test_the_golden_run_is_the_kernel_itself(control_campaign, kernel_inputs):
+    _, (runs,) = control_campaign
+    call = catalogue.find("control").prepare(load_inputs(kernel_inputs)[0])
+    assert runs.golden.sha256 == digest(pack(call()))
+
+
+def test_a_fault_depends_on_its_number_only(attack, control_campaign):
+    _, (many,) = control_campaign
+    _, (few,) = attack("control", runs=5)
+    assert untimed(few) == untimed(many)[:5]
+
+
+def test_other_seeds_draw_other_faults(attack, control_campaign):
+    _, (many,) = control_campaign
+    _, (other,) = attack("control", runs=5, seed=6)
+    assert [e["corruption"] for e in other.records] != [e["corruption"] for e in many.records[:5]]
+
+
+def test_a_campaign_that_was_cut_off_goes_on(attack, control_campaign, control_copy):
+    _, (first,) = control_campaign
+    lines = (control_copy / "runs.jsonl").read_text().splitlines(keepends=True)
+    (control_copy / "runs.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
+    _, (second,) = attack("control", runs=8, folder=control_copy)
+    assert [entry["run"] for entry in second.records] == list(range(8))
+    assert untimed(second) == untimed(first)[:8]
+    took = [entry["run_s"] for entry in first.records]
+    assert [entry["run_s"] for entry in second.records[:3]] == took[:3]
+
+
+def test_another_campaign_is_not_mixed_in(attack, control_copy):
+    with pytest.raises(ConfigError, match=r"another campaign; it differs in \['tolerance'\]"):
+        attack("control", runs=1, folder=control_copy, tolerance=0.5)
+
+
+@pytest.mark.parametrize(
+    ("kernels", "runs", "problem"),
+    [
+        (("control",), 29, "holds 30 runs already, 29 are asked for: ask for at least as many"),
+        (("point_cloud",), 30, "holds runs of control as well: name every kernel that it has"),
+    ],
+)
+def test_what_was_measured_is_never_left_out(attack, control_copy, kernels, runs, problem):
+    before = {path.name: path.read_bytes() for path in control_copy.iterdir()}
+    with pytest.raises(ConfigError, match=problem):
+        attack(*kernels, runs=runs, folder=control_copy)
+    assert {path.name: path.read_bytes() for path in control_copy.iterdir()} == before
+
+
+def test_more_runs_and_kernels_go_on_from_fewer(attack, control_campaign, control_copy):
+    _, (first,) = control_campaign
+    _, (control, cloud) = attack("control", "point_cloud", runs=31, folder=control_copy)
+    assert list(control.records[:30]) == list(first.records)
+    assert (len(control.records), len(cloud.records)) == (31, 31)
+
+
+def test_recorded_runs_repeat(control_copy):
+    replays = list(replay_runs(control_copy, ("control",)))
+    assert [replay.differs for replay in replays] == [()] * 30
+    line = json.loads((control_copy / "runs.jsonl").read_text().splitlines()[0])
+    line["output_sha256"] = "0"
+    (control_copy / "runs.jsonl").write_text(json.dumps(line) + "\n")
+    (replay,) = replay_runs(control_copy)
+    assert replay.differs == ("output_sha256",)
+
+
+def test_runs_of_a_program_are_not_replayed_as_kernels(tmp_path):
+    write_json(tmp_path / "plan.json", {"program": ["a.out"]})
+    with pytest.raises(RecordError, match="runs of a program"):
+        list(replay_runs(tmp_path))
+
+
+def test_runs_of_other_code_are_not_replayed(control_copy):
+    plan = json.loads((control_copy / "plan.json").read_text())
+    write_json(control_copy / "plan.json", plan | {"sources": "of another version"})
+    with pytest.raises(BuildMismatch, match="our own code"):
+        list(replay_runs(control_copy))
+
+
+def test_nothing_to_replay_is_an_error(tmp_path):
+    with pytest.raises(RecordError, match=r"plan\.json"):
+        list(replay_runs(tmp_path))
+
+
+def test_tolerance_makes_small_corruption_benign(attack, control_campaign):
+    _, (strict,) = control_campaign
+    _, (lenient,) = attack("control", runs=30, tolerance=1e300)
+    changed = 0
+    for before, after in zip(strict.records, lenient.records, strict=True):
+        size = before["magnitude"]["relative"] if before["outcome"] == "sdc" else None
+        if size is None:
+            assert after["outcome"] == before["outcome"]
+        else:
+            changed += 1
+            assert (after["outcome"], after["within_tolerance"]) == ("benign", True)
+            assert after["magnitude"]["relative"] == size > 0.0
+    assert changed
+
+
+def test_null_injections_are_benign(attack):
+    _, (runs,) = attack("point_cloud", runs=5, null=True)
+    assert {entry["outcome"] for entry in runs.records} == {"benign"}
+    assert {entry["injection"]["applied"] for entry in runs.records} == {False}
+
+
+def test_time_rules_say_what_they_missed(attack):
+    plan, (runs,) = attack("point_cloud", runs=6, rule="cpu-time")
+    for entry in runs.records:
+        assert (entry["outcome"] == "not_injected") == bool(entry["not_injected_reason"])
+    (kernel,) = summarise(plan, [runs])["kernels"]
+    assert kernel["complete"] is None
+
+
+def test_the_planner_is_attacked_in_its_own_library(attack):
+    _, (runs,) = attack("rrtconnect", runs=10)
+    assert {entry["object"] for entry in runs.records} <= {"libompl.so", "numba:segment_free"}
+    assert runs.profile.complete
+
+
+def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
+    monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
+    (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
+    start, windows = runs.profile.strata
+    assert start.marker is None
+    assert (len(windows.segments), windows.complete) == (3, False)
+    hit = {runs.profile.window_of(entry) for entry in runs.records} - {None}
+    assert hit <= {(1, segment.start[0].count) for segment in windows.segments}
+    assert len(hit) > 1
+    (kernel,) = summarise(plan, [runs])["kernels"]
+    count = windows.windows_in_run
+    assert f"by sample: the beginning, 3 of {count} windows from collide" in kernel["population"]
+    assert all(not replay.differs for replay in replay_runs(tmp_path))
+
+
+def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
+    plan, campaign = control_campaign
+    summary = summarise(plan, campaign)
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    (kernel,) = summary["kernels"]
+    assert set(kernel["outcomes"]) == OUTCOMES
+    assert sum(row["count"] for row in kernel["outcomes"].values()) == kernel["runs"] == 30
+    assert sum(kernel["crashes"].values()) == kernel["outcomes"]["crash"]["count"]
+    for row in kernel["outcomes"].values():
+        low, high = row["wilson95"]
+        assert 0.0 <= low <= row["share"] <= high <= 1.0
+    text = table(summary)
+    assert "sampling: instruction-uniform" in text
+    assert "PID: all" in text
+    rows = list(
+        csv.reader(
+            io.StringIO("\n".join(",".join(r[:4]) for r in csv_rows(KERNEL_COLUMNS, campaign)))
+        )
+    )
+    assert rows[0] == KERNEL_COLUMNS[:4]
+    assert len(rows) == 31
+    for name in ("one.svg", "two.svg"):
+        write_kernel_plot(summary, tmp_path / name)
+    assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
+    assert "PID" in (tmp_path / "one.svg").read_text()
+
+
+def test_an_unknown_kernel_names_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'octomap'"):
+        catalogue.select(["octomp"])
+
+
+def test_kernels_come_in_the_order_of_the_pipeline():
+    assert catalogue.select(["control", "point_cloud"]) == ("point_cloud", "control")
+    assert len(catalogue.select([])) == 7
+
+
+def test_inputs_of_something_else_are_refused(tmp_path):
+    path = tmp_path / "inputs.pickle"
+    path.write_bytes(b"nothing of the kind")
+    with pytest.raises(RecordError, match="not a file of kernel inputs"):
+        load_inputs(path)
+
+
+def test_the_command_line_refuses_what_makes_no_sense(mavfi):
+    asked = mavfi("kernels", "--kernel", "contrl", "--runs", "1")
+    assert asked.returncode == 2
+    assert asked.stderr.startswith("error: unknown kernel 'contrl': did you mean 'control'?")
+    assert mavfi("kernels", "--args", "5").returncode == 2
+    assert mavfi("kernels", "--program", "/bin/true", "--kernel", "rrt").returncode == 2
+    for option in (["--json"], ["--seed", "1"], ["--program", "/bin/true"]):
+        asked = mavfi("kernels", "--replay", ".", *option)
+        assert asked.returncode == 2
+        assert f"error: {option[0]} goes without --replay" in asked.stderr
+    asked = mavfi("kernels", "--kernel", "control", "--sampling", "instruction")
+    assert asked.returncode == 2
+    assert "instruction-uniform" in asked.stderr

@@ -1,0 +1,417 @@
+"""Outcomes that are known, faults that repeat, records that refuse another build."""
+
+import csv
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from mavfi_cli.attack.attacker import Attacker, golden_run
+from mavfi_cli.attack.campaign import run_campaign
+from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.outcome import Outcome, design_effect, shares, wilson
+from mavfi_cli.attack.plan import Plan
+from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.attack.summary import PROGRAM_COLUMNS, csv_rows, summarise_program
+from mavfi_cli.attack.target import RunLimits, digest
+from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
+from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.arch import decode
+from mavfi_cli.fi.tracer.breakpoints import Mechanism
+from mavfi_cli.fi.tracer.fault import (
+    DATA_REGISTERS,
+    FaultModel,
+    InstructionFault,
+    Role,
+    Site,
+    Stage,
+    explicit_corruption,
+)
+from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer.inject import Activation
+from mavfi_cli.fi.tracer.spawn import Command
+
+QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
+
+
+def attacked(program, jobs=1, folder=None, **plan):
+    """All runs of a campaign on one program."""
+    (runs,) = run_campaign(Plan(**plan), [program], jobs=jobs, folder=folder)
+    return runs
+
+
+@pytest.fixture
+def target(native_program):
+    def make(name, *arguments, **options):
+        command = Command.of([str(native_program(name)), *arguments])
+        options.setdefault("comparison", OutputComparison())
+        return ProgramTarget(command=command, limits=QUICK, **options)
+
+    return make
+
+
+@pytest.fixture
+def workplace():
+    places = []
+
+    def make(target):
+        places.append(Workplace(target))
+        return places[-1]
+
+    yield make
+    for place in places:
+        place.close()
+
+
+def victim_fault(place, target, bit):
+    """Bit of r10 right after the victim's `mov ..., %r10`."""
+    tracee = place.start()
+    image = Image(tracee.pid)
+    here = image.function("victim", [target.name])
+    address = image.address(here)
+    while True:
+        instruction = decode(tracee.read_memory(address, 16), address)
+        if any(use.register == "r10" for use in instruction.writes):
+            break
+        address = instruction.next_address
+    tracee.kill()
+    return InstructionFault(
+        trigger=(Stage(image.locate(address), 1),),
+        execution=1,
+        instruction=instruction.text,
+        instruction_bytes=instruction.raw,
+        corruption=explicit_corruption("r10", bit, Role.DESTINATION),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "bit", "outcome"),
+    [
+        ("benign", 5, Outcome.BENIGN),
+        ("crash", 62, Outcome.CRASH),
+        ("hang", 3, Outcome.HANG),
+        ("sdc", 4, Outcome.SDC),
+    ],
+)
+def test_programs_of_known_outcome(target, workplace, name, bit, outcome):
+    program = target(name)
+    place = workplace(program)
+    attacker = Attacker(place=place, golden=golden_run(place))
+    fault = victim_fault(place, program, bit)
+    for _ in range(2 if outcome is Outcome.HANG else 5):
+        result = attacker.run(fault)
+        assert result.outcome is outcome
+        assert result.injection.applied
+        assert result.injection.before ^ result.injection.after == 1 << bit
+    if outcome is Outcome.CRASH:
+        assert result.signal == 11
+    if outcome is Outcome.SDC:
+        assert result.verdict.details["magnitude"] == pytest.approx((23 - 7) / 7)
+
+
+def test_a_tolerance_makes_small_differences_benign(target, workplace):
+    program = target("sdc", comparison=OutputComparison(tolerance=3.0))
+    place = workplace(program)
+    attacker = Attacker(place=place, golden=golden_run(place))
+    result = attacker.run(victim_fault(place, program, 4))
+    assert result.outcome is Outcome.BENIGN
+    assert result.verdict.details["magnitude"] > 0.0
+
+
+def test_the_same_fault_gives_the_same_output_20_times(target, workplace):
+    program = target("counting", "60")
+    place = workplace(program)
+    attacker = Attacker(place=place, golden=golden_run(place))
+    campaign = attacked(program, runs=12, seed=8)
+    entry = next(entry for entry in campaign.records if entry["outcome"] == "sdc")
+    results = [attacker.run(record.fault_of(entry)) for _ in range(20)]
+    assert {r.verdict.output_sha256 for r in results} == {entry["output_sha256"]}
+    assert {(hex(r.injection.before), hex(r.injection.after)) for r in results} == {
+        (entry["injection"]["before"], entry["injection"]["after"])
+    }
+
+
+@pytest.mark.parametrize("sites", [DATA_REGISTERS, frozenset((Site.MEMORY,))])
+def test_what_was_overwritten_before_it_was_read_is_benign(target, sites):
+    """The fate that is told and the outcome that is seen are found out independently."""
+    model = FaultModel(roles=frozenset((Role.DESTINATION,)), sites=sites)
+    campaign = attacked(target("sorting"), runs=80, seed=3, model=model)
+    fates = {
+        (Activation(entry["activation"]["activation"]), Outcome(entry["outcome"]))
+        for entry in campaign.records
+        if entry["activation"]["activation"] == Activation.OVERWRITTEN.value
+    }
+    expected = set() if sites != DATA_REGISTERS else {(Activation.OVERWRITTEN, Outcome.BENIGN)}
+    assert fates - {(Activation.OVERWRITTEN, Outcome.BENIGN)} == set()
+    assert fates >= expected
+    assert {entry["outcome"] for entry in campaign.records} > {"benign"}
+
+
+def test_a_null_injection_changes_nothing(target):
+    campaign = attacked(target("counting", "60"), runs=10, seed=2, null=True)
+    assert {entry["outcome"] for entry in campaign.records} == {"benign"}
+    golden = digest(campaign.golden.output)
+    assert {entry["output_sha256"] for entry in campaign.records} == {golden}
+
+
+def test_workers_draw_disjoint_streams_and_do_not_change_the_result(target):
+    program = target("counting", "30")
+    alone, together = (attacked(program, jobs=jobs, runs=24, seed=4) for jobs in (1, 2))
+
+    def essence(campaign):
+        return [
+            (entry["run"], record.fault_of(entry), entry["outcome"], entry["output_sha256"])
+            for entry in campaign.records
+        ]
+
+    assert essence(alone) == essence(together)
+    assert len({record.fault_of(entry) for entry in alone.records}) > 20
+
+
+def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplace):
+    program = target("counting", "5")
+    place = workplace(program)
+    attacker = Attacker(place=place, golden=golden_run(place))
+    (entry,) = attacked(target("counting", "60"), runs=1, seed=1).records
+    fault = record.fault_of(entry)
+    late = InstructionFault(
+        trigger=(Stage(fault.target, 100_000),),
+        execution=100_000,
+        instruction=fault.instruction,
+        instruction_bytes=fault.instruction_bytes,
+        corruption=fault.corruption,
+    )
+    result = attacker.run(late)
+    assert result.outcome is Outcome.NOT_INJECTED
+    assert "ended before execution 100000 of counting+0x" in result.reason
+    assert result.followed.activation is Activation.NOT_INJECTED
+
+
+def test_another_instruction_at_the_place_is_refused(target, workplace):
+    program = target("sdc")
+    place = workplace(program)
+    attacker = Attacker(place=place, golden=golden_run(place))
+    fault = victim_fault(place, program, 1)
+    other = InstructionFault(
+        trigger=fault.trigger,
+        execution=1,
+        instruction="nop",
+        instruction_bytes=b"\x90",
+        corruption=fault.corruption,
+    )
+    with pytest.raises(FaultError, match="expected 'nop'"):
+        attacker.run(other)
+
+
+def test_sampled_invocations_say_that_they_are_a_sample(target, workplace):
+    program = target("counting", "50", function="body")
+    profiled = workplace(program).profile(np.random.default_rng(3), windows=4)
+    (stratum,) = profiled.strata
+    assert (len(stratum.segments), stratum.windows_in_run, stratum.complete) == (4, 50, False)
+    campaign = attacked(program, runs=6, seed=5, windows=4)
+    assert campaign.profile.windows == "4 of 50"
+    hit = {campaign.profile.window_of(entry) for entry in campaign.records}
+    starts = {segment.start[0].count for segment in campaign.profile.strata[0].segments}
+    assert hit <= {(0, number) for number in starts}
+    assert len(hit) > 1
+    assert {entry["symbol"].split("+")[0] for entry in campaign.records} == {"body"}
+
+
+def test_debug_registers_give_the_same_faults_and_outcomes(target):
+    """Where counted breakpoints are forbidden nothing but the time changes."""
+
+    def essence(mechanism):
+        program = target("counting", "12", function="body", mechanism=mechanism)
+        campaign = attacked(program, runs=10, seed=5, windows=3)
+        return [
+            (record.fault_of(entry), entry["outcome"], entry["output_sha256"])
+            for entry in campaign.records
+        ]
+
+    assert essence(Mechanism.PERF) == essence(Mechanism.DEBUG)
+
+
+@pytest.mark.parametrize("options", [{"rule": "cpu-time"}, {"compat": "rosfi-2021"}])
+def test_time_rules_name_themselves_and_count_what_they_miss(target, options):
+    campaign = attacked(target("counting", "400000"), runs=8, seed=6, **options)
+    summary = summarise_program(Plan(runs=8, seed=6, **options), campaign)["summary"]
+    assert summary["sampling"].startswith(next(iter(options.values())))
+    assert sum(row["count"] for row in summary["outcomes"].values()) == 8
+    for entry in campaign.records:
+        injected = entry["outcome"] != "not_injected"
+        assert injected == (not entry["not_injected_reason"])
+        if injected and "compat" in options:
+            assert set(entry["corruption"]["bits"]) <= set(range(8))
+            assert entry["corruption"]["operand"] not in ("rax", "eax", "rsp", "rip")
+
+
+def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_program):
+    native_program("counting")
+    script = tmp_path / "random"
+    script.write_text("#!/bin/sh\nod -An -N8 -tx8 /dev/urandom\n")
+    script.chmod(0o755)
+    program = ProgramTarget(command=Command.of([str(script)]), comparison=OutputComparison())
+    place = Workplace(program)
+    with pytest.raises(TargetError, match="fault-free runs differ"):
+        golden_run(place)
+    place.close()
+
+
+# -- records
+
+
+def test_a_record_survives_and_gives_the_fault_back(target, tmp_path):
+    plan = Plan(runs=5, seed=9)
+    (campaign,) = run_campaign(plan, [target("counting", "30")], folder=tmp_path)
+    planned = [json.loads(line) for line in (tmp_path / "faults.jsonl").read_text().splitlines()]
+    for before, entry in zip(planned, campaign.records, strict=True):
+        assert before["state"] == "planned"
+        path = tmp_path / "fault.json"
+        record.write(path, entry)
+        again = record.read(path)
+        rng = generator(9, Stream.FAULT, entry["run"])
+        drawn = campaign.profile.draw(plan.strategy(), rng)
+        assert record.fault_of(again) == record.fault_of(before) == drawn
+        assert again["object"] == "counting"
+        assert again["symbol"]
+        assert again == entry
+
+
+def test_a_campaign_that_was_cut_off_goes_on(target, tmp_path):
+    def go_on(runs, seed=9):
+        return attacked(target("counting", "30"), folder=tmp_path, runs=runs, seed=seed).records
+
+    first = go_on(6)
+    lines = (tmp_path / "runs.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "runs.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
+    second = go_on(8)
+    assert [entry["run"] for entry in second] == list(range(8))
+    assert second[:3] == first[:3]
+    assert [entry["outcome"] for entry in second[:6]] == [entry["outcome"] for entry in first]
+    with pytest.raises(ConfigError, match="holds 8 runs already, 7 are asked for"):
+        go_on(7)
+    with pytest.raises(ConfigError, match=r"another campaign; it differs in \['seed'\]"):
+        go_on(8, seed=10)
+
+
+def test_a_record_of_another_build_is_refused(target, start):
+    campaign = attacked(target("counting", "30"), runs=1, seed=9)
+    written = campaign.records[0]
+    image = Image(start("counting").pid)
+    record.require_same_build(written, image)
+    changed = {**written, "build_ids": {"counting": "0123", "libgone.so": "45"}}
+    with pytest.raises(BuildMismatch) as caught:
+        record.require_same_build(changed, image)
+    assert "counting has build id" in str(caught.value)
+    assert "libgone.so is not loaded" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"a": 1}'])
+def test_a_file_that_is_no_record_is_a_clear_error(tmp_path, text):
+    path = tmp_path / "fault.json"
+    path.write_text(text)
+    with pytest.raises(RecordError, match=r"fault\.json"):
+        record.read(path)
+
+
+def test_a_damaged_record_is_a_clear_error():
+    with pytest.raises(RecordError, match="damaged"):
+        record.fault_of({"version": 1, "trigger": [{}], "corruption": None})
+    with pytest.raises(RecordError, match="version 1"):
+        record.fault_of({"version": 99})
+
+
+# -- numbers
+
+
+@pytest.mark.parametrize(("count", "total"), [(0, 10), (3, 10), (10, 10), (84, 1000)])
+def test_wilson_against_scipy(count, total):
+    from scipy.stats import binomtest
+
+    ours = wilson(count, total)
+    theirs = binomtest(count, total).proportion_ci(method="wilson")
+    assert ours.low == pytest.approx(theirs.low, abs=1e-12)
+    assert ours.high == pytest.approx(theirs.high, abs=1e-12)
+
+
+def test_not_injected_runs_are_no_part_of_the_other_shares():
+    result = shares([Outcome.SDC, Outcome.BENIGN, Outcome.NOT_INJECTED, Outcome.NOT_INJECTED])
+    assert (result[Outcome.SDC].share, result[Outcome.SDC].total) == (0.5, 2)
+    assert (result[Outcome.NOT_INJECTED].share, result[Outcome.NOT_INJECTED].total) == (0.5, 4)
+    assert math.isnan(wilson(0, 0).share)
+
+
+def test_runs_of_a_window_count_less_the_more_they_are_alike():
+    """Against the spread of the share over repeated samples of windows and of runs in them."""
+    rng = np.random.default_rng(4)
+    chances = rng.beta(0.5, 0.5, size=5000)  # of a crash, window by window
+
+    def campaign():
+        drawn = rng.choice(chances, size=20)
+        windows = rng.integers(20, size=400)
+        return rng.random(400) < drawn[windows], [("f", int(window)) for window in windows]
+
+    campaigns = [campaign() for _ in range(300)]
+    spread = np.var([hits.mean() for hits, _ in campaigns])
+    binomial = chances.mean() * (1.0 - chances.mean()) / 400
+    effects = [design_effect(hits.tolist(), windows) for hits, windows in campaigns]
+    assert spread / binomial > 5.0
+    assert np.mean(effects) == pytest.approx(spread / binomial, rel=0.2)
+
+
+def test_independent_runs_count_in_full():
+    rng = np.random.default_rng(5)
+    hits = (rng.random(400) < 0.3).tolist()
+    assert design_effect(hits, [None] * 400) == pytest.approx(1.0, abs=0.01)
+    strata = [(number % 2, number) for number in range(400)]
+    assert design_effect(hits, strata) == pytest.approx(1.0, abs=0.02)
+    assert design_effect([True] * 9, [("f", 1)] * 9) == 1.0
+    half = [Outcome.SDC, Outcome.BENIGN] * 50
+    alone = shares(half)[Outcome.SDC]
+    alike = shares(half, [("f", number % 2) for number in range(100)])[Outcome.SDC]
+    assert alike.share == alone.share == 0.5
+    assert alike.high - alike.low > 2.0 * (alone.high - alone.low)
+
+
+# -- command
+
+
+def test_the_command_writes_a_table_json_and_csv(native_program, tmp_path):
+    from mavfi_cli.cli.kernels import kernels
+
+    arguments = ["--program", str(native_program("counting")), "--args", "30", "--runs", "8"]
+    result = CliRunner().invoke(kernels, [*arguments, "--out", str(tmp_path), "--json"])
+    assert result.exit_code == 0, result.output
+    saved = json.loads((tmp_path / "kernels.json").read_text())
+    assert len(saved["runs"]) == 8
+    assert saved["summary"]["sampling"] == "instruction-uniform"
+    rows = list(csv.reader((tmp_path / "kernels.csv").read_text().splitlines()))
+    assert len(rows) == 9
+    assert rows[0][:2] == ["run", "outcome"]
+    assert [row[1] for row in rows[1:]] == [run["outcome"] for run in saved["runs"]]
+
+
+def test_the_table_names_outcomes_and_signals(native_program, tmp_path):
+    from mavfi_cli.cli.kernels import kernels
+
+    arguments = ["--program", str(native_program("counting")), "--args", "30", "--runs", "40"]
+    result = CliRunner().invoke(kernels, [*arguments, "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert [line[:14].rstrip() for line in lines[:6]] == [
+        "outcome", "benign", "crash", "hang", "SDC", "not injected",
+    ]  # fmt: skip
+    (crashes,) = (line for line in lines if line.startswith("crashes: "))
+    assert re.search(r"\bSIG[A-Z]+ \d+", crashes)
+    assert lines[-1] == f"Files  {tmp_path}: kernels.json, kernels.csv, runs.jsonl"
+
+
+def test_csv_has_a_value_for_every_column(target):
+    campaign = attacked(target("counting", "30"), runs=3, seed=1)
+    header, *rows = csv_rows(PROGRAM_COLUMNS, [campaign])
+    assert all(len(row) == len(header) for row in rows)
+    assert all(row[header.index("instruction")] for row in rows)

@@ -1,0 +1,3 @@
+"""The small native programs that are traced."""
+
+from native_programs import native_program, start  # noqa: F401

@@ -1,0 +1,118 @@
+"""What a fault model draws: operands, fields, roles, and the habits of compat modes."""
+
+import platform
+from collections import Counter
+
+import numpy as np
+import pytest
+
+if platform.machine() != "x86_64":
+    pytest.skip("x86-64 only", allow_module_level=True)
+
+from mavfi_cli.fi.bits import Field
+from mavfi_cli.fi.tracer.arch import decode
+from mavfi_cli.fi.tracer.fault import FaultModel, Role, Site, draw_corruption
+from mavfi_cli.fi.tracer.sampling import strategy
+
+
+def of(code):
+    return decode(bytes.fromhex(code).ljust(16, b"\x90"), 0x1000)
+
+
+def drawn(instruction, model, count=300, seed=1):
+    rng = np.random.default_rng(seed)
+    return [draw_corruption(instruction, model, rng) for _ in range(count)]
+
+
+ADD = of("01c3")  # add ebx, eax
+ADDSD = of("f20f58c1")  # addsd xmm0, xmm1
+VADDPD = of("c5fd58c1")  # vaddpd ymm0, ymm0, ymm1
+
+
+def test_operands_are_equally_likely():
+    counts = Counter((c.role, c.register) for c in drawn(ADD, FaultModel(), 4000))
+    assert set(counts) == {
+        (Role.SOURCE, "rax"),
+        (Role.SOURCE, "rbx"),
+        (Role.DESTINATION, "rbx"),
+        (Role.DESTINATION, "rflags"),
+    }
+    assert all(abs(count - 1000) < 5 * np.sqrt(750) for count in counts.values())
+
+
+def test_bits_stay_inside_the_operand_and_cover_it():
+    bits = {c.bits[0] for c in drawn(ADD, FaultModel(sites=frozenset((Site.GENERAL,))), 1500)}
+    assert bits == set(range(32))
+
+
+def test_flags_are_those_that_the_instruction_writes():
+    model = FaultModel(sites=frozenset((Site.FLAGS,)))
+    assert {c.bits[0] for c in drawn(ADD, model)} == {0, 2, 4, 6, 7, 11}
+
+
+def test_roles_can_be_restricted():
+    model = FaultModel(roles=frozenset((Role.DESTINATION,)))
+    assert {c.role for c in drawn(ADD, model)} == {Role.DESTINATION}
+
+
+def test_implicit_operands_can_be_left_out():
+    multiply = of("48f7e1")  # mul rcx
+    assert {c.register for c in drawn(multiply, FaultModel(implicit=False))} == {"rcx"}
+    assert {c.register for c in drawn(multiply, FaultModel())} == {"rax", "rcx", "rdx", "rflags"}
+
+
+@pytest.mark.parametrize(
+    ("field", "lane"), [(Field.SIGN, {63}), (Field.EXPONENT, set(range(52, 63)))]
+)
+def test_a_field_of_a_scalar_double(field, lane):
+    assert {c.bits[0] for c in drawn(ADDSD, FaultModel(field=field))} == lane
+
+
+def test_a_field_of_packed_doubles_is_in_every_lane():
+    bits = {c.bits[0] for c in drawn(VADDPD, FaultModel(field=Field.SIGN), 100)}
+    assert bits == {63, 127, 191, 255}
+
+
+def test_an_instruction_without_the_field_is_not_drawn():
+    assert drawn(ADD, FaultModel(field=Field.EXPONENT), 1) == [None]
+
+
+def test_several_bits_are_distinct():
+    for corruption in drawn(ADDSD, FaultModel(count=3), 50):
+        assert len(set(corruption.bits)) == 3
+
+
+def test_sites_beyond_data_registers_are_asked_for():
+    model = FaultModel(sites=frozenset((Site.OPCODE, Site.INSTRUCTION_POINTER, Site.MEMORY)))
+    push = of("50")
+    seen = {c.site for c in drawn(push, model)}
+    assert seen == {
+        Site.OPCODE,
+        Site.INSTRUCTION_POINTER,
+        Site.MEMORY,
+    }
+    assert all(c.bits[0] < 8 for c in drawn(push, model) if c.site is Site.OPCODE)
+    assert all(c.bits[0] < 64 for c in drawn(push, model) if c.site is Site.MEMORY)
+
+
+def test_rosfi_2021_hits_the_low_byte_of_few_registers():
+    plan = strategy("wall-clock", compat="rosfi-2021")
+    rng = np.random.default_rng(3)
+    hits = [hit for _ in range(200) if (hit := plan.draw_at(ADDSD, rng)) is not None]
+    assert len(hits) == 200
+    assert {hit.bits[0] for hit in hits} == set(range(8))
+    mov = of("4889c7")  # mov rdi, rax
+    assert all(plan.draw_at(mov, rng) is None for _ in range(50))
+    high = of("4d01c1")  # add r9, r8
+    assert {plan.draw_at(high, rng).operand for _ in range(50)} == {"r8", "r9"}
+
+
+def test_the_flags_of_an_instruction_are_one_operand():
+    add = decode(bytes.fromhex("4801d8"), 0)  # add rax, rbx
+    model = FaultModel(sites=frozenset((Site.FLAGS,)))
+    rng = np.random.default_rng(1)
+    found = [draw_corruption(add, model, rng) for _ in range(200)]
+    assert {(c.operand, c.register, c.role) for c in found} == {
+        ("rflags", "rflags", Role.DESTINATION)
+    }
+    assert {c.bits for c in found} == {(bit,) for bit in (0, 2, 4, 6, 7, 11)}

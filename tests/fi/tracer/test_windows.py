@@ -1,0 +1,190 @@
+"""The profile is the truth about what executed, and every trigger drawn from it is exact."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from mavfi_cli.core.errors import FaultError, UnknownName
+from mavfi_cli.fi.tracer.breakpoints import ExecutionCounter, Mechanism
+from mavfi_cli.fi.tracer.fault import FaultModel, Site
+from mavfi_cli.fi.tracer.image import Image, scope_of
+from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
+from mavfi_cli.fi.tracer.sampling import draw_fault, strategy
+from mavfi_cli.fi.tracer.tracee import Ended
+from mavfi_cli.fi.tracer.windows import Segment, WindowTooLong, plan_trigger, record_window
+
+
+def profile_of(start, name, *arguments, limit=100_000):
+    tracee = start(name, *arguments)
+    image = Image(tracee.pid)
+    scope = scope_of(image, [name])
+    return record_window(tracee, scope, limit=limit, program=name), image, scope
+
+
+def stepped_in_python(start, name, *arguments):
+    """The slow twin: every instruction of the process, also out of scope, one by one."""
+    tracee = start(name, *arguments)
+    scope = scope_of(Image(tracee.pid), [name])
+    trace = []
+    while True:
+        here = tracee.registers.ip
+        if here in scope:
+            trace.append(here)
+        if isinstance(clean_step(tracee, instruction_at(tracee, here)), Ended):
+            return trace
+
+
+@pytest.mark.parametrize("name", ["sorting", "destinations"])
+def test_the_profile_equals_stepping_everything(start, tmp_path, name):
+    trace, _, _ = profile_of(start, name)
+    output = (tmp_path / "stdout").read_text()
+    assert trace.tolist() == stepped_in_python(start, name)
+    assert (tmp_path / "stdout").read_text() == output != ""
+
+
+def test_counts_equal_the_kernels_own(start):
+    trace, _, _ = profile_of(start, "sorting")
+    counts = Counter(trace.tolist())
+    for address in list(counts)[:: max(1, len(counts) // 8)]:
+        tracee = start("sorting")
+        tracee.registers.rearm()
+        try:
+            counter = ExecutionCounter(tracee.tid, address)
+        except OSError as error:
+            pytest.skip(f"perf_event_open is not allowed here: {error}")
+        tracee.resume()
+        assert counter.read() == counts[address]
+        counter.close()
+
+
+def test_a_function_window_ends_with_its_return(start):
+    tracee = start("counting", "50")
+    image = Image(tracee.pid)
+    body = image.address(image.function("body", ["counting"]))
+    assert tracee.run_to(body, 7)
+    window = record_window(
+        tracee, scope_of(image, ["counting"]), limit=1000, program="", until_return=True
+    )
+    assert window[0] == body
+    assert (window == body).sum() == 1
+    assert image.symbol(image.locate(tracee.registers.ip)).startswith("main+")
+    assert tracee.run_to(body, 1)
+    assert tracee.registers.read("rdi") == 7
+
+
+@pytest.mark.parametrize("mechanism", list(Mechanism))
+def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism):
+    tracee = start("sorting", mechanism=mechanism)
+    image = Image(tracee.pid)
+    compare = image.address(image.function("compare", ["sorting"]))
+    assert tracee.run_to(compare, 2)
+    window = record_window(
+        tracee, scope_of(image, ["sorting"]), limit=1000, program="", until_return=True
+    )
+    assert window[0] == compare
+    assert image.locate(tracee.registers.ip).object.startswith("libc")
+    assert tracee.run_to(compare, 1)
+
+
+def test_a_window_that_is_too_long_is_refused(start):
+    with pytest.raises(WindowTooLong, match="more than 100 instructions in scope; name a function"):
+        profile_of(start, "counting", "1000", limit=100)
+
+
+def test_every_trigger_stops_before_its_execution(start):
+    trace, image, _ = profile_of(start, "counting", "60")
+    segment = Segment(start=(), trace=trace)
+    indices = np.random.default_rng(5).integers(len(trace), size=12)
+    for index in map(int, indices):
+        trigger, k = plan_trigger(segment, index, image.locate)
+        assert k == int((trace[: index + 1] == trace[index]).sum())
+        tracee = start("counting", "60")
+        for stage in trigger:
+            assert tracee.run_to(image.address(stage.location), stage.count)
+        rest = record_window(
+            tracee, scope_of(image, ["counting"]), limit=100_000, program="counting"
+        )
+        assert np.array_equal(rest, trace[index:])
+
+
+def test_a_two_level_trigger_counts_less():
+    """An outer instruction every 1000 executions of an inner one."""
+    trace = np.array(([1] + [2, 3] * 1000) * 20, np.int64)
+    segment = Segment(start=(), trace=trace)
+    index = 2001 * 15 + 9
+    trigger, k = plan_trigger(segment, index, lambda address: address)
+    assert k == 15 * 1000 + int(np.sum(trace[2001 * 15 : index + 1] == trace[index]))
+    assert [(stage.location, stage.count) for stage in trigger] == [(1, 16), (int(trace[index]), 5)]
+
+
+def test_ranks_count_executions():
+    trace = np.random.default_rng(2).integers(0, 5, 300)
+    seen = Counter()
+    expected = []
+    for address in trace.tolist():
+        seen[address] += 1
+        expected.append(seen[address])
+    assert Segment(start=(), trace=trace).ranks.tolist() == expected
+
+
+def test_faults_are_uniform_over_executed_instructions(start):
+    """Chi-square of the drawn addresses against the profile's counts."""
+    from scipy.stats import chisquare
+
+    from mavfi_cli.fi.tracer.windows import Stratum
+
+    trace, image, _ = profile_of(start, "counting", "40")
+    tracee = start("counting", "40")
+    plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
+    profile = Stratum(segments=(Segment(start=(), trace=trace),), windows_in_run=1)
+    rng = np.random.default_rng(11)
+    drawn = Counter(
+        image.address(
+            draw_fault(
+                profile,
+                plan,
+                rng,
+                code_at=lambda address: tracee.read_memory(address, 16),
+                locate=image.locate,
+            ).target
+        )
+        for _ in range(3000)
+    )
+    counts = Counter(trace.tolist())
+    frequent = [address for address, count in counts.items() if count >= 40]
+    observed = [drawn[address] for address in frequent]
+    expected = np.array([counts[address] for address in frequent], float)
+    expected *= sum(observed) / expected.sum()
+    assert chisquare(observed, expected).pvalue > 1e-3
+    share = sum(counts[a] for a in frequent) / len(trace)
+    assert abs(sum(observed) / 3000 - share) < 5 * np.sqrt(share * (1 - share) / 3000)
+
+
+def test_unknown_rules_objects_and_functions_name_the_nearest(start):
+    with pytest.raises(UnknownName, match="did you mean 'cpu-time'"):
+        strategy("cpu-tim")
+    with pytest.raises(UnknownName, match="did you mean 'rosfi-2021'"):
+        strategy("wall-clock", compat="rosfi-2020")
+    image = Image(start("counting").pid)
+    with pytest.raises(UnknownName, match="did you mean 'counting'"):
+        scope_of(image, ["countin"])
+    with pytest.raises(UnknownName, match="did you mean 'body'"):
+        image.function("bodi", ["counting"])
+
+
+def test_a_scope_without_a_matching_operand_is_an_error(start):
+    from mavfi_cli.fi.tracer.windows import Stratum
+
+    trace, image, _ = profile_of(start, "sorting")
+    tracee = start("sorting")
+    profile = Stratum(segments=(Segment(start=(), trace=trace),), windows_in_run=1)
+    plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.MASK,))))
+    with pytest.raises(FaultError, match="no executed instruction in scope has an operand"):
+        draw_fault(
+            profile,
+            plan,
+            np.random.default_rng(0),
+            code_at=lambda address: tracee.read_memory(address, 16),
+            locate=image.locate,
+        )

@@ -1,0 +1,204 @@
+"""Small native programs for the injector, compiled once a session."""
+
+import shutil
+import subprocess
+
+import pytest
+
+SOURCES = {
+    # Writes what it reads from standard input, and its double; prints a time. args: the files.
+    "writing": """
+#include <stdio.h>
+#include <time.h>
+int main(int c, char **v) {
+    double x = 7; struct timespec now; clock_gettime(CLOCK_REALTIME, &now);
+    if (scanf("%lf", &x) < 0) x = 7;
+    for (int i = 1; i < c; i++) {
+        FILE *f = fopen(v[i], "w"); fprintf(f, "%g %g\\n", x, 2 * x); fclose(f);
+    }
+    printf("Time = %ld.%09ld\\nx = %g\\n", (long) now.tv_sec, now.tv_nsec, x);
+    return 0;
+}""",
+    # A loop whose counter is an argument of the called function; arg: iterations.
+    "counting": """
+#include <stdio.h>
+#include <stdlib.h>
+volatile long sink; double sum;
+__attribute__((noinline)) void body(long i) { sink = i; sum += 1.0 / (i + 1); }
+int main(int c, char **v) {
+    long n = c > 1 ? atol(v[1]) : 100;
+    for (long i = 0; i < n; i++) body(i);
+    printf("%ld %.17g\\n", sink, sum);
+    return 0;
+}""",
+    # Callbacks from libc into the program; every comparison is in scope.
+    "sorting": """
+#include <stdio.h>
+#include <stdlib.h>
+volatile long calls;
+static int compare(const void *a, const void *b) {
+    calls++; return *(const int *)a - *(const int *)b;
+}
+int main(void) {
+    int v[] = {9, 3, 7, 1, 8, 2};
+    qsort(v, 6, sizeof *v, compare);
+    for (int i = 0; i < 6; i++) printf("%d ", v[i]);
+    printf("%ld\\n", calls);
+    return 0;
+}""",
+    # Stops at `here` with everything under our control; the tests write what they need.
+    "sleeper": """
+#include <stdio.h>
+#include <time.h>
+int main(void) {
+    struct timespec t = {0, 150000000};
+    printf("%d\\n", nanosleep(&t, 0));
+    return 0;
+}""",
+    "threads": """
+#include <pthread.h>
+#include <stdio.h>
+volatile long sink; static long total[3];
+static void *work(void *p) { for (int i = 0; i < 1000; i++) ++*(long *)p; return 0; }
+__attribute__((noinline)) void body(long i) { sink = i; }
+int main(void) {
+    pthread_t t[3];
+    for (int i = 0; i < 3; i++) pthread_create(&t[i], 0, work, &total[i]);
+    for (long i = 0; i < 20; i++) body(i);
+    for (int i = 0; i < 3; i++) pthread_join(t[i], 0);
+    printf("%ld\\n", total[0] + total[1] + total[2] + sink);
+    return 0;
+}""",
+    # Handles its own signals, the tracer's favourite one included.
+    "signals": """
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+static volatile sig_atomic_t seen;
+static void handle(int number) {
+    seen += number;
+    if (number == SIGSEGV) { puts("caught"); exit(0); }
+}
+__attribute__((noinline)) void body(long i) { raise(i % 2 ? SIGUSR1 : SIGTRAP); }
+int main(void) {
+    signal(SIGUSR1, handle); signal(SIGTRAP, handle); signal(SIGSEGV, handle);
+    for (long i = 0; i < 6; i++) body(i);
+    printf("%d\\n", (int)seen);
+    *(volatile int *)0 = 1;
+    return 1;
+}""",
+    # Starts a child that outlives it.
+    "parent": """
+#include <stdio.h>
+#include <unistd.h>
+#include <sys/wait.h>
+int main(void) {
+    if (fork() == 0) return 3;
+    int status; wait(&status);
+    pid_t left = fork();
+    if (left == 0) { pause(); return 0; }
+    printf("%d %d\\n", WEXITSTATUS(status), left);
+    return 0;
+}""",
+    # Known outcomes: `victim` is the attacked function.
+    "benign": """
+#include <stdio.h>
+__attribute__((noinline)) void victim(void) { __asm__ volatile("mov $1, %%r10" ::: "r10"); }
+int main(void) { victim(); puts("done"); return 0; }""",
+    "crash": """
+#include <stdio.h>
+int value = 1;
+__attribute__((noinline)) int victim(void) {
+    int r; int *p = &value;
+    __asm__ volatile("mov %1, %%r10\\n\\tmov (%%r10), %0" : "=r"(r) : "r"(p) : "r10");
+    return r;
+}
+int main(void) { printf("%d\\n", victim()); return 0; }""",
+    "hang": """
+#include <stdio.h>
+__attribute__((noinline)) void victim(void) {
+    __asm__ volatile("mov $0, %%r10\\n1:\\ttest %%r10, %%r10\\n\\tjne 1b" ::: "r10", "cc");
+}
+int main(void) { victim(); puts("done"); return 0; }""",
+    "sdc": """
+#include <stdio.h>
+__attribute__((noinline)) long victim(void) {
+    long r; __asm__ volatile("mov $7, %%r10\\n\\tmov %%r10, %0" : "=r"(r) :: "r10"); return r;
+}
+int main(void) { printf("%ld\\n", victim()); return 0; }""",
+    # One labelled instruction of each kind whose destination must not be lost.
+    "destinations": r"""
+#include <stdio.h>
+char from[64] = "0123456789abcdefghijklmnopqrstuvwxyz", into[64];
+long cell = 0x1122;
+__attribute__((naked, noinline)) void parade(void) {
+    __asm__ volatile(
+        ".globl at_mov\nat_mov:  mov $5, %rax\n"
+        ".globl at_add\nat_add:  add $3, %rax\n"
+        ".globl at_load\nat_load: mov cell(%rip), %rcx\n"
+        "push $77\n"
+        ".globl at_pop\nat_pop:  pop %rdx\n"
+        ".globl at_call\nat_call: call 1f\n1: add $8, %rsp\n"
+        "lea from(%rip), %rsi\nlea into(%rip), %rdi\nmov $36, %rcx\n"
+        ".globl at_movs\nat_movs: rep movsb\n"
+        ".globl at_store\nat_store: movl $9, cell(%rip)\n"
+        ".globl at_pushf\nat_pushf: pushfq\n"
+        ".globl at_popf\nat_popf: popfq\n"
+        "ret\n");
+}
+int main(void) { parade(); printf("%s %ld\n", into, cell); return 0; }""",
+}
+
+
+@pytest.fixture(scope="session")
+def native_program(tmp_path_factory):
+    """Function from a program's name to its compiled path."""
+    compiler = shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("gcc is not installed")
+    reason = tracing_problem()
+    if reason:
+        pytest.skip(reason)
+    folder = tmp_path_factory.mktemp("native")
+
+    def build(name):
+        path = folder / name
+        if not path.exists():
+            source = folder / f"{name}.c"
+            source.write_text(SOURCES[name])
+            subprocess.run([compiler, "-O1", "-pthread", "-o", str(path), str(source)], check=True)
+        return path
+
+    return build
+
+
+def tracing_problem():
+    """Why nothing can be traced here, or None."""
+    import platform
+
+    if platform.machine() != "x86_64":
+        return f"instruction-level injection does not know {platform.machine()}"
+    from mavfi_cli.fi.tracer.doctor import check_tracing
+
+    return check_tracing().problem
+
+
+@pytest.fixture
+def start(native_program, tmp_path):
+    """Function that starts a program at its entry point; what it leaves behind is killed."""
+    from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
+
+    tracees = []
+
+    def begin(name, *arguments, mechanism=None):
+        command = Command.of([str(native_program(name)), *arguments])
+        tracee = spawn(
+            command, stdout=tmp_path / "stdout", stderr=tmp_path / "stderr", mechanism=mechanism
+        )
+        tracees.append(tracee)
+        assert run_to_entry(tracee)
+        return tracee
+
+    yield begin
+    for tracee in tracees:
+        tracee.kill()
