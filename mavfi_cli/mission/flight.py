@@ -26,7 +26,6 @@ from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.transport import Transport
-from mavfi_cli.mission.branching import Trunk
 from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.protection import gate_of, protection_of
@@ -129,8 +128,6 @@ class Flight:
             self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
         elif fault is not None:
             self.injection = Injection(fault, shortest_s)
-        elif isinstance(self.injection, Trunk):
-            self.injection.prepare(shortest_s)
         self.companion = Companion(
             self._config,
             self._stack,

@@ -9,13 +9,13 @@ import pytest
 from fake_autopilot import FakePX4
 
 from mavfi_cli.link import session
-from mavfi_cli.mission import flight, sortie
+from mavfi_cli.mission import flight
 
 
 @pytest.fixture
 def refused(command_line, tmp_path, monkeypatch):
     """Run `mavfi fly`, which must end with one line; the line. Also without --quiet."""
-    monkeypatch.setattr(sortie, "is_compiled", lambda: True)  # else there is a line about that
+    monkeypatch.setattr("mavfi_cli.mission.run.is_compiled", lambda: True)  # else a line says so
 
     def run(*arguments, code=1):
         left, out, err = command_line("fly", *arguments)
