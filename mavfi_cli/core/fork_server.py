@@ -106,15 +106,16 @@ class ForkServer:
         """
         order = json.dumps({"task": task, "folder": str(folder), "limit_s": limit_s}).encode()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
+        with theirs, contextlib.ExitStack() as undo:
+            undo.enter_context(ours)
             for _ in range(2):
                 try:
                     socket.send_fds(self._running(), [order], [theirs.fileno()])
                 except OSError:  # it was killed since
                     self.close()
                     continue
+                undo.pop_all()
                 return ours
-        ours.close()
         raise ForkServerFailed("the process that forks the workers ends at once")
 
     def _running(self) -> socket.socket:
