@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,12 +138,10 @@ class ImageReceiver:
 
     def feed(self, message: Message) -> list[ImageFrame]:
         """Take a message; the frames that it completes, mostly none, at most a few."""
-        if isinstance(message, dialect.MAVLink_encapsulated_data_message):
-            return self._packet(message.seqnr, _data(message))
-        if isinstance(message, dialect.MAVLink_data_transmission_handshake_message):
-            return self._handshake(message)
-        if isinstance(message, dialect.MAVLink_camera_image_captured_message):
-            return self._captured(message)
+        handler = _HANDLERS.get(type(message))
+        return [] if handler is None else handler(self, message)
+
+    def _field_of_view(self, message: Message) -> list[ImageFrame]:
         hfov_rad = hfov_of(message)
         if hfov_rad is not None:
             self.hfov_rad = hfov_rad
@@ -206,7 +204,8 @@ class ImageReceiver:
         """How far off its due time a packet may come, in messages: about one frame."""
         return _RECENT_PACKETS if self._shape is None else self._shape.packets + 2
 
-    def _packet(self, place: int, data: bytes) -> list[ImageFrame]:
+    def _packet(self, message: Message) -> list[ImageFrame]:
+        place, data = message.seqnr, _data(message)
         self._count += 1
         if not self._fits(place):
             return []
@@ -259,6 +258,15 @@ class ImageReceiver:
     def _close(self, frame: _Assembly) -> None:
         self._open.remove(frame)
         self._closed.append(frame.index)
+
+
+_HANDLERS: dict[type, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
+    dialect.MAVLink_encapsulated_data_message: ImageReceiver._packet,
+    dialect.MAVLink_data_transmission_handshake_message: ImageReceiver._handshake,
+    dialect.MAVLink_camera_image_captured_message: ImageReceiver._captured,
+    dialect.MAVLink_camera_information_message: ImageReceiver._field_of_view,
+    dialect.MAVLink_camera_fov_status_message: ImageReceiver._field_of_view,
+}
 
 
 def _data(message: Message) -> bytes:
