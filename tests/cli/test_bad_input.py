@@ -40,7 +40,7 @@ def refused(command_line, tmp_path, monkeypatch):
     ],
 )
 def test_an_unknown_name_gets_the_nearest(refused, option, given, kind, nearest):
-    line = refused(option, given, code=1 if option in ("--world", "--vehicle") else 2)
+    line = refused(option, given, code=2)
     assert line.startswith(f"unknown {kind} {given!r}: did you mean {nearest!r}? Known: ")
 
 
