@@ -3,9 +3,7 @@
     python benchmarks/campaign.py [--missions 100] [--jobs 2 ...] [--world sparse]
 
 Flies golden missions and missions with a source-level fault, pairs by default, then as many with an
-instruction-level fault; each with every number of jobs, and in each of three ways: simulated
-vehicles as programs, as forks of a warm one, and with missions that branch off each other where
-their fault strikes.
+instruction-level fault; each with every number of jobs.
 """
 
 from __future__ import annotations
@@ -66,24 +64,17 @@ def instruction_missions(world: str, count: int) -> list[PlannedMission]:
     ]  # fmt: skip
 
 
-WAYS = {
-    "programs": {"fork": False, "branch": False},
-    "forks": {"fork": True, "branch": False},
-    "branches": {"fork": True, "branch": True},
-}
-
-
-def row(name: str, missions: Sequence[PlannedMission], jobs: int, way: str) -> str:
+def row(name: str, missions: Sequence[PlannedMission], jobs: int) -> str:
     """Fly them, and tell one line of the table."""
     last = _Last()
     with tempfile.TemporaryDirectory() as folder:
-        options = Options(jobs=jobs, keep=Keep.NONE, **WAYS[way])
+        options = Options(jobs=jobs, keep=Keep.NONE)
         with run_campaign(missions, Path(folder) / "campaign", options, last) as ledger:
             errors = sum(result.outcome is None for result in ledger.results())
     seen = last.progress
     outside = 1.0 - seen.inside_s / (jobs * seen.elapsed_s)
     return (
-        f"| {name} | {way} | {jobs} | {len(missions)} | {seen.rate_per_h:.0f} | "
+        f"| {name} | {jobs} | {len(missions)} | {seen.rate_per_h:.0f} | "
         f"{REQUIRED[name]:.0f} | {100 * outside:.1f} % | {100 * OUTSIDE_LIMIT:.0f} % | {errors} |"
     )
 
@@ -94,12 +85,11 @@ def main() -> None:
     parser.add_argument("--missions", type=int, default=100)
     parser.add_argument("--jobs", type=int, nargs="+", default=[1, os.cpu_count() or 1])
     parser.add_argument("--world", default="sparse")
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     parser.add_argument("--faults", type=int, default=1, help="faulty missions a golden one")
     given = parser.parse_args()
     print(
-        "| missions | vehicles | jobs | flown | an hour | required (2 cores) | outside missions "
-        "| at most | could not begin |\n|---|---|---|---|---|---|---|---|---|"
+        "| missions | jobs | flown | an hour | required (2 cores) | outside missions | at most "
+        "| could not begin |\n|---|---|---|---|---|---|---|---|"
     )
     lists = {
         "golden and source level": source_missions(given.world, given.missions, given.faults),
@@ -107,8 +97,7 @@ def main() -> None:
     }
     for name, missions in lists.items():
         for jobs in given.jobs:
-            for way in given.ways:
-                print(row(name, missions, jobs, way), flush=True)
+            print(row(name, missions, jobs), flush=True)
 
 
 if __name__ == "__main__":

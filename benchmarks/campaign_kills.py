@@ -2,8 +2,8 @@
 
     python benchmarks/campaign_kills.py [--kills 50] [--missions 60] [--seed 1]
 
-Kills the runner, the process that forks the slots, slots, missions and their simulated vehicles,
-and runs the campaign again until it is complete.
+Kills the runner, the server that forks the workers, their guards and the workers themselves, and
+runs the campaign again until it is complete.
 """
 
 from __future__ import annotations

@@ -33,14 +33,10 @@ DISPATCH_LIMIT_S, LEDGER_LIMIT_S = 0.005, 10.0
 
 
 def prepare() -> None:
-    """Nothing to load: a part of the task, as the two below."""
+    """Nothing to load: a part of the task, as the one below."""
 
 
-def equip() -> None:
-    """No vehicles."""
-
-
-def perform(_changes: Mapping[str, Any], out: Path, _vehicles: None) -> Path:
+def perform(_changes: Mapping[str, Any], out: Path) -> Path:
     """A mission that does nothing but leave its record."""
     run = out / "nothing-1"
     run.mkdir()
@@ -73,11 +69,10 @@ def dispatch(count: int, jobs: int) -> str:
     outside_s = (jobs * seen.elapsed_s - seen.inside_s) / count
     own_s = (ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime) / count
     return (
-        f"| dispatch, {count} queued, {jobs} jobs: slot time between two missions | "
+        f"| dispatch, {count} queued, {jobs} jobs: worker time between two missions | "
         f"{1e3 * outside_s:.2f} ms | {1e3 * DISPATCH_LIMIT_S:.0f} ms |\n"
         f"| of it processor time of the runner | {1e3 * own_s:.2f} ms | |\n"
-        f"| a whole mission that does nothing, in its slot | {1e3 * seen.inside_s / count:.2f} ms "
-        f"| |"
+        f"| a whole mission that does nothing | {1e3 * seen.inside_s / count:.2f} ms | |"
     )
 
 

@@ -18,6 +18,7 @@ from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.vehicle import start_vehicle
 
 sys.path.insert(0, str(Path(__file__).parent / "link"))  # the scripted autopilots live there
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
@@ -37,8 +38,8 @@ def fly_short(tmp_path_factory):
     """Fly the short mission with changes, in this process; its run folder."""
     out = tmp_path_factory.mktemp("runs")
 
-    def fly(watcher=None, **changes):
-        return fly_mission(replace(SHORT, **changes), out, watcher or Watcher())
+    def fly(watcher=None, *, launch=start_vehicle, **changes):
+        return fly_mission(replace(SHORT, **changes), out, watcher or Watcher(), launch=launch)
 
     return fly
 

@@ -238,9 +238,8 @@ def flyable(spec: Spec) -> list[PlannedMission]:
     Raises:
         MavfiError: a world, vehicle, planner, target ... that no mission could be flown with.
     """
-    missions = spec.missions()
-    _check(missions)
-    return missions
+    _check(spec.kinds())
+    return spec.missions()
 
 
 def _check(missions: list[PlannedMission]) -> None:

@@ -37,12 +37,8 @@ class PlannedMission:
             object.__setattr__(self, "pair", pair_of(self.config))
 
 
-def _plain(config: MissionConfig) -> dict[str, Any]:
-    values: dict[str, Any] = json.loads(json.dumps(asdict(config)))
-    return values
-
-
-_BASE = _plain(MissionConfig())
+_DEFAULT = MissionConfig()
+_BASE: Mapping[str, Any] = json.loads(json.dumps(asdict(_DEFAULT)))
 # What a golden flight has not: faults, and what protects it from them.
 _TREATMENT = ("fault", "instruction", "detector", "isolate")
 
@@ -54,7 +50,13 @@ def canonical(value: Any) -> str:
 
 def changes_of(config: MissionConfig) -> dict[str, Any]:
     """What a mission has other than by default, as plain values."""
-    return {name: value for name, value in _plain(config).items() if value != _BASE[name]}
+    changed = {
+        each.name: value
+        for each in fields(MissionConfig)
+        if (value := getattr(config, each.name)) != getattr(_DEFAULT, each.name)
+    }
+    plain = json.loads(json.dumps(changed, default=asdict))
+    return {name: value for name, value in plain.items() if value != _BASE[name]}
 
 
 def config_from(changes: Mapping[str, Any]) -> MissionConfig:

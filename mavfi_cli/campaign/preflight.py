@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 
+from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.vehicle_process import VehicleProcess
-
-START_S = 300.0  # the first start after an installation compiles, on a busy machine for minutes
+from mavfi_cli.mission.vehicle import EmbeddedVehicle
 
 
 def ask_vehicle(config: MissionConfig) -> None:
@@ -19,12 +17,7 @@ def ask_vehicle(config: MissionConfig) -> None:
         VehicleProcessError: it refuses the world, the vehicle, the start or the goal.
     """
     with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
-        process = VehicleProcess(config, Path(folder))
         try:
-            os.close(process.detach())
-            process.stop(START_S)
-            failure = process.failure()
-        finally:
-            process.close()
-    if failure is not None:
-        raise failure
+            EmbeddedVehicle(config, Path(folder)).end()
+        except MavfiError as error:
+            raise VehicleProcessError(str(error)) from None

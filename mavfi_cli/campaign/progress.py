@@ -15,12 +15,11 @@ class Progress:
         total: missions of the list.
         before: of them over before this run began.
         over: over now, those of before included.
-        running: in flight, or waiting to branch off a flight.
-        flights: that these make; fewer where missions fly as one up to their faults.
+        running: in flight.
         again: attempts that something outside ended, so that they were begun again.
         elapsed_s: of this run, host time.
-        inside_s: of it within missions, summed over the slots.
-        slots: missions that can fly at the same time; None where that changes, as on a cluster.
+        inside_s: of it within missions, summed over the workers.
+        workers: missions that can fly at the same time; None where that changes, as on a cluster.
         outcomes: of the missions that this run flew, by setting, in the order of the list.
     """
 
@@ -28,11 +27,10 @@ class Progress:
     before: int
     over: int
     running: int
-    flights: int
     again: int
     elapsed_s: float
     inside_s: float
-    slots: int | None = None
+    workers: int | None = None
     outcomes: Mapping[str, Counter[str]] = field(default_factory=dict)
 
     @property
@@ -48,10 +46,10 @@ class Progress:
 
     @property
     def outside(self) -> float | None:
-        """Share of the slots' time outside missions; None where their number is not known."""
-        if self.slots is None or self.elapsed_s <= 0.0:
+        """Share of the workers' time outside missions; None where their number is not known."""
+        if self.workers is None or self.elapsed_s <= 0.0:
             return None
-        return max(0.0, 1.0 - self.inside_s / (self.slots * self.elapsed_s))
+        return max(0.0, 1.0 - self.inside_s / (self.workers * self.elapsed_s))
 
     @property
     def success_rate(self) -> float | None:

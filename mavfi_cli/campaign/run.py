@@ -17,13 +17,12 @@ from mavfi_cli.campaign.ledger import RUNS, Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
 from mavfi_cli.campaign.outcome import State, injected_of
 from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.slots.local import TASK, Slots
-from mavfi_cli.campaign.slots.seats import Assignment, Ended, Seats
-from mavfi_cli.campaign.slots.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.campaign.specification.spec import Stop
 from mavfi_cli.campaign.stopping import Entry, Gate, Queue
-from mavfi_cli.campaign.together import Together
 from mavfi_cli.campaign.unchanged import note_files, require_unchanged
+from mavfi_cli.campaign.workers.base import Assignment, Ended, Workers
+from mavfi_cli.campaign.workers.local import TASK, LocalWorkers
+from mavfi_cli.campaign.workers.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
 from mavfi_cli.mission.run import interruptible
 
@@ -43,9 +42,7 @@ class Options:
         limit_s: wall time of one mission; one that takes longer hangs.
         task: module that does the work.
         errors: fly those again that could not begin.
-        cluster: address of a scheduler of dask.distributed, instead of slots on this machine.
-        fork: simulated vehicles are forks of a warm template; otherwise programs.
-        branch: missions that differ in their fault only fly together until it strikes; with `fork`.
+        cluster: address of a scheduler of dask.distributed, instead of workers on this machine.
     """
 
     jobs: int = 0  # as many as there are cores
@@ -54,8 +51,6 @@ class Options:
     task: str = TASK
     errors: bool = False
     cluster: str | None = None
-    fork: bool = True
-    branch: bool = True
 
 
 def run_campaign(
@@ -187,14 +182,9 @@ class _Run:
         self._folder = ledger.folder.absolute()
         self._gate = None if stop is None else Gate(stop, ledger.cell_of_each(), ledger.fates())
         self._jobs = options.jobs or len(os.sched_getaffinity(0))
-        queue = Queue(ledger.missing(errors=options.errors), self._gate)
-        branches = options.branch and options.fork and options.task == TASK
-        self._queue: Queue | Together = queue
-        if branches and options.cluster is None:
-            self._queue = Together(queue, self._jobs)
+        self._queue = Queue(ledger.missing(errors=options.errors), self._gate)
         self._again: list[Entry] = []
         self._flying: dict[int, Entry] = {}
-        self._flight_of: dict[int, int] = {}  # by its first mission, of those that are flying
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
         self._setting_of, self._outcomes = _settings(ledger)
@@ -207,13 +197,13 @@ class _Run:
     def fly(self, asked: Sequence[int]) -> None:
         """Until nothing is missing, or somebody asks to stop."""
         told = False
-        with self._seats() as slots:
+        with self._workers() as workers:
             while len(asked) < 2:
-                self._fill(slots, asked)
+                self._fill(workers, asked)
                 if not self._flying:
                     break
-                over = slots.wait(_LOOK_S)
-                self._fill(slots, asked)  # at once: the ledger is written while they fly
+                over = workers.wait(_LOOK_S)
+                self._fill(workers, asked)  # at once: the ledger is written while they fly
                 for ended in over:
                     self._take(ended)
                 self._spectator.on_progress(self._progress())
@@ -230,43 +220,34 @@ class _Run:
                 f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
             )
 
-    def _seats(self) -> Seats:
+    def _workers(self) -> Workers:
         options = self._options
         if options.cluster is None:
-            return Slots(self._jobs, options.task, fork=options.fork)
-        from mavfi_cli.campaign.slots.cluster import Cluster
+            return LocalWorkers(self._jobs, options.task)
+        from mavfi_cli.campaign.workers.cluster import Cluster
 
         return Cluster(options.cluster, options.keep, options.task)
 
-    def _fill(self, slots: Seats, asked: Sequence[int]) -> None:
-        """Start as many missions as there are free slots."""
-        while slots.free and not asked and (entries := self._next()):
-            self._start(slots, entries)
+    def _fill(self, workers: Workers, asked: Sequence[int]) -> None:
+        """Start as many missions as there are free workers."""
+        while workers.free and not asked:
+            entry = self._again.pop() if self._again else self._queue.next()
+            if entry is None:
+                return
+            workers.start(self._assigned(entry), self._options.limit_s)
 
-    def _next(self) -> list[Entry]:
-        """What flies next: one mission, or several as one; those that are begun again, alone."""
-        if self._again:
-            return [self._again.pop()]
-        if isinstance(self._queue, Together):
-            return self._queue.next()
-        entry = self._queue.next()
-        return [] if entry is None else [entry]
-
-    def _start(self, slots: Seats, entries: Sequence[Entry]) -> None:
-        missions = []
-        for entry in entries:
-            number, _, changes = entry
-            self._attempts[number] += 1
-            out = self._out(number)
-            try:
-                out.mkdir()
-                (out / ".profiles").symlink_to(self._folder / PROFILES)
-            except OSError as error:
-                raise RecordError(f"{out}: {error.strerror or error}") from None
-            missions.append(Assignment(number=number, changes=changes, out=str(out)))
-            self._flying[number] = entry
-            self._flight_of[number] = entries[0][0]
-        slots.start(missions, self._options.limit_s)
+    def _assigned(self, entry: Entry) -> Assignment:
+        """The next attempt at a mission, in a folder of its own."""
+        number, _, changes = entry
+        self._attempts[number] += 1
+        self._flying[number] = entry
+        out = self._out(number)
+        try:
+            out.mkdir()
+            (out / ".profiles").symlink_to(self._folder / PROFILES)
+        except OSError as error:
+            raise RecordError(f"{out}: {error.strerror or error}") from None
+        return Assignment(number=number, changes=changes, out=str(out))
 
     def _out(self, number: int) -> Path:
         return self._folder / WORK / f"{number}-{self._attempts[number]}"
@@ -275,7 +256,6 @@ class _Run:
         """Settle one attempt that is over."""
         number = ended.number
         entry = self._flying.pop(number)
-        del self._flight_of[number]
         self._inside_s += ended.wall_s
         config = config_from(entry[2]).to_dict()
         out = self._out(number)
@@ -330,11 +310,10 @@ class _Run:
             before=self._before,
             over=self._over,
             running=len(self._flying),
-            flights=len(set(self._flight_of.values())),
             again=self._repeated,
             elapsed_s=time.monotonic() - self._begun,
             inside_s=self._inside_s,
-            slots=self._jobs if self._options.cluster is None else None,
+            workers=self._jobs if self._options.cluster is None else None,
             outcomes=self._outcomes,
         )
 

@@ -2,7 +2,7 @@
 
 The interval is looked at after every batch of a setting, over exactly the first missions of the
 list up to there, whatever order they ended in; so when a setting stops does not depend on how many
-slots there are. Looking often makes the interval a little less sure than it says.
+workers there are. Looking often makes the interval a little less sure than it says.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.config import MissionConfig
 
 SEARCH = "world-search"  # the folder
-_AT_ONCE = 4  # candidates whose flights fill the slots together
+_AT_ONCE = 4  # candidates whose flights fill the workers together
 
 
 class NoWorldFits(ConfigError):

@@ -50,12 +50,6 @@ def campaign() -> None:
 @click.option("--append", is_flag=True,
               help="Add the missions that the folder's list does not have.")  # fmt: skip
 @click.option("--retry-errors", is_flag=True, help="Fly those again that could not begin.")
-@click.option("--no-fork", is_flag=True,
-              help="Start each simulated vehicle as a program, not as a fork of a warm "
-                   "one; for comparison, the records are the same.")  # fmt: skip
-@click.option("--no-branch", is_flag=True,
-              help="Fly each mission from its start, also where one without its fault flies "
-                   "the same up to the fault; for comparison.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
@@ -76,8 +70,6 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
         limit_s=options["limit_s"],
         errors=options["retry_errors"],
         cluster=options["cluster"],
-        fork=not options["no_fork"],
-        branch=not options["no_branch"],
     )
     with (
         missions_view(quiet=quiet) as view,

@@ -68,8 +68,6 @@ class _Live(Spectator):
 def progress_line(progress: Progress) -> str:
     """How far it is: missions, rate, time left, success rates so far."""
     parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
-    if progress.flights < progress.running:  # those that differ in their fault only fly as one
-        parts[-1] += f" in {progress.flights} flight{'s' if progress.flights > 1 else ''}"
     if progress.eta_s is not None:
         parts.append(f"{progress.rate_per_h:.0f} an hour")
         if progress.over < progress.total:

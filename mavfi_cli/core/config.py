@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -138,7 +139,7 @@ _CONVERTER = _converter()
 
 def _refuse_unknown(data: Any, cls: Any, path: Path | None, text: str, prefix: str) -> None:
     """Walk nested dataclass fields; refuse any key that none of them has, and any wrong shape."""
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     for key, value in data.items():
         full = f"{prefix}{key}"
         if key not in hints:
@@ -151,20 +152,32 @@ def _refuse_unknown(data: Any, cls: Any, path: Path | None, text: str, prefix: s
                     _refuse_unknown(item, nested, path, text, prefix=f"{full}.{name}")
 
 
+@functools.cache
+def _hints(cls: Any) -> Mapping[str, Any]:
+    """Types by field: Python evaluates the texts of annotations each time that it is asked."""
+    return get_type_hints(cls)
+
+
 def _refuse_shape(value: Any, hint: Any, path: Path | None, text: str, key: str) -> None:
     """Refuse what is no table, or no array, where one belongs: text is an array of letters."""
-    hints = get_args(hint) if isinstance(hint, UnionType) else (hint,)
-    kinds = [get_origin(each) or each for each in hints if each is not NoneType]
-    if all(kind is dict or dataclasses.is_dataclass(kind) for kind in kinds):
-        fits, wanted = isinstance(value, Mapping), "a table"
-    elif all(kind in (list, tuple) for kind in kinds):
-        fits, wanted = isinstance(value, (list, tuple)), "an array"
-    else:
-        return
-    if not fits and not (value is None and NoneType in hints):
+    wanted, accepted = _shape(hint)
+    if not isinstance(value, accepted):
         raise ConfigError(
             f"expected {wanted}, got {value!r}", path=path, line=_line_of(text, key), key=key
         )
+
+
+@functools.cache
+def _shape(hint: Any) -> tuple[str, tuple[type, ...]]:
+    """What a type wants, in words, and the types that have this shape."""
+    hints = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    kinds = [get_origin(each) or each for each in hints if each is not NoneType]
+    none = (NoneType,) if NoneType in hints else ()
+    if all(kind is dict or dataclasses.is_dataclass(kind) for kind in kinds):
+        return "a table", (Mapping, *none)
+    if all(kind in (list, tuple) for kind in kinds):
+        return "an array", (list, tuple, *none)
+    return "", (object,)
 
 
 def _items(value: Any, hint: Any) -> list[tuple[str, Any]]:
@@ -176,7 +189,8 @@ def _items(value: Any, hint: Any) -> list[tuple[str, Any]]:
     return [("", value)]
 
 
-def _dataclasses_in(hint: Any) -> list[Any]:
+@functools.cache
+def _dataclasses_in(hint: Any) -> Sequence[Any]:
     if dataclasses.is_dataclass(hint):
         return [hint]
     return [found for arg in get_args(hint) for found in _dataclasses_in(arg)]

@@ -10,6 +10,7 @@ The conversions are involutions: applying one twice gives the input back.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ ned_yaw_from_enu = enu_yaw_from_ned
 _HALF_SQRT2 = math.sqrt(0.5)
 
 
-def flu_enu_from_frd_ned(quaternion: Vector) -> Vector:
+def flu_enu_from_frd_ned(quaternion: Vector | Sequence[float]) -> Vector:
     """Body-FLU-to-ENU quaternion (4,) of a body-FRD-to-NED quaternion (4,), and back.
 
     q_enu = q(ENU<-NED) * q_ned * q(FRD<-FLU), with q(ENU<-NED) = (0, s, s, 0), s = sqrt(1/2),
@@ -74,7 +75,7 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
     )
 
 
-def yaw_from_quaternion(quaternion: Vector) -> float:
+def yaw_from_quaternion(quaternion: Vector | Sequence[float]) -> float:
     """Yaw in [-pi, pi], rad, of a quaternion (4,)."""
     w, x, y, z = (float(c) for c in quaternion)
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

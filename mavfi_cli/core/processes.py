@@ -1,4 +1,4 @@
-"""Processes of one mission: how they are bound to their keeper, found, and ended."""
+"""Processes: how one is bound to its parent, found, and ended with all that it started."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from pathlib import Path
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 # What ps calls them.
-TEMPLATE, SLOT, MISSION = "mavfi-template", "mavfi-slot", "mavfi-mission"
-VEHICLES, VEHICLE = "mavfi-vehicles", "mavfi-vehicle"  # the template of vehicles, and one
+SERVER, GUARD, WORKER = "mavfi-server", "mavfi-guard", "mavfi-worker"
 ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -34,36 +33,6 @@ def die_with(parent: int) -> None:
         os._exit(1)
 
 
-def fork_beside(reaper: int) -> int | None:
-    """Fork, with a reaper as the parent instead of this process.
-
-    Args:
-        reaper: process id of the nearest reaper among the ancestors of this process. The child dies
-            with it.
-
-    Returns:
-        0 in the child, its process id here; None where something killed it before it could say so.
-    """
-    reading, writing = os.pipe()
-    between = os.fork()
-    if between:
-        os.close(writing)
-        with open(reading, "rb", buffering=0) as pipe:
-            told = pipe.read()
-        os.waitpid(between, 0)
-        return int(told) if told else None
-    middle = os.getpid()
-    if os.fork():
-        os._exit(0)
-    os.close(reading)
-    os.write(writing, str(os.getpid()).encode())
-    os.close(writing)
-    while os.getppid() == middle:  # it is about to end
-        os.sched_yield()
-    die_with(reaper)
-    return 0
-
-
 def threads() -> int:
     """How many threads this process has. A fork has only one of them, and the others' locks."""
     return len(os.listdir("/proc/self/task"))
@@ -80,15 +49,12 @@ def _request(option: int, value: int | ctypes.c_char_p) -> None:
         raise OSError(code, os.strerror(code))
 
 
-def end_children(spare: int | None = None) -> None:
+def end_children() -> None:
     """Kill and reap every descendant of this process, which is their reaper.
 
     A killed child leaves its own children to us, so the loop ends when there are none.
-
-    Args:
-        spare: a child that is left alone, with all that it started.
     """
-    while children := [pid for pid in _children() if pid != spare]:
+    while children := _children():
         for pid in children:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)

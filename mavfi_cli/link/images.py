@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,9 +28,11 @@ NOTHING = 255  # pixel value where nothing was in range
 
 _OPEN_FRAMES = 3  # the newest frames, by index, may still become whole
 _RECENT_PACKETS = 16  # packets that a frame announced after them may still claim
+_STRAY = 8  # messages that a packet comes off its due time before it is taken for a stray
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
 _LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
 _REMEMBERED = 64  # indices of frames that are done with
+_DATA_AT, _DATA_BYTES = 2, 253  # in the payload of ENCAPSULATED_DATA, behind `seqnr`
 _CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
 
 
@@ -60,7 +62,9 @@ class _Shape:
 class _Assembly:
     """A frame that was announced and is not whole yet."""
 
-    __slots__ = ("announced", "checksum", "index", "near", "stamp_s", "trials_left")
+    __slots__ = (
+        "announced", "checksum", "improved", "index", "near", "stamp_s", "strays", "trials_left",
+    )  # fmt: skip
 
     def __init__(self, index: int, stamp_s: float, checksum: int | None, announced: int) -> None:
         self.index = index
@@ -68,19 +72,23 @@ class _Assembly:
         self.checksum = checksum
         self.announced = announced  # count of messages at its announcement
         self.near: dict[int, tuple[int, bytes]] = {}  # place -> how far off its due time, data
+        self.strays = 0  # places whose packet came so far off that it is another frame's
+        self.improved = False  # a packet came that no trial has seen
         self.trials_left = _TRIALS
 
-    def offer(self, place: int, data: bytes, count: int, reach: int) -> bool:
+    def offer(self, place: int, data: bytes, count: int, reach: int) -> None:
         """Take the packet if it came nearer to when this frame's was due than any before."""
         off = abs(count - (self.announced + 2 + place))
         held = self.near.get(place)
         if off > reach or (held is not None and held[0] <= off):
-            return False
+            return
         self.near[place] = (off, data)
-        return True
+        self.strays += (off > _STRAY) - (held is not None and held[0] > _STRAY)
+        self.improved = True
 
     def image(self, packets: Iterable[bytes], shape: _Shape) -> bytes | None:
         """The pixels of these packets, if the checksum agrees."""
+        self.improved = False
         if self.trials_left <= 0:
             return None
         self.trials_left -= 1
@@ -130,12 +138,10 @@ class ImageReceiver:
 
     def feed(self, message: Message) -> list[ImageFrame]:
         """Take a message; the frames that it completes, mostly none, at most a few."""
-        if isinstance(message, dialect.MAVLink_encapsulated_data_message):
-            return self._packet(message.seqnr, bytes(message.data))
-        if isinstance(message, dialect.MAVLink_data_transmission_handshake_message):
-            return self._handshake(message)
-        if isinstance(message, dialect.MAVLink_camera_image_captured_message):
-            return self._captured(message)
+        handler = _HANDLERS.get(type(message))
+        return [] if handler is None else handler(self, message)
+
+    def _field_of_view(self, message: Message) -> list[ImageFrame]:
         hfov_rad = hfov_of(message)
         if hfov_rad is not None:
             self.hfov_rad = hfov_rad
@@ -187,6 +193,7 @@ class ImageReceiver:
             self._fresh &= self._latest.keys()
             for frame in self._open:
                 frame.near = {p: held for p, held in frame.near.items() if p < shape.packets}
+                frame.strays = sum(off > _STRAY for off, _ in frame.near.values())
         return self._finish(self._open)
 
     def _fits(self, place: int) -> bool:
@@ -197,7 +204,8 @@ class ImageReceiver:
         """How far off its due time a packet may come, in messages: about one frame."""
         return _RECENT_PACKETS if self._shape is None else self._shape.packets + 2
 
-    def _packet(self, place: int, data: bytes) -> list[ImageFrame]:
+    def _packet(self, message: Message) -> list[ImageFrame]:
+        place, data = message.seqnr, _data(message)
         self._count += 1
         if not self._fits(place):
             return []
@@ -205,9 +213,16 @@ class ImageReceiver:
         self._latest[place] = data
         self._fresh.add(place)
         reach = self._reach()
-        improved = [f for f in self._open if f.offer(place, data, self._count, reach)]
-        every = self._shape is not None and len(self._fresh) >= self._shape.packets
-        return self._finish(self._open if every else improved)
+        for frame in self._open:
+            frame.offer(place, data, self._count, reach)
+        if self._shape is None:
+            return []
+        if len(self._fresh) >= self._shape.packets:
+            return self._finish(self._open)
+        last = self._count - 1 - self._shape.packets  # announced then, a frame has had its time
+        return self._finish(
+            [f for f in self._open if f.improved and (not f.strays or f.announced <= last)]
+        )
 
     def _finish(self, frames: list[_Assembly]) -> list[ImageFrame]:
         """Close and return those of some open frames that are whole."""
@@ -243,6 +258,23 @@ class ImageReceiver:
     def _close(self, frame: _Assembly) -> None:
         self._open.remove(frame)
         self._closed.append(frame.index)
+
+
+_HANDLERS: dict[type, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
+    dialect.MAVLink_encapsulated_data_message: ImageReceiver._packet,
+    dialect.MAVLink_data_transmission_handshake_message: ImageReceiver._handshake,
+    dialect.MAVLink_camera_image_captured_message: ImageReceiver._captured,
+    dialect.MAVLink_camera_information_message: ImageReceiver._field_of_view,
+    dialect.MAVLink_camera_fov_status_message: ImageReceiver._field_of_view,
+}
+
+
+def _data(message: Message) -> bytes:
+    """The data of a packet, from the payload that was received: faster than from a list."""
+    payload: bytes | None = message.get_payload()
+    if payload is None:
+        return bytes(message.data)
+    return payload[_DATA_AT:].ljust(_DATA_BYTES, b"\0")
 
 
 def _shape_of(message: Message) -> _Shape | None:

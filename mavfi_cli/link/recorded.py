@@ -40,15 +40,6 @@ class RecordedLink:
             self._early.clear()
             yield
 
-    def go_on_in(self, path: Path) -> None:
-        """Go on in a copy of the tlog: this process is a fork, and flies another mission now.
-
-        Raises:
-            RecordError: it could not be copied.
-        """
-        assert self._tlog is not None
-        self._tlog.go_on_in(path)
-
     def receive(self, timeout_s: float) -> bytes:
         """Wait for bytes; none where none came in time.
 

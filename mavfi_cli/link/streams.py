@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import errno
-import os
 import socket
-from time import perf_counter
 from typing import NoReturn
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
@@ -15,9 +13,6 @@ from mavfi_cli.link.waiting import readable, writable
 CONNECT_TIMEOUT_S = 5.0
 SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for so long is lost
 _CHUNK = 1 << 16
-# Waking a sleeping process took 0.2 to 0.3 ms on a virtual machine, more than the peer needs for
-# one tick. Kernels take longer: then the wait sleeps after all.
-LOCKSTEP_LOOK_OUT_S = 0.001
 
 
 class StreamTransport:
@@ -28,24 +23,14 @@ class StreamTransport:
         url: for messages to people.
         patient: wait for a slow reader. Otherwise what does not fit its buffer is dropped, whole
             sends at a time, as autopilots do to a slow telemetry link.
-        look_out_s: how long a wait looks again and again, giving way to other processes, before
-            it sleeps: waking a sleeper costs more than a lockstep peer takes to answer.
     """
 
     datagram = False
 
-    def __init__(
-        self,
-        connection: socket.socket,
-        url: str,
-        *,
-        patient: bool = True,
-        look_out_s: float = 0.0,
-    ) -> None:
+    def __init__(self, connection: socket.socket, url: str, *, patient: bool = True) -> None:
         connection.settimeout(0.0)
         self._socket = connection
         self._patient = patient
-        self._look_out_s = look_out_s
         self._unsent = b""
         self.url = url
 
@@ -76,22 +61,9 @@ class StreamTransport:
     def receive(self, timeout_s: float) -> bytes:
         """The next bytes, or b"" after `timeout_s`; see `Transport`."""
         data = self._pull()
-        if data is None and timeout_s > 0.0:
-            if self._look_out_s > 0.0:
-                data = self._look_out()
-            if data is None and readable(self._socket.fileno(), timeout_s):
-                data = self._pull()
-        return data or b""
-
-    def _look_out(self) -> bytes | None:
-        """The next bytes, if they come while looking; None after `look_out_s`."""
-        end_s = perf_counter() + self._look_out_s
-        while perf_counter() < end_s:
+        if data is None and timeout_s > 0.0 and readable(self._socket.fileno(), timeout_s):
             data = self._pull()
-            if data is not None:
-                return data
-            os.sched_yield()
-        return None
+        return data or b""
 
     def _pull(self) -> bytes | None:
         try:
@@ -135,7 +107,7 @@ def inherited(endpoint: Endpoint) -> StreamTransport:
     if connection.type != socket.SOCK_STREAM:
         connection.detach()
         raise EndpointError(endpoint.url, "not a stream socket")
-    return StreamTransport(connection, endpoint.url, look_out_s=LOCKSTEP_LOOK_OUT_S)
+    return StreamTransport(connection, endpoint.url)
 
 
 def connected(endpoint: Endpoint, where: tuple[int, str]) -> StreamTransport:

@@ -110,16 +110,16 @@ class Telemetry:
         self.mode = self.autopilot.mode_name(message.custom_mode)
 
     def _local_position(self, message: Message) -> None:
-        position = np.array([message.y, message.x, -message.z], dtype=np.float64)
-        velocity = np.array([message.vy, message.vx, -message.vz], dtype=np.float64)
+        position = (message.y, message.x, -message.z)
+        velocity = (message.vy, message.vx, -message.vz)
         if self._quaternion is None or not math.isfinite(sum(position) + sum(velocity)):
             return
         state = VehicleState(
             stamp_s=message.time_boot_ms / 1e3,
-            position_enu_m=position,
-            velocity_enu_mps=velocity,
+            position_enu_m=np.array(position, dtype=np.float64),
+            velocity_enu_mps=np.array(velocity, dtype=np.float64),
             quaternion=self._quaternion,
-            yaw_rad=yaw_from_quaternion(self._quaternion),
+            yaw_rad=yaw_from_quaternion(self._quaternion.tolist()),
         )
         if self.history.add(state):
             self.state = state
@@ -136,8 +136,7 @@ class Telemetry:
         """Take a body-FRD-to-NED quaternion w x y z, if it is one."""
         norm = math.sqrt(sum(c * c for c in components))
         if math.isfinite(norm) and 0.5 < norm < 2.0:
-            unit = np.array([c / norm for c in components])
-            self._quaternion = flu_enu_from_frd_ned(unit)
+            self._quaternion = flu_enu_from_frd_ned([c / norm for c in components])
 
     def _sys_status(self, message: Message) -> None:
         self.ready = bool(message.onboard_control_sensors_health & _PREARM)

@@ -7,7 +7,6 @@ the wire. Time is EPOCH_UNIX_S plus the simulated stamp, so the same flight give
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 from types import TracebackType
 
@@ -75,21 +74,6 @@ class TlogWriter:
             pass
         finally:
             os.close(descriptor)
-
-    def go_on_in(self, path: Path) -> None:
-        """Go on in a copy of the file; for a fork of the writer's process.
-
-        Raises:
-            RecordError: the copy cannot be made.
-        """
-        try:
-            shutil.copyfile(self._path, path)
-            descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
-        except OSError as error:
-            raise self._error(error) from None
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-        self._path, self._descriptor = path, descriptor
 
     def close(self) -> None:
         """Flush and close; harmless when repeated."""

@@ -44,7 +44,7 @@ class Transport(Protocol):
         """
 
     def fileno(self) -> int:
-        """The descriptor that becomes readable when `receive` would return something."""
+        """The descriptor that becomes readable when `receive` would return something; -1: none."""
 
     def close(self) -> None:
         """Release the socket or device; harmless when repeated."""

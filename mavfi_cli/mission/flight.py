@@ -1,8 +1,8 @@
 """The loop of one mission: messages in, one control tick a state, setpoints out.
 
 The clock is the vehicle's: a LOCAL_POSITION_NED is the tick of its stamp. In lockstep the
-vehicle waits for the setpoint of that stamp; the answer goes out first, and the heavy kernels
-run while the vehicle already simulates the next tick.
+vehicle waits for the setpoint of that stamp; the answer goes out first, so that a vehicle in a
+process of its own simulates the next tick while the heavy kernels run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.transport import Transport
-from mavfi_cli.mission.branching import Trunk
 from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.protection import gate_of, protection_of
@@ -51,6 +50,7 @@ IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing
 CAMERA_BELOW_M = 1.0  # below the take-off height the camera is started
 LOST_S = 5.0  # a foreign autopilot that tells no new state for so long is lost
 _POSITION = dialect.MAVLink_local_position_ned_message
+_PACKET = dialect.MAVLink_encapsulated_data_message
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
 
@@ -129,8 +129,6 @@ class Flight:
             self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
         elif fault is not None:
             self.injection = Injection(fault, shortest_s)
-        elif isinstance(self.injection, Trunk):
-            self.injection.prepare(shortest_s)
         self.companion = Companion(
             self._config,
             self._stack,
@@ -243,8 +241,10 @@ class Flight:
         stamp_ms = None
         with self.wall.measure("link"):
             for message in self.link.messages(data, self.stamp_s):
-                self._session.handle(message)
                 self._frames += self._images.feed(message)
+                if type(message) is _PACKET:
+                    continue  # half of all messages, and nothing that the session looks at
+                self._session.handle(message)
                 if type(message) is _POSITION and self._is_autopilot(message):
                     stamp_ms = message.time_boot_ms
         return None if stamp_ms is None else stamp_ms / 1e3

@@ -84,11 +84,6 @@ class _Recorded(NoInjection, ABC):
         self._path = path
         write_json(path, self.record())
 
-    @property
-    def struck(self) -> bool:
-        """Whether the fault has acted."""
-        return self._strike is not None
-
     def news(self) -> list[str]:
         """What was done since the last call, a line each."""
         told, self._news = self._news, []

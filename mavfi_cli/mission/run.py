@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import functools
 import importlib.metadata
 import json
@@ -21,11 +22,10 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli import __version__
-from mavfi_cli.autonomy import planners
+from mavfi_cli.autonomy import is_compiled, planners, warm_up
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission import briefing
-from mavfi_cli.mission.branching import Branching
 from mavfi_cli.mission.companion.response import response_times
 from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.flight import Flight
@@ -35,13 +35,13 @@ from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.plan_file import write_plans
-from mavfi_cli.mission.record.run_folder import CRASH, RunFolder
+from mavfi_cli.mission.record.run_folder import CRASH, RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.record.statistics import mission_statistics, plan_lines
 from mavfi_cli.mission.record.timetable import timetable_of, write_timetable
 from mavfi_cli.mission.record.trace import write_trace
-from mavfi_cli.mission.sortie import Sortie, other_end
-from mavfi_cli.mission.vehicle_template import VehicleTemplate
+from mavfi_cli.mission.vehicle import OtherEnd, StartVehicle, other_end, start_vehicle
 
+COMPILING = "compiling the kernels, once on this machine: this takes a while"
 _VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")
 
 
@@ -53,8 +53,7 @@ def fly_mission(
     recorder: Recorder | None = None,
     repeat: Mapping[str, Any] | None = None,
     for_debugger: Callable[[int], None] | None = None,
-    vehicles: VehicleTemplate | None = None,
-    branching: Branching | None = None,
+    launch: StartVehicle = start_vehicle,
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
@@ -67,8 +66,7 @@ def fly_mission(
         recorder: keeps what the flight asks of its nodes.
         repeat: the record of an instruction-level fault to repeat, instead of drawing one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
-        vehicles: forks the simulated vehicle; None: it is started as a program.
-        branching: other missions that begin as this one; see `fly_together`.
+        launch: starts the simulated vehicle.
 
     Raises:
         MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
@@ -76,81 +74,76 @@ def fly_mission(
     """
     platform, stack = load_platform(config.platform), stack_of(config)
     planner = planners.find(config.planner)
-    begun_s = time.perf_counter()
+    started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
+    _warm_up(watcher)  # first: else a link is full of stale messages by then
     with (
-        _injection(config, out, repeat, for_debugger, vehicles) as injection,
+        _injection(config, out, repeat, for_debugger, launch) as injection,
         interruptible() as interrupt,
-        other_end(config, vehicles, watcher, patient=branching is not None) as end,
+        other_end(config, launch) as end,
     ):
-        flight = Flight(config, stack, end.transport, platform, planner, watcher, interrupt)
-        sortie = Sortie(config, out, end, flight, branching, begun_s=begun_s)
-        sortie.prepare_to_branch()
+        flight = Flight(config, stack, end.link, platform, planner, watcher, interrupt)
         if injection is not None:
             flight.injection = injection
-        try:
-            if end.truth_folder is None:  # before connecting: then the vehicle's clock runs
-                flight.brief(briefing.of_config(config))
-            flight.connect()
-            if end.truth_folder is not None:
-                flight.brief(briefing.of_simulation(end.truth_folder))
-            if recorder is not None:
-                flight.record(recorder)
-        except MavfiError:
-            end.transport.close()
-            if failure := end.failure():
-                raise failure from None
-            raise
-        sortie.begin()
-        sortie.flight_begun_s = time.perf_counter()
+        _begin(flight, config, end, recorder)
+        name = stem_of(config.world) if config.link is None else "link"
+        folder = new_run_folder(out, f"{name}-{config.seed}")
+        flight.injection.begin(folder.fault)
+        flight_begun_s = time.perf_counter()
         with flight.isolated_nodes():
-            crash = _fly(sortie)
-        sortie.note_end()
-        end.transport.close()  # the vehicle sees the end and saves its truth
+            crash = _fly(flight, folder.tlog)
+        flight_wall_s = time.perf_counter() - flight_begun_s
         if failure := end.failure():
             flight.explain(str(failure))
         truth, referee = _read_truth(end.truth_folder)
-        vehicle = _vehicle_host(end.truth_folder)
-        sortie.branch_rest()
-        _write(sortie, _host(sortie, vehicle), truth, referee, crash)
-    return sortie.folder
+        host = {
+            "started": started.isoformat(timespec="seconds"),
+            "startup_s": round(flight_begun_s - begun_s, 3),
+            "flight_wall_s": round(flight_wall_s, 3),
+            **_host(config, flight, end.truth_folder),
+        }
+        _write(config, flight, folder, host, truth, referee, crash)
+    return folder
 
 
-def fly_together(branching: Branching, place: Path, vehicles: VehicleTemplate) -> RunFolder:
-    """Fly missions that differ in their fault only, as one flight until each fault strikes.
+def _warm_up(watcher: Watcher) -> None:
+    if not is_compiled():
+        watcher.on_note(COMPILING)
+    warm_up()
 
-    Args:
-        branching: the missions; every one that branches off returns from here as well, in a process
-            of its own.
-        place: of what the flight leaves while it is none of the missions.
-        vehicles: forks the simulated vehicles.
 
-    Returns:
-        The run folder of the mission that the process has become.
+def _begin(flight: Flight, config: MissionConfig, end: OtherEnd, recorder: Recorder | None) -> None:
+    """Up to the first heartbeat, and what the mission is told before it flies.
 
     Raises:
-        MavfiError: as `fly_mission`.
+        MavfiError: why it cannot fly; the vehicle's own reason where it has one.
     """
-    config = replace(branching.members[0].config, fault=None)
-    out = place if branching.me is None else branching.members[branching.me].out
-    return fly_mission(config, out, Watcher(), vehicles=vehicles, branching=branching)
+    try:
+        if end.truth_folder is None:  # before connecting: then the vehicle's clock runs
+            flight.brief(briefing.of_config(config))
+        flight.connect()
+        if end.truth_folder is not None:
+            flight.brief(briefing.of_simulation(end.truth_folder))
+        if recorder is not None:
+            flight.record(recorder)
+    except MavfiError:
+        if failure := end.failure():
+            raise failure from None
+        raise
 
 
-def _host(sortie: Sortie, vehicle: Mapping[str, Any]) -> dict[str, Any]:
+def _host(config: MissionConfig, flight: Flight, truth_folder: Path | None) -> dict[str, Any]:
     """What this machine had to do for it: no part of what repeats."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    vehicle = _vehicle_host(truth_folder)
     return {
-        "started": sortie.started.isoformat(timespec="seconds"),
-        "startup_s": round(sortie.flight_begun_s - sortie.begun_s, 3),
-        "flight_wall_s": round(sortie.flight_wall_s, 3),
-        "branched_s": sortie.branched_s,
         "machine": host_platform.machine(),
         "cores": os.cpu_count(),
-        "isolated": list(sortie.config.isolate),
+        "isolated": list(config.isolate),
         "memory_mb": {
             "companion": round(own_mb, 1),
             "vehicle": round(vehicle.get("memory_mb", 0.0), 1),
         },
-        "stage_wall_s": _rounded(sortie.flight.wall.totals),
+        "stage_wall_s": _rounded(flight.wall.totals),
         "vehicle_stage_wall_s": _rounded(vehicle.get("stage_wall_s", {})),
     }
 
@@ -161,7 +154,7 @@ def _injection(
     out: Path,
     repeat: Mapping[str, Any] | None,
     for_debugger: Callable[[int], None] | None,
-    vehicles: VehicleTemplate | None,
+    launch: StartVehicle,
 ) -> Iterator[NoInjection | None]:
     """The instruction-level fault of a mission, its node's process already starting."""
     if config.instruction is None:
@@ -173,7 +166,7 @@ def _injection(
         config,
         out,
         installed_versions(),
-        functools.partial(fly_golden, vehicles=vehicles),
+        functools.partial(fly_golden, launch=launch),
         repeat=repeat,
         for_debugger=for_debugger,
     )
@@ -188,7 +181,7 @@ def fly_golden(
     out: Path,
     recorder: Recorder,
     *,
-    vehicles: VehicleTemplate | None = None,
+    launch: StartVehicle = start_vehicle,
 ) -> dict[str, Any]:
     """Fly a mission without a fault, from which faults or inputs are drawn.
 
@@ -199,7 +192,7 @@ def fly_golden(
         Interrupted: it was cut off: others would be drawn.
         VehicleProcessError: the vehicle died: there is nothing to draw from.
     """
-    flown = fly_mission(config, out, Watcher(), recorder=recorder, vehicles=vehicles)
+    flown = fly_mission(config, out, Watcher(), recorder=recorder, launch=launch)
     result: dict[str, Any] = json.loads(flown.result.read_text())
     if result["outcome"] == Outcome.INTERRUPTED.value:
         raise Interrupted("interrupted")
@@ -208,11 +201,10 @@ def fly_golden(
     return result
 
 
-def _fly(sortie: Sortie) -> str | None:
+def _fly(flight: Flight, tlog: Path) -> str | None:
     """Fly to the end. A crash of the companion's software is an outcome: returns its traceback."""
-    flight = sortie.flight
     try:
-        flight.fly(sortie.folder.tlog)
+        flight.fly(tlog)
     except MavfiError:
         raise
     except Exception as error:  # the mission-process boundary: a crash is a result
@@ -261,15 +253,15 @@ def _rounded(stages: Mapping[str, float]) -> dict[str, float]:
 
 
 def _write(
-    sortie: Sortie,
+    config: MissionConfig,
+    flight: Flight,
+    folder: RunFolder,
     host: dict[str, Any],
     truth: quality.Truth | None,
     referee: dict[str, Any] | None,
     crash: str | None,
 ) -> None:
-    flight, folder, config = sortie.flight, sortie.folder, sortie.config
-    companion = flight.companion
-    goal = flight.goal_enu_m
+    companion, goal = flight.companion, flight.goal_enu_m
     if truth is not None and goal is not None:
         qof = quality.from_truth(truth, flight.takeover_s, flight.end_s, goal)
     else:

@@ -8,11 +8,14 @@ time_boot_ms.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.streams import TICK_US
+from mavfi_cli.link.memory import memory_pair
+from sitl.autopilot.streams import TICK_US, Preset
 from sitl.server.client import Client
 from sitl.server.pace import Pace
 from sitl.server.simulation import Simulation
@@ -62,9 +65,8 @@ def _await_answer(
     deadline_s = 0.0
     while True:
         messages = client.receive(_LOOK_UP_S)
-        for message in reversed(messages):
-            if message.get_msgId() == _SETPOINT and message.time_boot_ms == stamp_ms:
-                return True
+        if _answers(messages, stamp_ms):
+            return True
         if messages:
             deadline_s = 0.0
             continue
@@ -77,3 +79,68 @@ def _await_answer(
             raise VehicleProcessError(
                 f"the companion gave no answer to {stamp_ms} ms within {limit_s:g} s"
             )
+
+
+def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
+    """Whether the setpoint for a stamp is among the companion's messages."""
+    return any(
+        message.get_msgId() == _SETPOINT and message.time_boot_ms == stamp_ms
+        for message in messages
+    )
+
+
+class EmbeddedVehicle:
+    """The vehicle inside its companion's process, which stands still while the vehicle flies.
+
+    Args:
+        simulation: the vehicle.
+        truth_folder: where the truth is saved at the end.
+
+    Attributes:
+        link: the companion's end of the link. When the companion has answered a tick and waits for
+            more, the vehicle flies the next one.
+        error: what ended the vehicle before its companion did.
+    """
+
+    def __init__(self, simulation: Simulation, truth_folder: Path) -> None:
+        self._simulation = simulation
+        self.link, end = memory_pair("the simulated vehicle")
+        self._client = Client(simulation, end, Preset.LOCKSTEP)
+        self._begun = self._ended = False
+        self.truth_folder = truth_folder
+        self.error: Exception | None = None
+        self.link.on_wait = self._fly_on
+
+    def _fly_on(self) -> None:
+        """Fly a tick if the companion has answered the last, and tell of it."""
+        try:
+            if not self._begun or self._fly_tick():
+                self._begun = True
+                self._client.send_tick()
+        except Exception as error:  # the vehicle's boundary: the companion only loses its link
+            self.error = error
+            self.end()
+
+    def _fly_tick(self) -> bool:
+        """Fly on if the companion has answered; whether it has."""
+        answered = _answers(self._client.receive(0.0), self._simulation.stamp_us // 1000)
+        if answered:
+            self._simulation.advance()
+        return answered
+
+    def end(self) -> None:
+        """Fly as the companion's last answer wants it, and save the truth; harmless when repeated.
+
+        Raises:
+            RecordError: the truth cannot be saved.
+        """
+        if self._ended:
+            return
+        self._ended = True
+        try:
+            if self._begun and self.error is None:
+                self._fly_tick()
+        except Exception as error:  # as above
+            self.error = error
+        self._client.close()
+        self._simulation.save_truth(self.truth_folder)

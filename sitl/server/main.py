@@ -6,7 +6,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from mavfi_cli.core.errors import ConfigError, MavfiError
@@ -15,40 +14,28 @@ from mavfi_cli.link.transport import open_listener, open_transport
 from sitl.autopilot.streams import Preset
 from sitl.server.briefing import write_briefing
 from sitl.server.client import Client
-from sitl.server.lockstep import run_lockstep
+from sitl.server.lockstep import EmbeddedVehicle, run_lockstep
 from sitl.server.options import Options, parse
 from sitl.server.realtime import Door, Realtime
 from sitl.server.simulation import Simulation
 from sitl.vehicle.profile_files import load_profile
 from sitl.world import load_world
 
-
-@dataclass(slots=True)
-class Place:
-    """Where the truth is saved at the end; None for nowhere. May change while it flies."""
-
-    truth: Path | None = None
+_WARM_TICKS = 2
 
 
-def main(arguments: Sequence[str] | None = None, place: Place | None = None) -> int:
-    """Run `python -m sitl`; the exit code. A known error is one line on stderr and 1.
-
-    Args:
-        arguments: of the command line.
-        place: told where the truth goes; asked again when it is saved.
-    """
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `python -m sitl`; the exit code. A known error is one line on stderr and 1."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
-    place = place or Place()
-    place.truth = options.truth
     try:
-        serve(options, place)
+        serve(options)
     except MavfiError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the one boundary
         return 1
     return 0
 
 
-def serve(options: Options, place: Place) -> None:
+def serve(options: Options) -> None:
     """Run until the peer closes, or SIGINT or SIGTERM; save the truth whatever ends it."""
     stopped = _stop_on_signals()
     simulation = _simulation(options)
@@ -58,8 +45,30 @@ def serve(options: Options, place: Place) -> None:
     try:
         run(options, simulation, stopped)
     finally:
-        if place.truth is not None:
-            simulation.save_truth(place.truth)
+        if options.truth is not None:
+            simulation.save_truth(options.truth)
+
+
+def embedded(arguments: Sequence[str], truth_folder: Path) -> EmbeddedVehicle:
+    """The vehicle of `python -m sitl --lockstep` in this process, ready to fly.
+
+    Args:
+        arguments: of the command line, without the companion's descriptor.
+        truth_folder: for the briefing, and at the end the truth.
+
+    Raises:
+        MavfiError: the world, the vehicle, the start or the goal cannot be used.
+    """
+    simulation = _simulation(parse(arguments))
+    write_briefing(simulation, truth_folder)
+    return EmbeddedVehicle(simulation, truth_folder)
+
+
+def warm_up() -> None:
+    """Load and compile all that a flight needs; the code is the same for every world."""
+    simulation = Simulation(load_world("dense", seed=1), load_profile("solo"))
+    for _ in range(_WARM_TICKS):
+        simulation.advance()
 
 
 def _simulation(options: Options) -> Simulation:

@@ -15,24 +15,7 @@ def prepare():
     pass
 
 
-def equip():
-    return None
-
-
-def perform_together(desk, vehicles):
-    """The first mission, off which the others branch before it begins its own work."""
-    desk.become(0)
-    for number, mission in enumerate(desk.missions[1:], 1):
-        if mission["changes"]["world"] == "left-out":
-            continue
-        if desk.fork(number):
-            return perform(mission["changes"], desk.out(number), vehicles)
-        desk.await_fork()
-    return perform(desk.missions[0]["changes"], desk.out(0), vehicles)
-
-
-def perform(changes, out, vehicles):
-    assert vehicles is None
+def perform(changes, out):
     world, _, value = changes.get("world", "fly").partition(":")
     seed = changes.get("seed", 3)
     run = out / f"{world}-{seed}-001"

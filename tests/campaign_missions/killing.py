@@ -14,11 +14,10 @@ from collections import Counter
 from pathlib import Path
 
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.core.processes import MISSION, SLOT, TEMPLATE, VEHICLE, VEHICLES
+from mavfi_cli.core.processes import GUARD, SERVER, WORKER
 
-RUNNER = "runner"
-WITHOUT_VEHICLES = (RUNNER, TEMPLATE, SLOT, MISSION)
-VICTIMS = (*WITHOUT_VEHICLES, VEHICLE, VEHICLES)
+RUNNER, VEHICLE = "runner", "vehicle"
+VICTIMS = (RUNNER, SERVER, GUARD, WORKER)
 _MARK = "MAVFI_TEST_CAMPAIGN"
 
 
@@ -47,7 +46,7 @@ def processes(mark):
 def kill_one(runner, mark, victim):
     """Kill one process of that kind, if missions are flying and there is one now."""
     found = processes(mark)
-    if MISSION not in found:
+    if WORKER not in found:
         return False
     if victim == RUNNER:
         runner.kill()
@@ -104,7 +103,7 @@ def start_fake(folder, count):
 if __name__ == "__main__":  # the runner of the tests: a list of missions without flights
     from mavfi_cli.campaign.missions import PlannedMission
     from mavfi_cli.campaign.run import Options, run_campaign
-    from mavfi_cli.campaign.slots.verdict import CampaignStopped
+    from mavfi_cli.campaign.workers.verdict import CampaignStopped
     from mavfi_cli.mission.config import MissionConfig
 
     folder, count, task = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]

@@ -16,7 +16,7 @@ from plans import planned
 
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.slots.cluster import Cluster, ClusterError
+from mavfi_cli.campaign.workers.cluster import Cluster, ClusterError
 from mavfi_cli.core.errors import ConfigError, RecordError
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")

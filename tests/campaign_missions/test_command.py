@@ -363,18 +363,3 @@ def test_help_needs_no_heavy_import():
         "assert not {'numpy', 'numba', 'sqlite3', 'pyarrow'} & set(sys.modules), sys.modules"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-@pytest.mark.parametrize(
-    ("flags", "fork", "branch"),
-    [((), True, True), (("--no-branch",), True, False), (("--no-fork",), False, True)],
-)
-def test_how_missions_start_can_be_chosen(monkeypatch, tmp_path, flags, fork, branch):
-    asked = []
-    monkeypatch.setattr(
-        "mavfi_cli.campaign.run.fly_missing", lambda _ledger, options, *_: asked.append(options)
-    )
-    line = ["run", str(written(tmp_path)), "--out", str(tmp_path / "out"), "--quiet", *flags]
-    done = CliRunner().invoke(command.campaign, line)
-    assert done.exit_code == 0, done.output
-    assert [(options.fork, options.branch) for options in asked] == [(fork, branch)]

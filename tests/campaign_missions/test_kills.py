@@ -7,7 +7,6 @@ from functools import partial
 
 from killing import (
     RUNNER,
-    WITHOUT_VEHICLES,
     complete_with_kills,
     kill_one,
     processes,
@@ -16,7 +15,7 @@ from killing import (
 )
 from plans import planned
 
-from mavfi_cli.core.processes import MISSION, SLOT
+from mavfi_cli.core.processes import GUARD, WORKER
 
 MISSIONS, KILLS = 40, 8
 
@@ -25,9 +24,7 @@ def test_random_kills_lose_and_double_nothing(tmp_path):
     undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
     assert start_fake(undisturbed, MISSIONS).wait() == 0
     start = partial(start_fake, disturbed, MISSIONS)
-    hits = complete_with_kills(
-        start, str(disturbed), KILLS, seed=1, pause_s=0.2, victims=WITHOUT_VEHICLES
-    )
+    hits = complete_with_kills(start, str(disturbed), KILLS, seed=1, pause_s=0.2)
     assert hits.total() == KILLS
     assert results_of(disturbed) == results_of(undisturbed)
     assert [number for number, *_ in results_of(disturbed)] == list(range(MISSIONS))
@@ -36,7 +33,7 @@ def test_random_kills_lose_and_double_nothing(tmp_path):
 def test_nothing_goes_on_when_the_runner_is_killed(tmp_path):
     mark = str(tmp_path / "campaign")
     runner = start_fake(tmp_path / "campaign", 1000)
-    while MISSION not in processes(mark):
+    while WORKER not in processes(mark):
         time.sleep(0.05)
     assert kill_one(runner, mark, RUNNER)
     runner.wait()
@@ -46,14 +43,14 @@ def test_nothing_goes_on_when_the_runner_is_killed(tmp_path):
         time.sleep(0.05)
 
 
-def test_a_killed_slot_costs_an_attempt_and_no_mission(campaign, monkeypatch):
+def test_a_killed_guard_costs_an_attempt_and_no_mission(campaign, monkeypatch):
     mark = str(campaign.folder)
     monkeypatch.setenv("MAVFI_TEST_CAMPAIGN", mark)
     struck = []
 
     def strike(progress):
-        if not struck and progress.running == 2 and len(processes(mark).get(MISSION, [])) == 2:
-            struck.append(processes(mark)[SLOT][0])
+        if not struck and progress.running == 2 and len(processes(mark).get(WORKER, [])) == 2:
+            struck.append(processes(mark)[GUARD][0])
             os.kill(struck[0], signal.SIGKILL)
 
     campaign.notes.on_progress = strike
@@ -61,4 +58,4 @@ def test_a_killed_slot_costs_an_attempt_and_no_mission(campaign, monkeypatch):
         attempts = [result.attempts for result in ledger.results()]
     assert struck
     assert sorted(attempts) == [1, 1, 2]
-    assert campaign.notes.lines[0].endswith("its slot was killed; begun again")
+    assert campaign.notes.lines[0].endswith("its guard was killed; begun again")

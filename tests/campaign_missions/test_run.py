@@ -16,7 +16,7 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.outcome import Injected, State
 from mavfi_cli.campaign.run import ATTEMPTS
-from mavfi_cli.campaign.slots.verdict import CampaignStopped
+from mavfi_cli.campaign.workers.verdict import CampaignStopped
 from mavfi_cli.core.errors import ConfigError, Interrupted
 
 

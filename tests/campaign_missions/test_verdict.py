@@ -1,7 +1,7 @@
 """What the end of a mission's process means."""
 
-from mavfi_cli.campaign.slots.seats import Ended
-from mavfi_cli.campaign.slots.verdict import judge
+from mavfi_cli.campaign.workers.base import Ended
+from mavfi_cli.campaign.workers.verdict import judge
 from mavfi_cli.core.errors import Interrupted
 
 

@@ -9,13 +9,13 @@ import pytest
 from fake_autopilot import FakePX4
 
 from mavfi_cli.link import session
-from mavfi_cli.mission import flight, sortie
+from mavfi_cli.mission import flight
 
 
 @pytest.fixture
 def refused(command_line, tmp_path, monkeypatch):
     """Run `mavfi fly`, which must end with one line; the line. Also without --quiet."""
-    monkeypatch.setattr(sortie, "is_compiled", lambda: True)  # else there is a line about that
+    monkeypatch.setattr("mavfi_cli.mission.run.is_compiled", lambda: True)  # else a line says so
 
     def run(*arguments, code=1):
         left, out, err = command_line("fly", *arguments)
@@ -40,7 +40,7 @@ def refused(command_line, tmp_path, monkeypatch):
     ],
 )
 def test_an_unknown_name_gets_the_nearest(refused, option, given, kind, nearest):
-    line = refused(option, given, code=1 if option in ("--world", "--vehicle") else 2)
+    line = refused(option, given, code=2)
     assert line.startswith(f"unknown {kind} {given!r}: did you mean {nearest!r}? Known: ")
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mavfi_cli.mission import sortie
+from mavfi_cli.mission import run
 from mavfi_cli.mission.record.run_folder import load_run
 
 SHORT = ("fly", "--world", "farm", "--seed=5", "--start=2,2,0", "--goal=10,6,5")
@@ -13,14 +13,14 @@ SHORT = ("fly", "--world", "farm", "--seed=5", "--start=2,2,0", "--goal=10,6,5")
 @pytest.fixture
 def compiled(monkeypatch):
     """Whatever numba's cache holds on the machine of the tests."""
-    monkeypatch.setattr(sortie, "is_compiled", lambda: True)
+    monkeypatch.setattr(run, "is_compiled", lambda: True)
 
 
 def test_the_first_flight_on_a_machine_says_why_it_waits(command_line, monkeypatch):
-    monkeypatch.setattr(sortie, "is_compiled", lambda: False)
+    monkeypatch.setattr(run, "is_compiled", lambda: False)
     short = (*SHORT, "--no-picture", "--time-limit=1")
     _, _, err = command_line(*short)
-    assert err.splitlines()[:2] == [sortie.COMPILING, "Flying solo in farm, seed 5"]
+    assert err.splitlines()[:2] == [run.COMPILING, "Flying solo in farm, seed 5"]
     assert command_line(*short, "--quiet")[2] == ""
 
 

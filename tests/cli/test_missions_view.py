@@ -10,9 +10,9 @@ from mavfi_cli.cli.missions_view import missions_view, progress_line
 
 def progress(over, outcomes, **changes):
     values = {
-        "total": 100, "before": 0, "over": over, "running": 2, "flights": 2, "again": 0,
+        "total": 100, "before": 0, "over": over, "running": 2, "again": 0,
         "elapsed_s": 36.0,
-        "inside_s": 70.0, "slots": 2, "outcomes": outcomes,
+        "inside_s": 70.0, "workers": 2, "outcomes": outcomes,
     }  # fmt: skip
     return Progress(**(values | changes))
 
@@ -39,13 +39,6 @@ def test_one_setting_or_many_are_told_by_one_rate(settings):
 
 def test_before_the_first_mission_is_over_there_is_no_rate():
     assert progress_line(progress(0, {"golden": Counter()})) == "0/100 missions, 2 flying"
-
-
-def test_missions_that_fly_as_one_are_told_with_their_flights():
-    started = {"running": 16, "flights": 2}
-    assert progress_line(progress(0, {}, **started)) == "0/100 missions, 16 flying in 2 flights"
-    last = progress_line(progress(0, {}, running=5, flights=1))
-    assert last == "0/100 missions, 5 flying in 1 flight"
 
 
 def test_plain_lines_come_every_ten_seconds_and_at_the_end(capsys):

@@ -13,6 +13,7 @@ import pytest
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
 from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.memory import memory_pair
 from mavfi_cli.link.transport import Transport, open_listener, open_transport
 
 Pair = tuple[Transport, Transport]
@@ -22,6 +23,13 @@ WAIT_S = 5.0
 def _socket_pair() -> Iterator[Pair]:
     ends = socket.socketpair()
     near, far = (open_transport(f"fd:{end.detach()}") for end in ends)
+    yield near, far
+    near.close()
+    far.close()
+
+
+def _memory() -> Iterator[Pair]:
+    near, far = memory_pair("in memory")
     yield near, far
     near.close()
     far.close()
@@ -110,8 +118,10 @@ MAKERS: dict[str, Callable[[], Iterator[Pair]]] = {
     "udp listener": lambda: _listened("udpin", "udpout"),
     "tcp listener": lambda: _listened("tcpin", "tcp"),
     "serial": _serial,
+    "memory": _memory,
 }
-STREAMS = ("socket pair", "tcp", "tcp listener")
+STREAMS = ("socket pair", "tcp", "tcp listener", "memory")
+WITH_DESCRIPTOR = tuple(kind for kind in MAKERS if kind != "memory")
 
 
 @pytest.fixture(params=MAKERS)
@@ -174,6 +184,7 @@ def test_nothing_to_receive_gives_no_bytes(pair: Pair) -> None:
         assert far.receive(timeout_s) == b""
 
 
+@pytest.mark.parametrize("kind", WITH_DESCRIPTOR, indirect=True)
 def test_the_descriptor_becomes_readable(pair: Pair) -> None:
     near, far = pair
     _introduce(near, far)
@@ -188,6 +199,7 @@ def test_closing_twice_is_harmless(pair: Pair) -> None:
         transport.close()
 
 
+@pytest.mark.parametrize("kind", WITH_DESCRIPTOR, indirect=True)
 def test_a_wait_without_end_is_ended_by_data(pair: Pair) -> None:
     near, far = pair
     _introduce(near, far)
@@ -206,6 +218,18 @@ def test_a_closed_stream_is_a_lost_link_at_the_other_end(pair: Pair) -> None:
     assert _receive(near, 3) == [0, 1, 2]  # what was sent before still arrives
     with pytest.raises(LinkLost):
         near.receive(WAIT_S)
+
+
+def test_in_memory_the_other_end_acts_while_one_waits() -> None:
+    near, far = memory_pair("in memory")
+    near.on_wait = lambda: far.send(b"answer to " + far.receive(0.0))
+    near.send(b"one")
+    assert near.receive(WAIT_S) == b"answer to one"
+    near.on_wait = far.close
+    with pytest.raises(LinkLost, match="in memory: the peer closed the connection"):
+        near.receive(WAIT_S)
+    with pytest.raises(LinkLost):
+        near.send(b"two")
 
 
 def test_a_serial_device_that_goes_away_is_a_lost_link() -> None:

@@ -56,16 +56,3 @@ def test_both_directions_are_recorded_and_what_came_early_comes_first(ends, tmp_
     with ends[0].recording(tmp_path / "flight.tlog"):
         exchange(ends, 1)
     assert told(tmp_path / "flight.tlog") == records(0) + records(1)
-
-
-def test_it_goes_on_in_a_copy(ends, tmp_path):
-    trunk, branch = tmp_path / "trunk.tlog", tmp_path / "branch.tlog"
-    with ends[0].recording(trunk):
-        exchange(ends, 0)
-        exchange(ends, 2)  # two seconds later: what came before is on the disk
-        ends[0].go_on_in(branch)
-        exchange(ends, 3)
-    assert told(branch) == records(0) + records(2) + records(3)
-    left = told(trunk)
-    assert left
-    assert left == (records(0) + records(2))[: len(left)]

@@ -10,6 +10,7 @@ import pytest
 
 from mavfi_cli.autonomy import collision
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.vehicle import VehicleProcess
 
 MAVLOGDUMP = Path(sys.executable).parent / "mavlogdump.py"
 
@@ -47,9 +48,8 @@ def test_interrupted_by_ctrl_c_the_record_is_whole(fly_short, at_event, text):
 def test_ctrl_c_on_the_command_line_exits_with_130(flying):
     mission = flying()
     mission.await_line("flies a plan")
-    with mission.vehicle_descriptor() as _vehicle:
-        mission.process.send_signal(signal.SIGINT)
-        code, out, _, folder = mission.end()
+    mission.process.send_signal(signal.SIGINT)
+    code, out, _, folder = mission.end()
     assert code == 130
     assert out.startswith("INTERRUPTED\n")
     assert load_run(folder).result["outcome"] == "interrupted"
@@ -64,14 +64,21 @@ def test_ctrl_c_on_the_command_line_exits_with_130(flying):
     }
 
 
-def test_a_killed_mission_leaves_its_tlog_and_no_vehicle(flying, mavfi, await_end):
-    mission = flying()
-    mission.await_line("flies a plan")
+def test_a_killed_mission_by_the_wall_clock_leaves_no_vehicle(flying, await_end):
+    mission = flying("--realtime")
+    mission.await_line("waiting until ready")
     with mission.vehicle_descriptor() as vehicle:
         mission.process.kill()
-        code, _, _, folder = mission.end()
-        assert code == -signal.SIGKILL
+        mission.process.wait()
         await_end(vehicle)
+
+
+def test_a_killed_mission_leaves_its_tlog(flying, mavfi):
+    mission = flying()
+    mission.await_line("flies a plan")
+    mission.process.kill()
+    code, _, _, folder = mission.end()
+    assert code == -signal.SIGKILL
     assert {path.name for path in folder.iterdir()} == {"flight.tlog"}
     assert dumped(folder / "flight.tlog").count("LOCAL_POSITION_NED") > 400
     shown = mavfi("show", folder)
@@ -80,7 +87,7 @@ def test_a_killed_mission_leaves_its_tlog_and_no_vehicle(flying, mavfi, await_en
 
 
 def test_a_vehicle_that_is_killed_is_a_lost_link(fly_short, at_event, kill_vehicle):
-    folder = fly_short(at_event("flies a plan", kill_vehicle))
+    folder = fly_short(at_event("flies a plan", kill_vehicle), launch=VehicleProcess)
     run = load_run(folder.path)
     assert run.result["outcome"] == "link_lost"
     assert "SIGKILL" in run.result["reason"]

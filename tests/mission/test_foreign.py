@@ -13,7 +13,7 @@ from fake_autopilot import FakeArduCopter, FakePX4
 from mavfi_cli.core.errors import CommandRefused, ConfigError, Interrupted, NoAutopilot
 from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.session import SessionSettings
-from mavfi_cli.mission import flight, sortie
+from mavfi_cli.mission import flight, run
 from mavfi_cli.mission.record.run_folder import load_run
 
 SPEED = 2.0
@@ -189,7 +189,7 @@ def test_the_link_opens_only_when_everything_is_loaded(
             probe.bind(("127.0.0.1", free_port))
         loaded.append(True)
 
-    monkeypatch.setattr(sortie, "warm_up", warm_up)
+    monkeypatch.setattr(run, "warm_up", warm_up)
     with pytest.raises(NoAutopilot):
         fly_short(link=f"udpin:127.0.0.1:{free_port}")
     assert loaded == [True]

@@ -109,30 +109,41 @@ class Spec:
         Raises:
             ConfigError: nothing to fly, more than MOST, or a combination that makes no mission.
         """
-        if (planned := sum(self._size(setting) for setting in self.settings)) > MOST:
-            raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
-        points = [
-            (setting, Point(values={**self.fixed, **values}), labels)
-            for setting in self.settings
-            for values, labels in self._combinations(setting)
-        ]
-        counts = [
-            self.repetitions if setting.repetitions is None else setting.repetitions
-            for setting, _, _ in points
-        ]
-        if not points or not max(counts):
-            raise ConfigError(f"campaign {self.name!r} has no mission: an empty list of values")
+        points = self._points()
         return [
             self._mission(point, labels, repetition)
-            for repetition in range(max(counts))
-            for (_, point, labels), count in zip(points, counts, strict=True)
+            for repetition in range(max(count for *_, count in points))
+            for point, labels, count in points
             if repetition < count
         ]
 
+    def kinds(self) -> list[PlannedMission]:
+        """The first missions of the list, one of each combination; the others differ in seeds.
+
+        Raises:
+            ConfigError: as `missions`.
+        """
+        return [self._mission(point, labels, 0) for point, labels, _ in self._points()]
+
+    def _points(self) -> list[tuple[Point, dict[str, Label], int]]:
+        """Each combination with its labels and its repetitions."""
+        if (planned := sum(self._size(setting) for setting in self.settings)) > MOST:
+            raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
+        points = [
+            (Point(values={**self.fixed, **values}), labels, self._count(setting))
+            for setting in self.settings
+            for values, labels in self._combinations(setting)
+        ]
+        if not points:
+            raise ConfigError(f"campaign {self.name!r} has no mission: an empty list of values")
+        return points
+
+    def _count(self, setting: Setting) -> int:
+        return self.repetitions if setting.repetitions is None else setting.repetitions
+
     def _size(self, setting: Setting) -> int:
         """How many missions a setting has, without making them."""
-        count = self.repetitions if setting.repetitions is None else setting.repetitions
-        return count * math.prod(map(len, {**self.axes, **setting.axes}.values()))
+        return self._count(setting) * math.prod(map(len, {**self.axes, **setting.axes}.values()))
 
     def _combinations(self, setting: Setting) -> Iterator[tuple[dict[str, Any], dict[str, Label]]]:
         axes = {**self.axes, **setting.axes}

@@ -1,4 +1,4 @@
-"""A campaign on dask.distributed: the same runner, whose slots are the threads of the workers."""
+"""A campaign on dask.distributed: the same runner, whose workers are the threads of a cluster."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import contextlib
 import queue
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.slots.local import TASK
-from mavfi_cli.campaign.slots.remote import Answer, Order, fly, unpack, worker_versions
-from mavfi_cli.campaign.slots.seats import Assignment, Ended, Seats
+from mavfi_cli.campaign.workers.base import Assignment, Ended, Workers
+from mavfi_cli.campaign.workers.local import TASK
+from mavfi_cli.campaign.workers.remote import Answer, Order, fly, unpack, worker_versions
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
@@ -31,7 +31,7 @@ class ClusterError(MavfiError):
     """A cluster that cannot be used."""
 
 
-class Cluster(Seats):
+class Cluster(Workers):
     """The workers of one scheduler.
 
     Args:
@@ -66,9 +66,8 @@ class Cluster(Seats):
             self._looked_s = time.monotonic()
         return _BACKLOG * self._threads - len(self._futures)
 
-    def start(self, missions: Sequence[Assignment], limit_s: float) -> None:
+    def start(self, mission: Assignment, limit_s: float) -> None:
         """Hand a mission out."""
-        (mission,) = missions
         number = mission.number
         order = Order(
             number=number,

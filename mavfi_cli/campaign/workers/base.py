@@ -1,9 +1,9 @@
-"""Where missions fly: what the runner knows of slots on this machine, and of a cluster."""
+"""Workers fly missions: what the runner knows of those on this machine, and of a cluster's."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -14,11 +14,11 @@ class Ended:
 
     Attributes:
         exit: code with which the mission's process ended; None where it was killed.
-        signal: that killed it; None where its slot was killed too, or the time ran out.
+        signal: that killed it; None where its guard was killed too, or the time ran out.
         timeout: the limit of wall time passed.
         report: the mission's own last words: folder, or error and text, or traceback.
         lost: why nobody knows how it ended.
-        wall_s: of the whole attempt, the slot's own work included.
+        wall_s: of the whole attempt, the guard's own work included.
     """
 
     number: int
@@ -26,7 +26,7 @@ class Ended:
     signal: int | None = None
     timeout: bool = False
     report: Mapping[str, Any] | None = None
-    lost: str = "its slot was killed"
+    lost: str = "its guard was killed"
     wall_s: float = 0.0
 
 
@@ -45,7 +45,7 @@ class Assignment:
     out: str
 
 
-class Seats(ABC):
+class Workers(ABC):
     """Keeps missions flying. A context manager that ends them."""
 
     def __enter__(self) -> Self:
@@ -60,13 +60,8 @@ class Seats(ABC):
         """How many missions may be started now."""
 
     @abstractmethod
-    def start(self, missions: Sequence[Assignment], limit_s: float) -> None:
-        """Start missions that begin alike as one flight; or a single one.
-
-        Args:
-            missions: what to fly.
-            limit_s: of wall time, of each.
-        """
+    def start(self, mission: Assignment, limit_s: float) -> None:
+        """Start a mission that has `limit_s` of wall time."""
 
     @abstractmethod
     def wait(self, timeout_s: float) -> list[Ended]:

@@ -1,7 +1,7 @@
 """A worker's side of a campaign on a cluster: one mission in a fresh process, packed for its way.
 
-Imported by workers of dask.distributed; knows nothing of dask itself. Each thread of a worker keeps
-one slot, so a worker with n threads flies n missions at a time.
+Imported by workers of dask.distributed; knows nothing of dask itself. Each thread of a dask
+worker keeps a worker of ours, so a dask worker with n threads flies n missions at a time.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.slots.desk import SCRATCH
-from mavfi_cli.campaign.slots.local import Slots
-from mavfi_cli.campaign.slots.seats import Assignment, Ended
+from mavfi_cli.campaign.workers.base import Assignment, Ended
+from mavfi_cli.campaign.workers.local import LocalWorkers
+from mavfi_cli.core.fork_server import SCRATCH
 from mavfi_cli.mission.record.run_folder import FAULT, RESULT
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
@@ -72,22 +72,22 @@ def fly(order: Order) -> Answer:
     place.mkdir()
     (place / ".profiles").symlink_to(_scratch() / "profiles")
     try:
-        slots = _slots(order.task)
+        workers = _workers(order.task)
         mission = Assignment(number=order.number, changes=order.changes, out=str(place))
-        slots.start([mission], order.limit_s)
+        workers.start(mission, order.limit_s)
         ended: list[Ended] = []
         while not ended:
-            ended = slots.wait(60.0)
+            ended = workers.wait(60.0)
         return Answer(ended=asdict(ended[0]), files=_packed(place, order))
     finally:
         shutil.rmtree(place, ignore_errors=True)
 
 
-def _slots(task: str) -> Slots:
-    """The slot of this thread."""
-    kept: dict[str, Slots] = _thread.__dict__.setdefault("slots", {})
+def _workers(task: str) -> LocalWorkers:
+    """Those of this thread, one at a time."""
+    kept: dict[str, LocalWorkers] = _thread.__dict__.setdefault("workers", {})
     if task not in kept:
-        kept[task] = Slots(1, task)
+        kept[task] = LocalWorkers(1, task)
     return kept[task]
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.outcome import State
-from mavfi_cli.campaign.slots.desk import ERRORS, SCRATCH
-from mavfi_cli.campaign.slots.seats import Ended
+from mavfi_cli.campaign.workers.base import Ended
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
+from mavfi_cli.core.fork_server import ERRORS, SCRATCH
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import RunFolder
 

@@ -1,0 +1,37 @@
+"""What a worker of a campaign does: fly one mission, and leave its run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+def prepare() -> None:
+    """Import and load all that a mission needs; every worker is a fork of this state."""
+    import pyarrow.parquet  # noqa: F401  # only imported: its threads start at the first use
+
+    import mavfi_cli.mission.run
+    from mavfi_cli import autonomy
+    from mavfi_cli.mission import vehicle
+
+    assert mavfi_cli.mission.run
+    autonomy.warm_up()
+    vehicle.warm_up()
+
+
+def perform(changes: Mapping[str, Any], out: Path) -> Path:
+    """Fly one mission; its run folder.
+
+    Args:
+        changes: of the mission, by `missions.changes_of`.
+        out: where the run folder goes.
+
+    Raises:
+        MavfiError: the mission could not begin, or its record could not be written.
+    """
+    from mavfi_cli.campaign.missions import config_from
+    from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.run import fly_mission
+
+    return fly_mission(config_from(changes), out, Watcher()).path

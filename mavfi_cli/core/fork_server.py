@@ -1,0 +1,293 @@
+"""A process that has loaded everything once, and forks a fresh worker for every order.
+
+    python -m mavfi_cli.core.fork_server FD MODULE
+
+    client ──► server: loads MODULE, never works
+                  ├─ guard: parent, watch and reaper of one worker
+                  │     └─ worker: MODULE.perform(task, folder)
+                  └─ guard ...
+
+A worker is a fork of a process with a single thread that has done nothing but load. It dies with
+its guard; when it ends, or its time runs out, the guard ends all that it has started and only then
+reports. When the client closes the channel of an order, or dies, the guard ends the worker.
+Whatever is killed, nothing goes on in secret and nobody waits for ever.
+
+`multiprocessing` has a fork server too. There each child keeps the server's pipe open, so one that
+hangs outlives a killed client; each child imports the client's main module again; nothing reaps
+what a child leaves; and a daemonic process, as dask's workers are, may not use it.
+
+FD is a socket to the client. Each packet on it is an order in JSON, {"task", "folder", "limit_s"},
+with the descriptor of a channel on which the guard says {"pid"} at the begin and at the end
+{"exit" | "signal" | "timeout", "report", "wall_s"}.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import gc
+import importlib
+import json
+import math
+import os
+import resource
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn, Protocol, cast
+
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.processes import (
+    GUARD,
+    ONE_THREAD,
+    SERVER,
+    WORKER,
+    become_reaper,
+    call_this_process,
+    die_with,
+    end_children,
+    threads,
+)
+
+PACKET = 1 << 17  # bytes, of an order or a report
+ERRORS, SCRATCH = "stderr.txt", "tmp"
+_READY = b"ready"
+_STOP_S = 10.0  # from the closing of the server until it is killed
+_TRACEBACK = 8000  # characters of a traceback that are reported, the last ones
+_LONGEST_WAIT_S = 3600.0
+
+
+class Module(Protocol):
+    """What a module has that workers run."""
+
+    def prepare(self) -> None:
+        """Load everything, once; starts no thread."""
+
+    def perform(self, task: Mapping[str, Any], folder: Path) -> Path:
+        """Do a task; the folder that it left, in `folder`."""
+
+
+class ForkServerFailed(MavfiError):
+    """The process that forks the workers could not start."""
+
+
+# The client's side --------------------------------------------------------------------------------
+
+
+class ForkServer:
+    """Starts workers; the server itself is started with the first, and again where it was killed.
+
+    Args:
+        module: name of the module whose `perform` does the work.
+    """
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+        self._process: subprocess.Popen[bytes] | None = None
+        self._control: socket.socket | None = None
+
+    def start(self, task: Mapping[str, Any], folder: Path, limit_s: float) -> socket.socket:
+        """Have a fresh worker do a task; the channel on which its guard reports.
+
+        Args:
+            task: plain values.
+            folder: for what the worker leaves, its standard error and temporary files included.
+            limit_s: wall time after which it is killed.
+
+        Raises:
+            ForkServerFailed: the server cannot be started.
+        """
+        order = json.dumps({"task": task, "folder": str(folder), "limit_s": limit_s}).encode()
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs, contextlib.ExitStack() as undo:
+            undo.enter_context(ours)
+            for _ in range(2):
+                try:
+                    socket.send_fds(self._running(), [order], [theirs.fileno()])
+                except OSError:  # it was killed since
+                    self.close()
+                    continue
+                undo.pop_all()
+                return ours
+        raise ForkServerFailed("the process that forks the workers ends at once")
+
+    def _running(self) -> socket.socket:
+        if self._control is not None:
+            return self._control
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            line = [sys.executable, "-m", "mavfi_cli.core.fork_server", str(theirs.fileno())]
+            self._process = subprocess.Popen(
+                [*line, self._module],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, **ONE_THREAD},
+                start_new_session=True,  # Ctrl-C is for the client
+            )
+        said = b""
+        with contextlib.suppress(OSError):
+            said = ours.recv(len(_READY))
+        if said != _READY:
+            ours.close()
+            self._process.wait()
+            raise ForkServerFailed("the process that forks the workers could not start")
+        self._control = ours
+        return ours
+
+    def close(self) -> None:
+        """End the server; guards and workers end with their channels."""
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+        if self._process is not None:
+            try:
+                self._process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._process = None
+
+
+# The server ---------------------------------------------------------------------------------------
+
+
+def main() -> NoReturn:
+    """Load the module, then fork a guard for every order until the client closes its end."""
+    call_this_process(SERVER)
+    control = socket.socket(fileno=int(sys.argv[1]))
+    module = cast(Module, importlib.import_module(sys.argv[2]))
+    module.prepare()
+    gc.collect()
+    if (count := threads()) > 1:
+        sys.exit(f"error: {count} threads where one is needed: a fork would lack the others")
+    gc.freeze()  # the collector would touch, and so copy, every page that forks share
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the guards
+    control.send(_READY)
+    while True:
+        packet, channels, _, _ = socket.recv_fds(control, PACKET, 1)
+        if not packet:
+            os._exit(0)  # an orderly end would have native libraries complain of what is loaded
+        if os.fork() == 0:
+            control.close()
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            _guard(json.loads(packet), socket.socket(fileno=channels[0]), module)
+        os.close(channels[0])
+
+
+# The guard ----------------------------------------------------------------------------------------
+
+
+def _guard(order: Mapping[str, Any], channel: socket.socket, module: Module) -> NoReturn:
+    """The whole life of a guard."""
+    call_this_process(GUARD)
+    become_reaper()
+    begun_s, guard = time.monotonic(), os.getpid()
+    reading, writing = os.pipe()
+    worker = os.fork()
+    if worker == 0:
+        channel.close()
+        os.close(reading)
+        _work(order, module, guard, writing)
+    os.close(writing)
+    with contextlib.suppress(OSError):  # the client is gone: so will be the guard
+        channel.send(json.dumps({"pid": worker}).encode())
+        late = _await(worker, channel, begun_s + float(order["limit_s"]))
+        _, status = os.waitpid(worker, 0)
+        end_children()
+        told: dict[str, Any] = {"report": _last_words(reading)}
+        if late:
+            told["timeout"] = True
+        elif os.WIFSIGNALED(status):
+            told["signal"] = os.WTERMSIG(status)
+        else:
+            told["exit"] = os.WEXITSTATUS(status)
+        told["wall_s"] = round(time.monotonic() - begun_s, 6)
+        channel.send(json.dumps(told).encode())
+    end_children()
+    os._exit(0)
+
+
+def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
+    """Until the worker has ended; True where it was killed because its time ran out.
+
+    Raises:
+        ConnectionError: the client has closed the channel.
+    """
+    process = os.pidfd_open(worker)
+    poller = select.poll()
+    poller.register(process, select.POLLIN)
+    poller.register(channel, select.POLLIN)
+    late = False
+    while True:
+        left_s = math.inf if late else max(0.0, deadline_s - time.monotonic())
+        ready = {descriptor for descriptor, _ in poller.poll(1e3 * min(left_s, _LONGEST_WAIT_S))}
+        if channel.fileno() in ready:  # nothing is said meanwhile
+            raise ConnectionError("the client has closed")
+        if process in ready:
+            return late
+        if left_s <= 0.0:
+            late = True
+            os.kill(worker, signal.SIGKILL)
+
+
+def _last_words(reading: int) -> Any:
+    """The worker's report; None where it was ended before it had made a whole one."""
+    with open(reading, "rb") as pipe:
+        said = pipe.read()
+    try:
+        return json.loads(said)
+    except ValueError:
+        return None
+
+
+# The worker ---------------------------------------------------------------------------------------
+
+
+def _work(order: Mapping[str, Any], module: Module, guard: int, writing: int) -> NoReturn:
+    """The whole life of a worker, in a process group of its own."""
+    code, report = 1, {}
+    try:
+        call_this_process(WORKER)
+        os.setsid()
+        die_with(guard)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        folder = Path(order["folder"])
+        _own_surroundings(folder)
+        report = {"folder": module.perform(order["task"], folder).name}
+        code = 0
+    except MavfiError as error:
+        report = {"error": type(error).__name__, "text": str(error)}
+    except BaseException:  # the process boundary: the traceback goes to the client
+        report = {"traceback": traceback.format_exc()[-_TRACEBACK:]}
+    finally:
+        with contextlib.suppress(OSError):
+            os.write(writing, json.dumps(report).encode())
+        os._exit(code)
+
+
+def _own_surroundings(folder: Path) -> None:
+    """Streams and temporary files of a worker of its own."""
+    scratch = folder / SCRATCH
+    scratch.mkdir(parents=True, exist_ok=True)
+    os.environ["TMPDIR"] = tempfile.tempdir = str(scratch)
+    nothing = os.open(os.devnull, os.O_RDWR)
+    errors = os.open(folder / ERRORS, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    for stream, target in ((0, nothing), (1, nothing), (2, errors)):
+        os.dup2(target, stream)
+    for descriptor in (nothing, errors):
+        os.close(descriptor)
+    faulthandler.enable(sys.stderr)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""The simulated vehicle of a mission: in the mission's own process, or beside it in another.
+
+Either way companion and vehicle share the bytes of a MAVLink link, and the folder in which the
+vehicle leaves its briefing and, at the end, the referee's truth. This is the only module of the
+companion's side that imports the vehicle's, and only to start it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from mavfi_cli.core.errors import MavfiError, VehicleProcessError
+from mavfi_cli.link.transport import Transport, open_transport
+from mavfi_cli.mission.config import MissionConfig
+
+
+class Vehicle(Protocol):
+    """A simulated vehicle that flies."""
+
+    @property
+    def link(self) -> Transport:
+        """The companion's end of the link."""
+
+    def end(self) -> VehicleProcessError | None:
+        """Close the link and wait until the truth is saved; why the vehicle ended before that."""
+
+
+class EmbeddedVehicle:
+    """The vehicle in this process; it flies while the companion waits for it.
+
+    Args:
+        config: the mission.
+        truth_folder: where the vehicle leaves briefing and truth.
+
+    Raises:
+        MavfiError: the world, the vehicle, the start or the goal cannot be used.
+    """
+
+    def __init__(self, config: MissionConfig, truth_folder: Path) -> None:
+        from sitl.server.main import embedded
+
+        self._vehicle = embedded(_arguments(config), truth_folder)
+        self.link: Transport = self._vehicle.link
+
+    def end(self) -> VehicleProcessError | None:
+        """See `Vehicle`.
+
+        Raises:
+            RecordError: the truth cannot be saved.
+        """
+        self._vehicle.end()
+        error = self._vehicle.error
+        if error is None:
+            return None
+        known = isinstance(error, MavfiError)
+        return VehicleProcessError(
+            str(error) if known else f"the vehicle ended with {type(error).__name__}: {error}"
+        )
+
+
+def warm_up() -> None:
+    """Load and compile all that a vehicle in this process needs."""
+    from sitl.server.main import warm_up
+
+    warm_up()
+
+
+class VehicleProcess:
+    """`python -m sitl` in lockstep. Closing the socket ends it and saves the referee's truth.
+
+    Args:
+        config: the mission.
+        truth_folder: where the vehicle leaves briefing and truth.
+
+    Raises:
+        VehicleProcessError: it cannot be started.
+    """
+
+    def __init__(self, config: MissionConfig, truth_folder: Path) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        line = [sys.executable, "-m", "sitl", *_arguments(config), "--truth", str(truth_folder)]
+        line += ["--lockstep", "--fd", str(theirs.fileno())]
+        if config.realtime:
+            line += ["--speed", "1"]
+        with theirs:
+            try:
+                self._process = subprocess.Popen(
+                    line,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=self._errors,
+                    pass_fds=[theirs.fileno()],
+                    start_new_session=True,  # Ctrl-C is for the companion, which then closes
+                )
+            except OSError as error:
+                ours.close()
+                self._errors.close()
+                raise VehicleProcessError(f"cannot start the vehicle: {error}") from None
+        self.link: Transport = open_transport(f"fd:{ours.detach()}")
+
+    def end(self, timeout_s: float = 20.0) -> VehicleProcessError | None:
+        """See `Vehicle`; a vehicle that does not end is killed."""
+        self.link.close()
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._errors.closed:
+            return None
+        with self._errors:
+            return self._failure(self._process.returncode)
+
+    def _failure(self, code: int) -> VehicleProcessError | None:
+        if code == 0:
+            return None
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        told = [line for line in lines if line.startswith("error: ")]
+        if told:
+            return VehicleProcessError(told[-1].removeprefix("error: "))
+        killed = code < 0
+        how = f"was killed by {signal.Signals(-code).name}" if killed else f"ended with code {code}"
+        last = f": {lines[-1]}" if lines else ""
+        return VehicleProcessError(f"the vehicle process {how}{last}")
+
+
+def _arguments(config: MissionConfig) -> list[str]:
+    """Of `python -m sitl`, but for the link and the folder of the truth."""
+    line = [
+        "--world", config.world, "--seed", str(config.seed_of_world), "--vehicle", config.vehicle,
+        "--camera-size", f"{config.camera_columns}x{config.camera_rows}",
+        "--camera-rate", f"{config.camera_rate_hz:g}",
+    ]  # fmt: skip
+    for name, place in (("--start", config.start), ("--goal", config.goal)):
+        if place is not None:
+            line.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")
+    return line
+
+
+@dataclass(frozen=True, slots=True)
+class OtherEnd:
+    """What is at the other end of the link: a simulated vehicle of our own, or somebody else's.
+
+    Attributes:
+        link: our end.
+        vehicle: ours; None: somebody else's.
+        truth_folder: where our vehicle leaves briefing and truth.
+    """
+
+    link: Transport
+    vehicle: Vehicle | None = None
+    truth_folder: Path | None = None
+
+    def failure(self) -> MavfiError | None:
+        """End the vehicle; why it ended before that.
+
+        Raises:
+            RecordError: it cannot save its truth.
+        """
+        return None if self.vehicle is None else self.vehicle.end()
+
+
+StartVehicle = Callable[[MissionConfig, Path], Vehicle]
+
+
+def start_vehicle(config: MissionConfig, truth_folder: Path) -> Vehicle:
+    """In this process, but by the wall clock, where companion and vehicle compute side by side."""
+    start = VehicleProcess if config.realtime else EmbeddedVehicle
+    return start(config, truth_folder)
+
+
+@contextlib.contextmanager
+def other_end(config: MissionConfig, launch: StartVehicle = start_vehicle) -> Iterator[OtherEnd]:
+    """A foreign autopilot where the mission names one, else a simulated vehicle that starts.
+
+    Args:
+        config: the mission.
+        launch: starts the simulated vehicle.
+
+    Raises:
+        MavfiError: the link cannot be opened, or the vehicle cannot start.
+    """
+    if config.link is not None:
+        with contextlib.closing(open_transport(config.link)) as link:
+            yield OtherEnd(link)
+        return
+    folder = Path(tempfile.mkdtemp(prefix="mavfi-"))
+    with contextlib.ExitStack() as leaving:
+        leaving.callback(shutil.rmtree, folder, ignore_errors=True)
+        vehicle = launch(config, folder)
+        leaving.callback(vehicle.end)
+        yield OtherEnd(vehicle.link, vehicle, folder)

@@ -1,0 +1,92 @@
+"""The vehicle inside the mission's process: its records, and what becomes of its errors."""
+
+from dataclasses import replace
+
+import pytest
+from record_digest import record_digest
+
+from mavfi_cli.campaign.preflight import ask_vehicle
+from mavfi_cli.core.errors import UnknownName, VehicleProcessError, WorldError
+from mavfi_cli.mission.detector_config import DetectorConfig
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.vehicle import VehicleProcess, start_vehicle
+from sitl.server.simulation import Simulation
+
+FAULT = FaultConfig(target="command_velocity", at="time=1", together=True, field="exponent", seed=2)
+FILES = ("flight.tlog", "trace.parquet", "plans.parquet", "kernels.parquet")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"stack": "mavbench", "land": True},
+        {"fault": FAULT, "detector": DetectorConfig(name="gad")},
+        {"isolate": ("octomap", "planner")},
+    ],
+)
+def test_the_record_is_that_of_two_processes_with_a_socket_between(fly_short, changes):
+    here, apart = fly_short(**changes), fly_short(launch=VehicleProcess, **changes)
+    for name in FILES:
+        assert (here.path / name).read_bytes() == (apart.path / name).read_bytes(), name
+    assert record_digest(here.path) == record_digest(apart.path)
+
+
+def test_only_a_flight_by_the_wall_clock_has_a_vehicle_in_another_process(short_config, tmp_path):
+    paced = replace(short_config, realtime=True)
+    for config, expected in ((short_config, False), (paced, True)):
+        vehicle = start_vehicle(config, tmp_path)
+        assert isinstance(vehicle, VehicleProcess) == expected
+        assert vehicle.end() is None
+
+
+@pytest.fixture
+def fails_at(monkeypatch):
+    """Have the simulation raise an error at a stamp."""
+    advance = Simulation.advance
+
+    def fail(stamp_s, error):
+        def advance_or_fail(self):
+            if self.stamp_us >= stamp_s * 1e6:
+                raise error
+            advance(self)
+
+        monkeypatch.setattr(Simulation, "advance", advance_or_fail)
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (VehicleProcessError("physics diverged at 12.00 s"), "physics diverged at 12.00 s"),
+        (IndexError("a defect"), "the vehicle ended with IndexError: a defect"),
+    ],
+)
+def test_a_vehicle_that_breaks_is_a_lost_link_with_its_reason(fly_short, fails_at, error, told):
+    fails_at(12.0, error)
+    run = load_run(fly_short().path)
+    assert run.result["outcome"] == "link_lost"
+    reason = f"the simulated vehicle: the peer closed the connection: {told}"
+    assert run.result["reason"] == reason
+    assert run.result["referee"] is not None  # the truth up to there
+    assert run.result["simulated_s"] == 12.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "text"),
+    [
+        ({"world": "fram"}, UnknownName, "unknown world 'fram': did you mean 'farm'"),
+        ({"vehicle": "sole"}, UnknownName, "unknown vehicle 'sole'"),
+        ({"goal": (1e9, 0.0, 5.0)}, WorldError, "goal"),
+    ],
+)
+def test_what_the_vehicle_refuses_is_one_clear_error(
+    short_config, fly_short, changes, error, text, capfd
+):
+    with pytest.raises(error, match=text):
+        fly_short(**changes)
+    with pytest.raises(VehicleProcessError, match=text):
+        ask_vehicle(replace(short_config, **changes))
+    assert capfd.readouterr().err == ""
