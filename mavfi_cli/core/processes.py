@@ -9,7 +9,7 @@ import signal
 from pathlib import Path
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
-# What ps calls them.
+# Process names in ps and top.
 TEMPLATE, SLOT, MISSION = "mavfi-template", "mavfi-slot", "mavfi-mission"
 VEHICLES, VEHICLE = "mavfi-vehicles", "mavfi-vehicle"  # the template of vehicles, and one
 ONE_THREAD = {
@@ -17,18 +17,18 @@ ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "JE_ARROW_MALLOC_CONF": "background_thread:false",
 }
-"""Environment of a process that forks itself: the libraries that it loads start no threads."""
+"""Environment of a process that forks itself. Its libraries then start no threads."""
 
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 
 
 def become_reaper() -> None:
-    """From now on orphans among the descendants of this process become its children."""
+    """Make orphaned descendants of this process its children from now on."""
     _request(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def die_with(parent: int) -> None:
-    """Have this process killed when its parent ends; end now where that has happened already."""
+    """Have the kernel kill this process when its parent ends. Exit now if it has already ended."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -65,12 +65,12 @@ def fork_beside(reaper: int) -> int | None:
 
 
 def threads() -> int:
-    """How many threads this process has. A fork has only one of them, and the others' locks."""
+    """Count the threads of this process. A fork copies one thread, but the locks of all."""
     return len(os.listdir("/proc/self/task"))
 
 
 def call_this_process(name: str) -> None:
-    """Have ps and top call this process so; at most 15 bytes."""
+    """Set the name of this process in ps and top, at most 15 bytes."""
     _request(_PR_SET_NAME, ctypes.c_char_p(name.encode()))
 
 
@@ -81,7 +81,7 @@ def _request(option: int, value: int | ctypes.c_char_p) -> None:
 
 
 def end_children(spare: int | None = None) -> None:
-    """Kill and reap every descendant of this process, which is their reaper.
+    """Kill and reap every descendant of this process, which must be their reaper.
 
     A killed child leaves its own children to us, so the loop ends when there are none.
 
