@@ -1,7 +1,7 @@
-"""MAVLink's command protocol: send, await the acknowledgement, repeat; no clock of its own.
+"""MAVLink's command protocol: sends a command, awaits its acknowledgement, repeats it.
 
-Source: https://mavlink.io/en/services/command.html. An acknowledgement names the command only, so
-two of the same command never are under way to one component at once.
+The caller supplies the time. An acknowledgement names the command only, so the same command is
+never pending twice for one component. Source: https://mavlink.io/en/services/command.html.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _RESULTS = {
     dialect.MAV_RESULT_COMMAND_LONG_ONLY: "only as COMMAND_LONG",
     dialect.MAV_RESULT_COMMAND_INT_ONLY: "only as COMMAND_INT",
 }
-# Refusals that time may cure.
+# Refusals that may be temporary.
 _PASSING = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_FAILED)
 
 
 class Verdict(Enum):
-    """Where a command stands."""
+    """State of a command."""
 
     PENDING = "pending"
     ACCEPTED = "accepted"
@@ -41,7 +41,7 @@ class Verdict(Enum):
 
 
 class Ticket:
-    """One command on its way; `verdict` tells where it stands, `result` the peer's word for it."""
+    """A submitted command. `verdict` is its state, `result` the peer's answer in words."""
 
     __slots__ = (
         "command", "component", "due_s", "parameters", "refusals_left", "result", "sent",
@@ -63,7 +63,7 @@ class Ticket:
 
     @property
     def pending(self) -> bool:
-        """Whether the outcome is still open."""
+        """True until the command is accepted, refused or given up."""
         return self.verdict is Verdict.PENDING
 
 
@@ -71,8 +71,8 @@ class CommandChannel:
     """Commands to the components of one system.
 
     Args:
-        system: own system id.
-        component: own component id; acknowledgements to somebody else are not ours.
+        system: Own system id.
+        component: Own component id. Acknowledgements for other components are ignored.
     """
 
     def __init__(self, system: int, component: int) -> None:
@@ -91,11 +91,11 @@ class CommandChannel:
         """Queue a COMMAND_LONG.
 
         Args:
-            command: a MAV_CMD number.
-            parameters: the first of its seven parameters; the others become `unused`.
-            component: whom it is for.
-            unused: value of a parameter without meaning.
-            refusals: how many passing refusals are answered with another try, a second later.
+            command: MAV_CMD number.
+            parameters: First of its seven parameters; the others are set to `unused`.
+            component: Component id of the receiver.
+            unused: Value of an unused parameter.
+            refusals: Number of temporary refusals after which the command is repeated, 1 s later.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
         ticket = Ticket(command, padded, component, refusals)
@@ -107,7 +107,7 @@ class CommandChannel:
         return ticket
 
     def acknowledge(self, message: Message) -> None:
-        """Take a COMMAND_ACK; one that answers nothing of ours is ignored."""
+        """Handle a COMMAND_ACK. It is ignored if it answers none of our commands."""
         if message.target_system not in (0, self._own[0]):
             return
         if message.target_component not in (0, self._own[1]):
@@ -129,7 +129,7 @@ class CommandChannel:
             self._close(lane, Verdict.REFUSED)
 
     def poll(self, stamp_s: float, system: int) -> list[Message]:
-        """The commands that are due at `stamp_s`, addressed to `system`."""
+        """Return the commands that are due at `stamp_s`, addressed to `system`."""
         self._now_s = stamp_s
         due = []
         for lane in self._lanes.values():

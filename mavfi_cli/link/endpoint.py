@@ -1,4 +1,4 @@
-"""Endpoint URLs: what they say, and which of them need signing."""
+"""Parses endpoint URLs and checks which of them need signing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEFAULT_BAUD = 57_600
 
 
 class Scheme(Enum):
-    """The kinds of endpoint, by the word before the first colon."""
+    """Scheme of an endpoint URL: the word before the first colon."""
 
     UDP_IN = "udpin"
     UDP_OUT = "udpout"
@@ -33,7 +33,7 @@ _FORMS = {
     Scheme.SERIAL: "serial:device[:baud]",
     Scheme.FD: "fd:number",
 }
-# `udp` listens, as in pymavlink and MAVSDK; `tcpout` is MAVSDK's word for tcp.
+# `udp` listens, as in pymavlink and MAVSDK. `tcpout` is MAVSDK's name for tcp.
 _ALIASES = {"udp": Scheme.UDP_IN, "tcpout": Scheme.TCP}
 _LISTENING = (Scheme.UDP_IN, Scheme.TCP_IN)
 _HOST_PORT = re.compile(r"(?:(?P<host>\[[^\]]*\]|[^:\[\]]*):)?(?P<port>[0-9]+)", re.ASCII)
@@ -41,7 +41,7 @@ _HOST_PORT = re.compile(r"(?:(?P<host>\[[^\]]*\]|[^:\[\]]*):)?(?P<port>[0-9]+)",
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoint:
-    """A parsed endpoint URL; only the fields of its scheme mean something."""
+    """A parsed endpoint URL. Fields that its scheme does not use have no meaning."""
 
     url: str
     scheme: Scheme
@@ -53,10 +53,10 @@ class Endpoint:
 
 
 def parse_endpoint(url: str) -> Endpoint:
-    """The endpoint of a URL, in the form `scheme:rest` or `scheme://rest`.
+    """Parse a URL of the form `scheme:rest` or `scheme://rest`.
 
     Raises:
-        EndpointError: unknown scheme (names the known ones), or a rest that does not fit it.
+        EndpointError: The scheme is unknown (lists the known ones), or the rest does not fit it.
     """
     word, _, rest = url.partition(":")
     rest = rest.removeprefix("//")
@@ -96,10 +96,10 @@ def _serial(url: str, rest: str) -> Endpoint:
 
 
 def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> tuple[socket.AddressFamily, str]:
-    """Address family and numeric address of the endpoint's host, IPv4 first.
+    """Resolve the endpoint's host to address family and numeric address, IPv4 first.
 
     Raises:
-        EndpointError: no such host.
+        EndpointError: The host does not exist.
     """
     try:
         found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)
@@ -111,10 +111,10 @@ def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> tuple[socket.Address
 
 
 def check_reach(endpoint: Endpoint, address: str, *, signed: bool, allow_unsigned: bool) -> None:
-    """Refuse an unsigned link that reaches beyond this machine.
+    """Reject an unsigned link that reaches beyond this machine.
 
     Raises:
-        EndpointError: `address` is not a loopback one, and neither flag is set.
+        EndpointError: `address` is not a loopback address, and neither flag is set.
     """
     if signed or allow_unsigned or ipaddress.ip_address(address.partition("%")[0]).is_loopback:
         return
