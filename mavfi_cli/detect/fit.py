@@ -1,7 +1,7 @@
-"""Models from a data set of error-free flights.
+"""Fits models to a data set of error-free flights.
 
-Flights are split by seed into three parts: `train` fits weights, means and scales, `validation`
-says when the autoencoder has learned enough, `threshold` sets the thresholds. No flight is in two.
+Flights are split by seed into three disjoint parts: `train` fits weights, means and scales,
+`validation` selects the epoch of the autoencoder, and `threshold` sets the thresholds.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from mavfi_cli.detect.span import RangeDetector
 from mavfi_cli.detect.watch import ranges_of
 
 FLIGHTS_MIN = 10
-# Whose turn it is, over and over: of ten flights five train, one validates, four set thresholds.
+# Cycle of the split: of ten flights, five train, one validates and four set thresholds.
 _TURNS = ("train", "threshold") * 4 + ("train", "validation")
-# Two reports can come between two ticks, so a sequence number may step by two.
+# Two reports can arrive between two ticks, so a sequence number may increase by two.
 _LEAST_SCALE = np.array([2 if s.dtype is DType.INT32 else 1 for s in DETECTED])
 _X, _Y = ([NAMES.index(f"{prefix}{axis}") for prefix in ("waypoint_", "waypoint_v", "command_v")]
           for axis in "xy")  # fmt: skip
@@ -43,7 +43,7 @@ KINDS = ("gad", "aad", "range", "l2")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Split:
-    """Places of the flights of a data set, by what they are for."""
+    """Indices of the flights of a data set by their use."""
 
     train: tuple[int, ...]
     validation: tuple[int, ...]
@@ -51,10 +51,10 @@ class Split:
 
 
 def split(dataset: Dataset, seed: int) -> Split:
-    """Split by flight, alike in each world.
+    """Split by flight, in the same way for each world.
 
     Raises:
-        ModelError: fewer than FLIGHTS_MIN flights.
+        ModelError: There are fewer than FLIGHTS_MIN flights.
     """
     _refuse_few(len(dataset))
     drawn = generator(seed, Stream.MISSION, "detector-split").permutation(len(dataset))
@@ -67,15 +67,17 @@ def split(dataset: Dataset, seed: int) -> Split:
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
-    """Say before the flights what would keep `fit` from fitting to them.
+    """Check before the flights that `fit` will be able to use them.
 
     Args:
-        flights: how many there will be at most.
+        kinds: Kinds of detector to fit.
+        flights: Maximum number of flights.
+        n_sigma: Threshold of the Gaussian model.
 
     Raises:
-        UnknownName: an unknown kind.
-        ModelError: too few flights, or torch is missing for aad.
-        ConfigError: n sigma out of range.
+        UnknownName: A kind is unknown.
+        ModelError: There are too few flights, or torch is missing for aad.
+        ConfigError: n sigma is out of range.
     """
     for kind in kinds:
         if kind not in KINDS:
@@ -100,15 +102,16 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     """Fit one kind of detector.
 
     Args:
-        kind: gad, aad, range or l2.
-        seed: of the split and of the autoencoder's first weights.
-        n_sigma: threshold of the Gaussian model; None takes the least whole number that error-free
+        kind: Kind of detector: gad, aad, range or l2.
+        dataset: Error-free flights.
+        seed: Seed of the autoencoder's initial weights and of the split.
+        n_sigma: Threshold of the Gaussian model. None selects the smallest integer that the
             flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
 
     Raises:
-        UnknownName: an unknown kind.
-        ModelError: too few flights, or torch is missing for aad.
-        ConfigError: n sigma out of range.
+        UnknownName: The kind is unknown.
+        ModelError: There are too few flights, or torch is missing for aad.
+        ConfigError: n sigma is out of range.
     """
     parts = split(dataset, seed)
     flights = dataset.flights
@@ -162,7 +165,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
 
 
 def warmed(detector: GaussianDetector, flights: list[Flight]) -> GaussianDetector:
-    """The detector after it has learned from all samples of the flights."""
+    """Return the detector after it has learned all samples of the flights."""
     for flight in flights:
         for stage in Stage:
             for deltas in flight.of_stage(stage):
@@ -171,9 +174,10 @@ def warmed(detector: GaussianDetector, flights: list[Flight]) -> GaussianDetecto
 
 
 def scale_of(flights: list[Flight]) -> FloatArray:
-    """Largest |delta| in each state's group (COUNT,), at least 1: inputs lie within about +-1.
+    """Return the largest |delta| in each state's group (COUNT,), at least 1.
 
-    The components of a vector share their scale: what one of them shows, another may.
+    The scaled inputs lie within about +-1. The components of a vector share one scale, because each
+    component may take the values of the others.
     """
     rows = mirrored(_all(flights))
     largest = np.maximum(np.abs(rows).max(axis=0), _LEAST_SCALE)
@@ -182,12 +186,12 @@ def scale_of(flights: list[Flight]) -> FloatArray:
 
 
 def mirrored(deltas: Codes) -> NDArray[np.int64]:
-    """All distinct rows (m, COUNT) of the deltas (n, COUNT) and of their mirror images.
+    """Return the distinct rows (m, COUNT) of the deltas (n, COUNT) and their mirror images.
 
-    The training worlds have their goals north-east of the start, but no direction is better than
-    another: east may be west, north may be south, and the two may be swapped. A mirrored velocity
-    or position has the negated code. Yaw is negated with north; under the other two its delta is
-    left as it is, an approximation.
+    The training worlds have their goals north-east of the start, but no direction is special. The
+    images mirror east, mirror north, and swap the two. A mirrored velocity or position has the
+    negated code. Yaw is negated with north. Its delta stays unchanged under the other two, which is
+    an approximation.
     """
     rows = np.unique(deltas.astype(np.int64), axis=0)
     images = []
@@ -205,7 +209,7 @@ def mirrored(deltas: Codes) -> NDArray[np.int64]:
 
 
 def scores(detector: Detector, flight: Flight) -> FloatArray:
-    """Score of every judged message (n,): the highest of the stages that it brings."""
+    """Return the score of every judged message (n,): the highest score of its stages."""
     found = np.zeros(len(flight.deltas))
     rows = zip(flight.deltas, *(_flags(flight)), strict=True)
     for row, (deltas, report, step, new) in enumerate(rows):
@@ -224,12 +228,15 @@ def _flags(flight: Flight) -> tuple[list[bool], list[bool], list[bool]]:
 
 
 def _all(flights: list[Flight]) -> Codes:
-    """Deltas (n, COUNT) of all samples of some flights."""
+    """Return the deltas (n, COUNT) of all samples of some flights."""
     return np.concatenate([flight.deltas for flight in flights])
 
 
 def _largest(detector: Detector, flights: list[Flight]) -> float:
-    """Largest score of the flights; for one over all states also of their mirror images."""
+    """Return the largest score of the flights.
+
+    For a detector with one score over all states it includes the mirror images.
+    """
     if detector.per_stage:
         return max(float(scores(detector, flight).max(initial=0.0)) for flight in flights)
     rows = mirrored(_all(flights)).astype(np.int16)
@@ -240,7 +247,7 @@ def _provenance(
     dataset: Dataset, parts: Split, seed: int, threshold: float, told: Mapping[str, Any]
 ) -> dict[str, Any]:
     def named(places: tuple[int, ...]) -> list[str]:
-        """Flights as world/seed."""
+        """Return the names of flights as world/seed."""
         return [f"{dataset.flights[p].world}/{dataset.flights[p].seed}" for p in places]
 
     return {
