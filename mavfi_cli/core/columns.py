@@ -38,11 +38,11 @@ def wrapped(rows: Iterable[Sequence[str]], width: int = WIDTH) -> list[str]:
     """Align all columns left and wrap the last one, which is prose, at `width`."""
     cells = _padded(rows)
     room = width - sum(each + _GAP for each in _widths(cells)[:-1])
-    told = []
+    lines = []
     for *row, prose in cells:
         first, *rest = textwrap.wrap(prose, max(room, _LEAST_ROOM)) or [""]
-        told += [[*row, first], *([""] * len(row) + [each] for each in rest)]
-    return _aligned(told, None)
+        lines += [[*row, first], *([""] * len(row) + [each] for each in rest)]
+    return _aligned(lines, None)
 
 
 def _cut(widths: Sequence[int], labels: int, width: int) -> Iterator[tuple[int, int]]:

@@ -118,7 +118,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     train = [flights[place] for place in parts.train]
     validation = [flights[place] for place in parts.validation]
     held_out = [flights[place] for place in parts.threshold]
-    told: dict[str, Any] = {}
+    details: dict[str, Any] = {}
     detector: Any
     if kind == "gad":
         cold = (
@@ -128,7 +128,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         )
         detector = warmed(cold, [*train, *validation])
         largest = _largest(detector, held_out)
-        told["largest_distance_sigma"] = largest
+        details["largest_distance_sigma"] = largest
         if n_sigma is None:
             detector.memory["n_sigma"][0] = max(gaussian.N_SIGMA, math.ceil(largest))
     elif kind == "range":
@@ -150,7 +150,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         )
         detector = AutoencoderDetector({"threshold": np.ones(1), "scale": scale, **trained.weights})
         detector.memory["threshold"][0] = _largest(detector, held_out)
-        told.update(trained.told)
+        details.update(trained.provenance)
     else:
         raise _unknown(kind)
     arrays = {name: np.array(array) for name, array in detector.memory.items()}
@@ -160,7 +160,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         stack=dataset.stack,
         extended=ranges_of(np.concatenate([flight.extended for flight in flights])),
         preprocess=dataset.preprocess,
-        provenance=_provenance(dataset, parts, seed, detector.threshold, told),
+        provenance=_provenance(dataset, parts, seed, detector.threshold, details),
     )
 
 
@@ -244,7 +244,7 @@ def _largest(detector: Detector, flights: list[Flight]) -> float:
 
 
 def _provenance(
-    dataset: Dataset, parts: Split, seed: int, threshold: float, told: Mapping[str, Any]
+    dataset: Dataset, parts: Split, seed: int, threshold: float, details: Mapping[str, Any]
 ) -> dict[str, Any]:
     def named(places: tuple[int, ...]) -> list[str]:
         """Return the names of flights as world/seed."""
@@ -264,7 +264,7 @@ def _provenance(
         "versions": {
             "python": platform.python_version(),
             "numpy": np.__version__,
-            **told.get("versions", {}),
+            **details.get("versions", {}),
         },
-        **{name: value for name, value in told.items() if name != "versions"},
+        **{name: value for name, value in details.items() if name != "versions"},
     }

@@ -146,11 +146,11 @@ def provenance(path: Path) -> dict[str, Any]:
         ModelError: The file cannot be read or has no provenance.
     """
     data = _read(path)
-    told = data.get("provenance")
-    if not isinstance(told, dict):
+    recorded = data.get("provenance")
+    if not isinstance(recorded, dict):
         raise ModelError("corrupt model file: provenance is no object", path=path)
     header = {key: data.get(key) for key in ("mavfi", "detector", "stack")}
-    return {**header, **told}
+    return {**header, **recorded}
 
 
 def checked_threshold(value: float, key: str = "threshold") -> float:

@@ -274,8 +274,8 @@ class _Messages:
             | ~np.concatenate([[False], self._has_waypoint[:-1]])
         )
         self._trajectory: Trajectory | None = None
-        told = trace.get("collision")  # without it, a finite time means a collision
-        self._collisions = np.isfinite(self._reports[:, 0]) if told is None else told
+        collision = trace.get("collision")  # without it, a finite time means a collision
+        self._collisions = np.isfinite(self._reports[:, 0]) if collision is None else collision
 
     @property
     def reports(self) -> list[CollisionReport]:
@@ -330,10 +330,10 @@ def _present(column: NDArray[Any]) -> NDArray[np.bool_]:
     return ~np.isnan(_reals(column))
 
 
-def _changes(values: FloatArray, trace: Columns, telling: tuple[str, ...]) -> NDArray[np.bool_]:
+def _changes(values: FloatArray, trace: Columns, markers: tuple[str, ...]) -> NDArray[np.bool_]:
     """Return True for rows (n,) whose values or marker columns differ from the last row."""
-    told = [_reals(trace[name]) for name in telling if name in trace]
-    patterns = np.column_stack([values, *told]).view(np.int64)  # NaN equals itself
+    marked = [_reals(trace[name]) for name in markers if name in trace]
+    patterns = np.column_stack([values, *marked]).view(np.int64)  # NaN equals itself
     changed = np.ones(len(patterns), np.bool_)
     changed[1:] = (patterns[1:] != patterns[:-1]).any(axis=1)
     return changed

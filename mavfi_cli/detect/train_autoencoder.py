@@ -28,11 +28,11 @@ CURVE_EVERY = 20  # epochs between two points of the recorded loss curve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trained:
+class TrainedWeights:
     """Weights, named as in `autoencoder.WEIGHTS`, and the provenance of the training."""
 
     weights: Mapping[str, FloatArray]
-    told: Mapping[str, Any]
+    provenance: Mapping[str, Any]
 
 
 def require_torch() -> None:
@@ -45,7 +45,7 @@ def require_torch() -> None:
         raise ModelError("training the autoencoder needs torch: pip install 'mavfi[train]'")
 
 
-def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> Trained:
+def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> TrainedWeights:
     """Train on scaled vectors (n, 13) and keep the best weights for the validation (m, 13).
 
     Args:
@@ -64,10 +64,10 @@ def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> Trained:
         starts = [_train(torch, inputs, validation, seed + number) for number in range(STARTS)]
     finally:
         torch.set_num_threads(threads)
-    return min(starts, key=lambda start: float(start.told["validation_error"]))
+    return min(starts, key=lambda start: float(start.provenance["validation_error"]))
 
 
-def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
+def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) -> TrainedWeights:
     """Train from one set of initial weights."""
     source = torch.Generator().manual_seed(seed)
     sizes = ((COUNT, HIDDEN), (HIDDEN, CODED), (CODED, COUNT))
@@ -102,9 +102,9 @@ def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) ->
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return Trained(
+    return TrainedWeights(
         weights=kept,
-        told={
+        provenance={
             "epochs": EPOCHS,
             "learning_rate": LEARNING_RATE,
             "best_epoch": best_epoch,

@@ -91,8 +91,8 @@ class _Recorded(NoInjection, ABC):
 
     def news(self) -> list[str]:
         """What was done since the last call, a line each."""
-        told, self._news = self._news, []
-        return told
+        news, self._news = self._news, []
+        return news
 
     @abstractmethod
     def _missed(self) -> str:

@@ -109,8 +109,8 @@ def _wheels() -> Iterator[Check]:
         except (ImportError, importlib.metadata.PackageNotFoundError, OSError) as error:
             missing.append(f"{distribution} ({error})")
     if missing:
-        told = "missing: " + "; ".join(missing)
-        yield Check(name="Libraries", verdict=Verdict.FAILED, found=told,
+        problem = "missing: " + "; ".join(missing)
+        yield Check(name="Libraries", verdict=Verdict.FAILED, found=problem,
                     remedy="pip install -e . in the project's folder")  # fmt: skip
     else:
         yield Check(name="Libraries", verdict=Verdict.OK, found=", ".join(found))

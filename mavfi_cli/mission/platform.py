@@ -195,12 +195,12 @@ def measured_factor(name: str) -> float | None:
 
 
 def _measured(factor: float) -> PlatformProfile:
-    told = f"this host's own times while it flies, x {factor:g}"
+    source = f"this host's own times while it flies, x {factor:g}"
     return PlatformProfile(
         name=f"{MEASURED}:{factor:g}",
         cores=len(os.sched_getaffinity(0)),
-        kernels=dict.fromkeys(KERNELS, KernelLatency(latency_s=0.0, source=told)),
-        description=f"{told}; needs --realtime, and does not repeat",
+        kernels=dict.fromkeys(KERNELS, KernelLatency(latency_s=0.0, source=source)),
+        description=f"{source}; needs --realtime, and does not repeat",
         carried=False,
         measured_factor=factor,
     )
@@ -226,9 +226,9 @@ def _kernels(
     file: _PlatformFile, base: dict[str, KernelLatency], path: Path
 ) -> dict[str, KernelLatency]:
     """Every kernel's latency: the base's times the file's factor, or the kernel's own entry."""
-    told = _scaled(file.base, file.scale, file.sources.get("scale", ""))
+    scale_source = _scaled(file.base, file.scale, file.sources.get("scale", ""))
     kernels = {
-        name: replace(latency, latency_s=latency.latency_s * file.scale, source=told)
+        name: replace(latency, latency_s=latency.latency_s * file.scale, source=scale_source)
         for name, latency in base.items()
     }
     for name, entry in file.kernels.items():
@@ -252,8 +252,8 @@ def _latency(entry: _KernelEntry, base: KernelLatency | None, base_name: str) ->
 
 def _scaled(base_name: str, scale: float, source: str) -> str:
     """Where a latency comes from that is a multiple of another platform's."""
-    told = f"{base_name} x {scale:g}"
-    return f"{told}: {source}" if source else told
+    scaled = f"{base_name} x {scale:g}"
+    return f"{scaled}: {source}" if source else scaled
 
 
 class LatencyModel:

@@ -205,8 +205,10 @@ def _values(path: Path) -> tuple[dict[str, Any], str]:
         error = UnknownName("stack", str(base), set(stack_names()) - {path.stem})
         raise ConfigError(str(error), path=path, key="base")
     inherited, _ = _values(_FOLDER / f"{base}.toml")
-    told = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}
-    return {**inherited, **values, "sources": {**told, **values.get("sources", {})}}, text
+    base_sources = {
+        key: why for key, why in inherited.pop("sources", {}).items() if key not in values
+    }
+    return {**inherited, **values, "sources": {**kept, **values.get("sources", {})}}, text
 
 
 def _changes(text: str) -> dict[str, Any]:
