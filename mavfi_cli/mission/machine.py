@@ -1,4 +1,4 @@
-"""What this machine can do: each check says what it found, and what to do where it fails."""
+"""Checks of this machine, each with its finding and the remedy for a failure."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from typing import Any
 
 
 class Verdict(Enum):
-    """How a check ended."""
+    """Result of a check."""
 
     OK = "ok"
-    LIMITED = "limited"  # flying works, something else does not
+    LIMITED = "limited"  # flying works, but something else does not
     FAILED = "failed"  # flying does not work
 
 
@@ -37,7 +37,7 @@ class Check:
     remedy: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for --json."""
+        """Return plain values for --json."""
         return {**asdict(self), "verdict": self.verdict.value}
 
 
@@ -67,7 +67,7 @@ _EXTRAS = {"train": "torch", "cluster": "distributed", "view": "rerun"}
 
 
 def check_machine() -> Iterator[Check]:
-    """Run every check, one after the other."""
+    """Run all checks in sequence and yield their results."""
     yield _python()
     yield _processor()
     yield from _wheels()
@@ -149,7 +149,7 @@ def _loopback() -> Check:
 
 
 def _physics() -> Check:
-    """The vehicle's process starts, which loads JSBSim and every compiled kernel it has."""
+    """Start the vehicle's process, which loads JSBSim and its compiled kernels."""
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
             [sys.executable, "-c", _LOAD_VEHICLE], capture_output=True, text=True, cwd=folder,
@@ -163,7 +163,7 @@ def _physics() -> Check:
 
 
 def _injection() -> Iterator[Check]:
-    """Tracing and counted breakpoints, tried on a real program."""
+    """Test tracing and counted breakpoints on a real program."""
     from mavfi_cli.fi.tracer.arch import SUPPORTED
     from mavfi_cli.fi.tracer.doctor import check_counting, check_tracing
 

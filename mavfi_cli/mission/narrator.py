@@ -1,4 +1,4 @@
-"""Tells the flight's story: notes what is new after every tick, and shows progress."""
+"""Logs the events of a flight after every tick and reports progress."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ PROGRESS_EVERY_S = 1.0
 
 
 class Narrator:
-    """Compares each tick with the one before.
+    """Finds events by comparing each tick with the last.
 
     Attributes:
-        log: every event so far.
+        log: All events so far.
     """
 
     def __init__(self, watcher: Watcher) -> None:
@@ -32,7 +32,7 @@ class Narrator:
         self._next_progress_s = 0.0
 
     def note(self, stamp_s: float, kind: str, text: str, state: VehicleState | None) -> None:
-        """Note one event where the vehicle is."""
+        """Log an event at the vehicle's position."""
         place = None if state is None else tuple(round(float(c), 3) for c in state.position_enu_m)
         self.log.add(round(stamp_s, 3), kind, text, place)  # type: ignore[arg-type]
 
@@ -43,7 +43,7 @@ class Narrator:
         companion: Companion | None,
         injection: NoInjection,
     ) -> None:
-        """Note what is new at a tick; once a simulated second, show progress."""
+        """Log the events of a tick, and report progress once per simulated second."""
         state = session.state
         for kind, text in self._news(session, companion, injection):
             self.note(stamp_s, kind, text, state)
@@ -57,7 +57,7 @@ class Narrator:
         companion: Companion | None,
         injection: NoInjection,
     ) -> list[tuple[str, str]]:
-        """Kind and text of what happened since the last tick."""
+        """Return kind and text of each event since the last tick."""
         news: list[tuple[str, str]] = []
         if session.phase is not self._phase:
             self._phase = session.phase

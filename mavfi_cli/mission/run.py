@@ -1,4 +1,4 @@
-"""Fly one mission and leave its record: the function behind `mavfi fly`."""
+"""Flies one mission and writes its record. This is the function behind `mavfi fly`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def fly_mission(
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
-    Whatever becomes of the flight, crash of the companion included, is a result and is recorded.
+    Every end of the flight, including a crash of the companion, is a result and is recorded.
 
     Args:
         config: the mission.
@@ -136,7 +136,7 @@ def fly_together(branching: Branching, place: Path, vehicles: VehicleTemplate) -
 
 
 def _host(sortie: Sortie, vehicle: Mapping[str, Any]) -> dict[str, Any]:
-    """What this machine had to do for it: no part of what repeats."""
+    """Return the host's cost of the mission, which is not repeatable."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {
         "started": sortie.started.isoformat(timespec="seconds"),
@@ -163,7 +163,7 @@ def _injection(
     for_debugger: Callable[[int], None] | None,
     vehicles: VehicleTemplate | None,
 ) -> Iterator[NoInjection | None]:
-    """The instruction-level fault of a mission, its node's process already starting."""
+    """Create the instruction-level fault of a mission and start its node's process."""
     if config.instruction is None:
         yield None
         return
@@ -190,14 +190,14 @@ def fly_golden(
     *,
     vehicles: VehicleTemplate | None = None,
 ) -> dict[str, Any]:
-    """Fly a mission without a fault, from which faults or inputs are drawn.
+    """Fly a golden run, from which faults or inputs are drawn.
 
     Returns:
-        Its result.
+        Contents of its result.json.
 
     Raises:
-        Interrupted: it was cut off: others would be drawn.
-        VehicleProcessError: the vehicle died: there is nothing to draw from.
+        Interrupted: The run was cut off, so other faults would be drawn.
+        VehicleProcessError: The vehicle died, so there is nothing to draw from.
     """
     flown = fly_mission(config, out, Watcher(), recorder=recorder, vehicles=vehicles)
     result: dict[str, Any] = json.loads(flown.result.read_text())
@@ -209,7 +209,7 @@ def fly_golden(
 
 
 def _fly(sortie: Sortie) -> str | None:
-    """Fly to the end. A crash of the companion's software is an outcome: returns its traceback."""
+    """Fly to the end. Return the traceback if the companion's software crashes, else None."""
     flight = sortie.flight
     try:
         flight.fly(sortie.folder.tlog)
@@ -223,9 +223,9 @@ def _fly(sortie: Sortie) -> str | None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[list[int]]:
-    """Turn Ctrl-C and SIGTERM into a request, so that what runs ends with a whole record.
+    """Turn Ctrl-C and SIGTERM into a request, so that a mission ends with a complete record.
 
-    Yields a list that is empty until then. Only the main thread can ask for this.
+    Yields a list that is empty until a signal arrives. Has no effect outside the main thread.
     """
     asked: list[int] = []
     previous: dict[signal.Signals, Any] = {}
@@ -240,7 +240,7 @@ def interruptible() -> Iterator[list[int]]:
 
 
 def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, Any] | None]:
-    """The referee's log and report; None for a foreign autopilot, or a vehicle that died."""
+    """Read the referee's log and report; None for a foreign autopilot or a dead vehicle."""
     if folder is None or not (folder / "truth.json").is_file():
         return None, None
     with np.load(folder / "truth.npz") as data:
@@ -249,7 +249,7 @@ def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, An
 
 
 def _vehicle_host(folder: Path | None) -> dict[str, Any]:
-    """What the vehicle's process tells of itself: stages, s, and memory, MB."""
+    """Read the statistics of the vehicle's process: stages, s, and memory, MB."""
     if folder is None or not (folder / "host.json").is_file():
         return {}
     told: dict[str, Any] = json.loads((folder / "host.json").read_text())
@@ -307,7 +307,7 @@ def _write(
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions that a record depends on."""
+    """Return the versions of all libraries that a record depends on."""
     versions = {"mavfi": __version__, "python": sys.version.split()[0]}
     for name in _VERSIONS:
         versions[name] = importlib.metadata.version(name)

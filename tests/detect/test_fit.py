@@ -164,8 +164,8 @@ def test_training_is_deterministic_and_tells_what_it_did(dataset, quick):
 def test_trained_weights_reconstruct_better_than_the_first_ones(quick):
     rows = fit.mirrored(flight("w", 1, 400).deltas).astype(float)
     trained = train_autoencoder.train(rows, rows, seed=1)
-    curve = np.array(trained.told["loss_curve"]["rows"])
-    assert trained.told["validation_error"] < curve[0, 2]
+    curve = np.array(trained.provenance["loss_curve"]["rows"])
+    assert trained.provenance["validation_error"] < curve[0, 2]
 
 
 def test_without_torch_only_the_autoencoder_is_missing(dataset, monkeypatch):

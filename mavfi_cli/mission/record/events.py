@@ -1,4 +1,4 @@
-"""What happened in a mission, in order: the list that a person reads after the flight."""
+"""Event log of a mission."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """One line of the flight's story."""
+    """One event of a flight."""
 
     stamp_s: float
     kind: str  # phase, autopilot, plan, collision, outcome
@@ -17,10 +17,10 @@ class Event:
 
 
 class Listener(Protocol):
-    """Hears of every event as it happens."""
+    """Receiver of events."""
 
     def on_event(self, event: Event) -> None:
-        """Called for every event."""
+        """Handle an event."""
 
 
 @dataclass(slots=True)
@@ -37,11 +37,11 @@ class EventLog:
         text: str,
         position_enu_m: tuple[float, float, float] | None = None,
     ) -> None:
-        """Note one event."""
+        """Add an event."""
         event = Event(stamp_s=stamp_s, kind=kind, text=text, position_enu_m=position_enu_m)
         self.events.append(event)
         self.listener.on_event(event)
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Plain values, for the record of the run."""
+        """Return plain values for the record of the run."""
         return [asdict(event) for event in self.events]
