@@ -1,4 +1,4 @@
-"""COMMAND_LONG and COMMAND_INT: one normal form for both, and what each command does."""
+"""Common form of COMMAND_LONG and COMMAND_INT, and execution of each command."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FARTHEST_M = 1e6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """A command of either message; parameters that were not given are NaN."""
+    """A command from either message. Missing parameters are NaN."""
 
     number: int
     p1: float
@@ -38,13 +38,13 @@ class Command:
     latitude_deg: float  # p5 of a COMMAND_LONG
     longitude_deg: float  # p6
     altitude_m: float  # p7
-    above_home: bool  # what the altitude counts from; otherwise from the sea
-    system: int  # who asked
+    above_home: bool  # altitude above home; otherwise above sea level
+    system: int  # system id of the sender
     component: int
 
 
 def from_long(message: Any) -> Command:
-    """The normal form of a COMMAND_LONG."""
+    """Convert a COMMAND_LONG to the common form."""
     return Command(
         number=message.command, p1=message.param1, p2=message.param2, p3=message.param3,
         p4=message.param4, latitude_deg=message.param5, longitude_deg=message.param6,
@@ -54,7 +54,7 @@ def from_long(message: Any) -> Command:
 
 
 def from_int(message: Any) -> Command:
-    """The normal form of a COMMAND_INT."""
+    """Convert a COMMAND_INT to the common form."""
     return Command(
         number=message.command, p1=message.param1, p2=message.param2, p3=message.param3,
         p4=message.param4, latitude_deg=_degrees(message.x), longitude_deg=_degrees(message.y),
@@ -68,19 +68,19 @@ def _degrees(value: int) -> float:
 
 
 def acknowledge(command: Command, result: Result) -> Any:
-    """The COMMAND_ACK that goes to who asked."""
+    """Return the COMMAND_ACK to the sender."""
     return dialect.MAVLink_command_ack_message(
         command.number, int(result), 0, 0, command.system, command.component
     )
 
 
 def _whole(value: float) -> int | None:
-    """A parameter that stands for a number of something; None where it is none."""
+    """Return an integer parameter; None if it is not an integer."""
     return int(value) if math.isfinite(value) and value == int(value) else None
 
 
 def execute(autopilot: Autopilot, command: Command, link: Link) -> None:
-    """Carry a command out and acknowledge it."""
+    """Execute a command and acknowledge it."""
     handler = _HANDLERS.get(command.number)
     result = Result.UNSUPPORTED if handler is None else handler(autopilot, command, link)
     if result is not None:
@@ -98,7 +98,7 @@ def _arm_disarm(autopilot: Autopilot, command: Command, _link: Link) -> Result |
 
 
 def _set_mode(autopilot: Autopilot, command: Command, link: Link) -> Result:
-    """PX4 answers twice: its receiver says ACCEPTED, then the commander gives its verdict."""
+    """Answer twice like PX4: its receiver acknowledges first, then its commander decides."""
     link.send(acknowledge(command, Result.ACCEPTED))
     base, main, sub = (_whole(value) for value in (command.p1, command.p2, command.p3))
     if base is None or not base & 1 or main is None:
@@ -122,7 +122,7 @@ def _takeoff(autopilot: Autopilot, command: Command, _link: Link) -> Result:
 
 
 def _down(autopilot: Autopilot, command: Command) -> float:
-    """The height that a command names, local down, m; NaN where it names none."""
+    """Return a command's height as local down, m; NaN if it has none."""
     if not abs(command.altitude_m) < _FARTHEST_M:
         return math.nan
     if command.above_home:
@@ -132,7 +132,7 @@ def _down(autopilot: Autopilot, command: Command) -> float:
 
 def _mode_command(mode: Mode) -> Callable[[Autopilot, Command, Link], Result]:
     def handler(autopilot: Autopilot, _command: Command, _link: Link) -> Result:
-        """Enter the mode; whether it was accepted."""
+        """Enter the mode and return the result."""
         return autopilot.enter_mode(mode)
 
     return handler
@@ -193,7 +193,7 @@ def _request_version(autopilot: Autopilot, _command: Command, link: Link) -> Res
 
 
 def _send_one(autopilot: Autopilot, number: int, link: Link) -> Result:
-    """A requested message goes out before the ACK."""
+    """Send a requested message before the acknowledgement."""
     build = BUILDERS.get(number)
     message = None if build is None else build(autopilot.snapshot)
     if message is None:
@@ -215,7 +215,7 @@ def _get_interval(_autopilot: Autopilot, command: Command, link: Link) -> Result
     if number is None or not 0 <= number <= 0xFFFF:
         return Result.FAILED
     interval = link.streams.interval_us(number)
-    wire = 0 if interval is None else (interval or -1)  # 0: not available, -1: not streamed
+    wire = 0 if interval is None else (interval or -1)  # 0: unavailable, -1: not streamed
     link.send(dialect.MAVLink_message_interval_message(number, int32(wire)))
     return Result.ACCEPTED
 

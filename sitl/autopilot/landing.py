@@ -1,4 +1,4 @@
-"""The land detector: on the ground, still, and not asked to climb, for some time."""
+"""Land detector: on the ground, still, and without a climb setpoint for some time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _STILL_MPS = 0.5
 
 
 class LandDetector:
-    """Whether the vehicle has landed, with PX4's LNDMC_TRIG_TIME as hysteresis."""
+    """Detects landing, with PX4's LNDMC_TRIG_TIME as hysteresis."""
 
     __slots__ = ("_settled_since_us", "landed")
 
@@ -17,7 +17,7 @@ class LandDetector:
         self._settled_since_us: int | None = None
 
     def update(self, stamp_us: int, truth: Truth, *, wants_up: bool, trigger_s: float) -> bool:
-        """Take the newest state; True where `landed` has just changed."""
+        """Take the newest state. Return True if `landed` has changed."""
         if self.landed:
             self.landed = truth.on_ground
             self._settled_since_us = None

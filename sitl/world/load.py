@@ -1,4 +1,4 @@
-"""From a name, a generator spec or a file to a world."""
+"""Loads a world by name, generator spec or file."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ GENERATED: dict[str, Pair] = {
         for size in (3.0, 5.0)
     },
 }
-"""The paper's pairs (section VI-A): two to evaluate on, four to train on."""
+"""Pairs of the paper (section VI-A): two for evaluation, four for training."""
 
 SCENES: tuple[str, ...] = ("factory", "farm")
 
 
 def world_names() -> list[str]:
-    """Every world that has a name, evaluation worlds first."""
+    """Return the names of all worlds, evaluation worlds first."""
     trained = [name for name in GENERATED if name.startswith("train-")]
     return [*(name for name in GENERATED if name not in trained), *SCENES, *trained]
 
@@ -41,18 +41,18 @@ def load_world(
     start_enu_m: Sequence[float] | Vector | None = None,
     goal_enu_m: Sequence[float] | Vector | None = None,
 ) -> World:
-    """The world of a name, of `gen:density,size`, or of a TOML file, for one seed.
+    """Load a world by name, `gen:density,size` or TOML file for one seed.
 
     Args:
-        name_or_path: one of `world_names()`, a generator spec, or a path ending in `.toml`.
-        seed: non-negative; with the same seed the same world, always.
-        start_enu_m: (3,) where the flight starts, m; default: the world's own.
-        goal_enu_m: (3,) where it goes, m; default: the world's own.
+        name_or_path: One of `world_names()`, a generator spec, or a path ending in `.toml`.
+        seed: Non-negative seed. The same seed always gives the same world.
+        start_enu_m: Start of the flight (3,), m; default: the world's own.
+        goal_enu_m: Goal of the flight (3,), m; default: the world's own.
 
     Raises:
-        UnknownName: no such world; names the nearest.
-        WorldError: start or goal outside or blocked, or a generator spec that makes no world.
-        ConfigError: a file that cannot be used; with file, line and key.
+        UnknownName: No world has this name. Suggests the nearest.
+        WorldError: Start or goal is outside or blocked, or the generator spec is invalid.
+        ConfigError: The file cannot be used. Names file, line and key.
     """
     if seed < 0:
         raise WorldError(f"seed {seed} is negative")
@@ -85,7 +85,7 @@ def _is_path(text: str) -> bool:
 
 
 def _pair_of_spec(text: str) -> Pair | None:
-    """The pair of `gen:density,size`, or None where the text is no such spec."""
+    """Parse `gen:density,size`. Return None if the text is not such a spec."""
     if not text.startswith("gen:"):
         return None
     try:
