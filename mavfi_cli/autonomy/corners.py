@@ -19,7 +19,7 @@ from mavfi_cli.core.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
+class MotionLimits:
     """Limits of a motion."""
 
     speed_mps: float
@@ -39,7 +39,7 @@ class Polyline:
     half_sines: FloatArray  # (n,) sin of half the turn at each vertex; 0 at the ends
 
 
-def polyline(vertices: FloatArray, limits: Limits) -> Polyline:
+def polyline(vertices: FloatArray, limits: MotionLimits) -> Polyline:
     """Compute the geometry of a path (n, 3) without points within 1 mm of their predecessor."""
     kept = [vertices[0]]
     for vertex in vertices[1:]:
@@ -61,7 +61,7 @@ def polyline(vertices: FloatArray, limits: Limits) -> Polyline:
     )
 
 
-def _speed_cap(rise: float, limits: Limits) -> float:
+def _speed_cap(rise: float, limits: MotionLimits) -> float:
     """Return the speed that keeps the vertical limits along a direction of vertical part `rise`."""
     cap = limits.speed_mps
     if rise > 0.0:

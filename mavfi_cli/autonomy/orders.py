@@ -8,7 +8,7 @@ from enum import Enum
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 
-class Mode(Enum):
+class PilotMode(Enum):
     """Mode of the pilot."""
 
     TURNING = "turning"  # hovers and turns once round before the first plan
@@ -47,7 +47,7 @@ class PlanFailure:
 class Directive:
     """Input of the control stage in one tick."""
 
-    mode: Mode
+    mode: PilotMode
     trajectory: Trajectory | None  # None: hold `hold_enu_m`
     time_s: float  # point on the trajectory, from its first waypoint
     rate: float  # trajectory seconds per second, 0..1

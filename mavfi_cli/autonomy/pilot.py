@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mavfi_cli.autonomy.flown import FlownPlan
-from mavfi_cli.autonomy.orders import Directive, Mode, PlanFailure, PlanRequest
+from mavfi_cli.autonomy.orders import Directive, PilotMode, PlanFailure, PlanRequest
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
@@ -92,7 +92,7 @@ class Pilot:
         self.params = params
         self.goal_enu_m = goal_enu_m
         self.counters = Counters()
-        self.mode = Mode.WAITING
+        self.mode = PilotMode.WAITING
         self.flown = FlownPlan(params.v_max_mps, params.brake_mps2)
         self._next: Trajectory | None = None
         self._hold: FloatArray | None = None
@@ -127,7 +127,7 @@ class Pilot:
         elif self.params.acts_on_report_once:
             return False
         self._collision_seq = report.future_collision_seq
-        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.WAITING):
+        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP, PilotMode.WAITING):
             return False
         self._next = None
         self.want_plan()
@@ -151,25 +151,25 @@ class Pilot:
             self._stop_s = self._stamp_s + (left_s - brake_s if left_s > brake_s else 0.0)
             return
         if not left_s > brake_s:  # also stops on NaN
-            mode = Mode.STOPPING
+            mode = PilotMode.STOPPING
         elif left_s <= brake_s + p.plan_lead_s + p.late_plan_s:
-            mode = Mode.SLOWING
+            mode = PilotMode.SLOWING
         else:
-            mode = Mode.EVADING
-        severity = (Mode.FLYING, Mode.EVADING, Mode.SLOWING, Mode.STOPPING)
+            mode = PilotMode.EVADING
+        severity = (PilotMode.FLYING, PilotMode.EVADING, PilotMode.SLOWING, PilotMode.STOPPING)
         if severity.index(mode) > severity.index(self.mode):
-            if mode is Mode.STOPPING:
+            if mode is PilotMode.STOPPING:
                 self._brake()
                 self._plan_anew()
-            elif mode is Mode.SLOWING:
+            elif mode is PilotMode.SLOWING:
                 self.counters.slowdowns += 1
             self.mode = mode
 
     def _brake(self) -> None:
         """Stop on the trajectory."""
-        if self.mode is not Mode.STOPPING:
+        if self.mode is not PilotMode.STOPPING:
             self.counters.stops += 1
-        self.mode = Mode.STOPPING
+        self.mode = PilotMode.STOPPING
 
     def _plan_anew(self) -> None:
         """Request a plan and abandon the pending one, whose start is no longer valid."""
@@ -238,7 +238,7 @@ class Pilot:
 
     def want_plan(self) -> None:
         """Request a new plan unless one is pending."""
-        if not self._awaiting_plan and self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
+        if not self._awaiting_plan and self.mode not in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
             self._wanted = True
 
     def _plan_failed(self) -> None:
@@ -246,12 +246,12 @@ class Pilot:
         self._failures += 1
         self._wanted = True
         self._not_before_s = self._stamp_s + self.params.retry_s
-        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
+        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
             return
         if self.flown.trajectory is not None:
             self._brake()
         if self._failures >= self.params.attempts_max:
-            self.mode = Mode.GAVE_UP
+            self.mode = PilotMode.GAVE_UP
         elif self._failures == self.params.look_round_after:
             self._look_started_s = self._stamp_s
             self.counters.look_rounds += 1
@@ -263,8 +263,8 @@ class Pilot:
         self._stamp_s = stamp_s
         if self._hold is None:
             self._begin(state)
-        if self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
-            if self.mode is Mode.TURNING:
+        if self.mode not in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
+            if self.mode is PilotMode.TURNING:
                 self._turn(stamp_s)
             self._stop_if_due(stamp_s, state)
             self._advance(step_s, state)
@@ -272,7 +272,7 @@ class Pilot:
             self._adopt_next(stamp_s)
             self._guard(state)
             if self._has_arrived(state):
-                self.mode = Mode.ARRIVED
+                self.mode = PilotMode.ARRIVED
                 self._hold, self._hold_yaw = self.goal_enu_m, state.yaw_rad
                 self.flown.stand()
         plan = self._plan_request(stamp_s, state)
@@ -292,7 +292,7 @@ class Pilot:
         """Run the first tick: hover here, and turn once round first if the parameters say so."""
         self._hold_here(state)
         if self.params.turns_before_departure:
-            self.mode = Mode.TURNING
+            self.mode = PilotMode.TURNING
             self._look_started_s = self._stamp_s
 
     def _turn(self, stamp_s: float) -> None:
@@ -300,7 +300,7 @@ class Pilot:
         assert self._look_started_s is not None
         if stamp_s - self._look_started_s >= TURN_S:
             self._look_started_s = None
-            self.mode = Mode.WAITING
+            self.mode = PilotMode.WAITING
 
     def _has_arrived(self, state: VehicleState) -> bool:
         distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
@@ -326,14 +326,14 @@ class Pilot:
         self._hold_here(state)
         self.flown.stand()
         self._next = None
-        self.mode = Mode.WAITING if self.params.plans_in_motion else Mode.STOPPING
+        self.mode = PilotMode.WAITING if self.params.plans_in_motion else PilotMode.STOPPING
 
     def _settle(self, state: VehicleState) -> None:
         """Move the hover position with the vehicle while it brakes without a trajectory."""
-        if self.mode is Mode.STOPPING and self.flown.trajectory is None:
+        if self.mode is PilotMode.STOPPING and self.flown.trajectory is None:
             self._hold_here(state)
             if self._at_rest(state):
-                self.mode = Mode.WAITING
+                self.mode = PilotMode.WAITING
 
     def _adopt_next(self, stamp_s: float) -> None:
         """Switch to the next trajectory once its start time is reached."""
@@ -341,7 +341,7 @@ class Pilot:
             return
         self.counters.replans += self._adopted
         self._adopted = True
-        moving = self.mode not in (Mode.WAITING, Mode.STOPPING)
+        moving = self.mode not in (PilotMode.WAITING, PilotMode.STOPPING)
         late_s = stamp_s - self._next.stamp_s
         self.flown.begin(
             self._next,
@@ -351,18 +351,18 @@ class Pilot:
         )
         self._next = None
         self._stop_s = math.inf
-        self.mode = Mode.FLYING
+        self.mode = PilotMode.FLYING
 
     def _advance(self, step_s: float, state: VehicleState) -> None:
         """Run the trajectory's clock at the rate of the mode. Hover at the trajectory's end."""
         if self.flown.trajectory is None:
             return
-        slower = {Mode.STOPPING: 0.0, Mode.SLOWING: self.params.slow_rate}
+        slower = {PilotMode.STOPPING: 0.0, PilotMode.SLOWING: self.params.slow_rate}
         rate = slower.get(self.mode, 1.0)
         if self.params.slows_where_blind and self._flies_blind(state):
             rate = min(rate, self.params.slow_rate)
         self.flown.advance(step_s, rate)
-        stopped = self.mode is Mode.STOPPING and self.flown.rate <= 0.0
+        stopped = self.mode is PilotMode.STOPPING and self.flown.rate <= 0.0
         if not (stopped or (self.flown.over and self._next is None)):
             return
         if self.params.plans_in_motion:
@@ -396,7 +396,7 @@ class Pilot:
 
     def abandon(self, state: VehicleState) -> None:
         """Drop the trajectory, hover here, and request a plan from here."""
-        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
+        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
             return
         self._hover(state)
         self._plan_anew()
@@ -408,7 +408,7 @@ class Pilot:
         self._hold, self._hold_yaw = reference[0:3].copy(), float(reference[3])
         self.flown.stand()
         self.want_plan()
-        self.mode = Mode.WAITING
+        self.mode = PilotMode.WAITING
 
     def _hold_here(self, state: VehicleState) -> None:
         self._hold = state.position_enu_m.copy()
@@ -416,7 +416,12 @@ class Pilot:
 
     def _plan_request(self, stamp_s: float, state: VehicleState) -> PlanRequest | None:
         """Return a request if one is due, none is pending, and the pause is over."""
-        idle = self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.STOPPING, Mode.TURNING)
+        idle = self.mode in (
+            PilotMode.ARRIVED,
+            PilotMode.GAVE_UP,
+            PilotMode.STOPPING,
+            PilotMode.TURNING,
+        )
         if not self.params.plans_in_motion:
             idle = idle or self.flown.trajectory is not None or not self._at_rest(state)
         if idle or not self._wanted or self._awaiting_plan or stamp_s < self._not_before_s:
@@ -463,7 +468,7 @@ class Pilot:
 
     def _look_round_angle(self, stamp_s: float) -> float:
         """Return the angle of the turn after failed plans, rad: one full turn in 6 s."""
-        if self._look_started_s is None or self.mode not in (Mode.WAITING, Mode.TURNING):
+        if self._look_started_s is None or self.mode not in (PilotMode.WAITING, PilotMode.TURNING):
             return 0.0
         turn_s = stamp_s - self._look_started_s
         return min(2.0 * math.pi, turn_s * 2.0 * math.pi / TURN_S)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.autonomy import corners
-from mavfi_cli.autonomy.corners import Limits, Motion
+from mavfi_cli.autonomy.corners import Motion, MotionLimits
 from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.heading import headings, turn_time_s
 from mavfi_cli.core.types import FloatArray, Trajectory
@@ -56,9 +56,9 @@ class SmoothingParams:
     passes_max: int = 40
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> MotionLimits:
         """Return the limits of the planned motion."""
-        return Limits(
+        return MotionLimits(
             speed_mps=self.speed_share * self.v_max_mps,
             climb_mps=self.climb_max_mps,
             descent_mps=self.descent_max_mps,

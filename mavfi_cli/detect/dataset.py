@@ -28,7 +28,7 @@ _STACK = (b"mavfi_stack", b"mavfi_stack_digest")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Flight:
+class FlightSamples:
     """Samples of one error-free flight, oldest first."""
 
     world: str
@@ -53,7 +53,7 @@ class Flight:
 class Dataset:
     """Flights with distinct combinations of world and seed."""
 
-    flights: tuple[Flight, ...]
+    flights: tuple[FlightSamples, ...]
     preprocess: PreprocessParams
     stack: StackMark  # stack of all flights
 
@@ -137,7 +137,7 @@ def _joined(arrays: list[NDArray[np.generic]]) -> NDArray[np.generic]:
     return np.concatenate(arrays) if arrays else np.zeros(0)
 
 
-def _flights(table: object) -> Iterable[Flight]:
+def _flights(table: object) -> Iterable[FlightSamples]:
     columns = {name: table[name].to_numpy() for name in table.column_names}  # type: ignore[attr-defined,index]
     worlds, seeds = columns["world"], columns["seed"]
     rows = len(worlds)
@@ -148,7 +148,7 @@ def _flights(table: object) -> Iterable[Flight]:
     deltas = np.column_stack([columns[name] for name in NAMES]).astype(np.int16)
     extended = np.column_stack([columns[state.name] for state in EXTENDED]).astype(np.int16)
     for start, end in itertools.pairwise(edges):
-        yield Flight(
+        yield FlightSamples(
             world=str(worlds[start]),
             seed=int(seeds[start]),
             stamps_s=columns["stamp_s"][start:end],

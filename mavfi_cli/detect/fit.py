@@ -22,7 +22,7 @@ from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.detect import gaussian, span, train_autoencoder
 from mavfi_cli.detect.autoencoder import AutoencoderDetector
 from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.dataset import Dataset, Flight
+from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.model import Model, checked_threshold
 from mavfi_cli.detect.norm import NormDetector
@@ -164,7 +164,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     )
 
 
-def warmed(detector: GaussianDetector, flights: list[Flight]) -> GaussianDetector:
+def warmed(detector: GaussianDetector, flights: list[FlightSamples]) -> GaussianDetector:
     """Return the detector after it has learned all samples of the flights."""
     for flight in flights:
         for stage in Stage:
@@ -173,7 +173,7 @@ def warmed(detector: GaussianDetector, flights: list[Flight]) -> GaussianDetecto
     return detector
 
 
-def scale_of(flights: list[Flight]) -> FloatArray:
+def scale_of(flights: list[FlightSamples]) -> FloatArray:
     """Return the largest |delta| in each state's group (COUNT,), at least 1.
 
     The scaled inputs lie within about +-1. The components of a vector share one scale, because each
@@ -208,7 +208,7 @@ def mirrored(deltas: Codes) -> NDArray[np.int64]:
     return np.unique(np.concatenate(images), axis=0)
 
 
-def scores(detector: Detector, flight: Flight) -> FloatArray:
+def scores(detector: Detector, flight: FlightSamples) -> FloatArray:
     """Return the score of every judged message (n,): the highest score of its stages."""
     found = np.zeros(len(flight.deltas))
     rows = zip(flight.deltas, *(_flags(flight)), strict=True)
@@ -223,16 +223,16 @@ def scores(detector: Detector, flight: Flight) -> FloatArray:
     return found
 
 
-def _flags(flight: Flight) -> tuple[list[bool], list[bool], list[bool]]:
+def _flags(flight: FlightSamples) -> tuple[list[bool], list[bool], list[bool]]:
     return flight.reports.tolist(), flight.plan_steps.tolist(), flight.new_waypoint.tolist()
 
 
-def _all(flights: list[Flight]) -> Codes:
+def _all(flights: list[FlightSamples]) -> Codes:
     """Return the deltas (n, COUNT) of all samples of some flights."""
     return np.concatenate([flight.deltas for flight in flights])
 
 
-def _largest(detector: Detector, flights: list[Flight]) -> float:
+def _largest(detector: Detector, flights: list[FlightSamples]) -> float:
     """Return the largest score of the flights.
 
     For a detector with one score over all states it includes the mirror images.

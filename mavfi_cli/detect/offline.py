@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.states import BY_NAME, STATES, DType
 from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Trajectory
 from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.dataset import Flight
+from mavfi_cli.detect.dataset import FlightSamples
 from mavfi_cli.detect.gate import ALL_STAGES, Alarm, Gate
 from mavfi_cli.detect.preprocess import (
     COUNT,
@@ -169,7 +169,7 @@ def flight_of(
     seed: int,
     params: PreprocessParams | None = None,
     plans: Sequence[Trajectory] = (),
-) -> Flight:
+) -> FlightSamples:
     """Extract the samples of one error-free flight for a data set.
 
     Args:
@@ -186,7 +186,7 @@ def flight_of(
     for first, plan, row in zip(firsts.tolist(), plans, changes(plans), strict=True):
         if len(plan.waypoints) > 1:
             extended[first] = row
-    return Flight(
+    return FlightSamples(
         world=world,
         seed=seed,
         stamps_s=np.array([each.stamp_s for each in judged] + stamps, np.float64),

@@ -13,7 +13,7 @@ from mavfi_cli.link.codec import dialect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Autopilot:
+class AutopilotProfile:
     """Modes and command conventions of one autopilot."""
 
     name: str
@@ -44,7 +44,7 @@ def _px4(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
-PX4 = Autopilot(
+PX4 = AutopilotProfile(
     name="PX4",
     modes={
         "MANUAL": _px4(1),
@@ -68,7 +68,7 @@ PX4 = Autopilot(
     early_setpoints=True,
 )
 
-ARDUCOPTER = Autopilot(
+ARDUCOPTER = AutopilotProfile(
     name="ArduCopter",
     modes={
         "STABILIZE": 0,
@@ -92,6 +92,6 @@ ARDUCOPTER = Autopilot(
 )
 
 
-def autopilot_of(mav_autopilot: int) -> Autopilot:
+def autopilot_of(mav_autopilot: int) -> AutopilotProfile:
     """Return the entry for a HEARTBEAT.autopilot. An unknown autopilot is treated as PX4."""
     return ARDUCOPTER if mav_autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA else PX4

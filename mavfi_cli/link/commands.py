@@ -31,7 +31,7 @@ _RESULTS = {
 _PASSING = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_FAILED)
 
 
-class Verdict(Enum):
+class CommandState(Enum):
     """State of a command."""
 
     PENDING = "pending"
@@ -55,8 +55,8 @@ class Ticket:
         self.component = component
         self.parameters = parameters
         self.refusals_left = refusals
-        self.verdict = Verdict.PENDING
-        self.result = Verdict.UNANSWERED.value
+        self.verdict = CommandState.PENDING
+        self.result = CommandState.UNANSWERED.value
         self.sent = 0
         self.sent_since_answer = 0
         self.due_s = -1.0
@@ -64,7 +64,7 @@ class Ticket:
     @property
     def pending(self) -> bool:
         """True until the command is accepted, refused or given up."""
-        return self.verdict is Verdict.PENDING
+        return self.verdict is CommandState.PENDING
 
 
 class CommandChannel:
@@ -101,7 +101,7 @@ class CommandChannel:
         ticket = Ticket(command, padded, component, refusals)
         lane = self._lanes.setdefault((component, command), deque())
         if len(lane) >= _MAX_WAITING:
-            ticket.verdict = Verdict.UNANSWERED
+            ticket.verdict = CommandState.UNANSWERED
         else:
             lane.append(ticket)
         return ticket
@@ -121,12 +121,12 @@ class CommandChannel:
         if message.result == dialect.MAV_RESULT_IN_PROGRESS:
             ticket.due_s = self._now_s + PROGRESS_TIMEOUT_S
         elif message.result == dialect.MAV_RESULT_ACCEPTED:
-            self._close(lane, Verdict.ACCEPTED)
+            self._close(lane, CommandState.ACCEPTED)
         elif message.result in _PASSING and ticket.refusals_left > 0:
             ticket.refusals_left -= 1
             ticket.due_s = self._now_s + REFUSAL_PAUSE_S
         else:
-            self._close(lane, Verdict.REFUSED)
+            self._close(lane, CommandState.REFUSED)
 
     def poll(self, stamp_s: float, system: int) -> list[Message]:
         """Return the commands that are due at `stamp_s`, addressed to `system`."""
@@ -138,7 +138,7 @@ class CommandChannel:
                 if ticket.sent_since_answer < TRIES:
                     due.append(self._send(ticket, system))
                     break
-                self._close(lane, Verdict.UNANSWERED)
+                self._close(lane, CommandState.UNANSWERED)
         return due
 
     def _send(self, ticket: Ticket, system: int) -> Message:
@@ -151,5 +151,5 @@ class CommandChannel:
         )
 
     @staticmethod
-    def _close(lane: deque[Ticket], verdict: Verdict) -> None:
+    def _close(lane: deque[Ticket], verdict: CommandState) -> None:
         lane.popleft().verdict = verdict

@@ -7,7 +7,7 @@ from typing import NoReturn
 
 from mavfi_cli.core.errors import CommandRefused
 from mavfi_cli.link.codec import dialect
-from mavfi_cli.link.commands import CommandChannel, Ticket, Verdict
+from mavfi_cli.link.commands import CommandChannel, CommandState, Ticket
 from mavfi_cli.link.telemetry import Telemetry
 
 _SETTLE_S = 0.5  # wait for status texts after a refusal
@@ -80,7 +80,7 @@ class Requests:
         if self._decided_s is None:
             self._decided_s = self.now_s
         waited_s = self.now_s - self._decided_s
-        if ticket.verdict is Verdict.ACCEPTED:
+        if ticket.verdict is CommandState.ACCEPTED:
             if waited_s >= _EFFECT_S:
                 self._ticket = None
             return True

@@ -10,7 +10,7 @@ import numpy as np
 
 from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
 from mavfi_cli.core.types import FloatArray, VehicleState
-from mavfi_cli.link.autopilots import PX4, Autopilot, autopilot_of
+from mavfi_cli.link.autopilots import PX4, AutopilotProfile, autopilot_of
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.history import StateHistory
 from mavfi_cli.link.texts import TextCollector
@@ -52,7 +52,7 @@ class Telemetry:
     def __init__(self) -> None:
         self.now_s = 0.0
         self.system = 0
-        self.autopilot: Autopilot = PX4
+        self.autopilot: AutopilotProfile = PX4
         self.state: VehicleState | None = None
         self.armed = False
         self.mode = ""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
-from mavfi_cli.link.endpoint import Endpoint, Scheme, check_reach, parse_endpoint, resolve
+from mavfi_cli.link.endpoint import Endpoint, UrlScheme, check_reach, parse_endpoint, resolve
 
 __all__ = [
     "EndpointError",
@@ -81,21 +81,21 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
     """
     # Each scheme's module is imported on first use to keep the import of this module cheap.
     endpoint = parse_endpoint(url)
-    if endpoint.scheme is Scheme.SERIAL:
+    if endpoint.scheme is UrlScheme.SERIAL:
         from mavfi_cli.link.serial_port import SerialPort
 
         return SerialPort(endpoint)
-    if endpoint.scheme in (Scheme.UDP_IN, Scheme.UDP_OUT):
+    if endpoint.scheme in (UrlScheme.UDP_IN, UrlScheme.UDP_OUT):
         from mavfi_cli.link import datagrams
 
-        opened = datagrams.bound if endpoint.scheme is Scheme.UDP_IN else datagrams.connected
+        opened = datagrams.bound if endpoint.scheme is UrlScheme.UDP_IN else datagrams.connected
         return opened(endpoint, _reachable(endpoint, signed, allow_unsigned))
     from mavfi_cli.link import streams
 
-    if endpoint.scheme is Scheme.FD:
+    if endpoint.scheme is UrlScheme.FD:
         return streams.inherited(endpoint)
     address = _reachable(endpoint, signed, allow_unsigned)
-    if endpoint.scheme is Scheme.TCP:
+    if endpoint.scheme is UrlScheme.TCP:
         return streams.connected(endpoint, address)
     return streams.TcpServerEnd(streams.TcpListener(endpoint, address))
 
@@ -103,11 +103,11 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
 def open_listener(url: str, *, signed: bool = False, allow_unsigned: bool = False) -> Listener:
     """Open an endpoint that serves several peers. Arguments and errors as in `open_transport`."""
     endpoint = parse_endpoint(url)
-    if endpoint.scheme is Scheme.UDP_IN:
+    if endpoint.scheme is UrlScheme.UDP_IN:
         from mavfi_cli.link.datagrams import UdpListener
 
         return UdpListener(endpoint, _reachable(endpoint, signed, allow_unsigned))
-    if endpoint.scheme is Scheme.TCP_IN:
+    if endpoint.scheme is UrlScheme.TCP_IN:
         from mavfi_cli.link.streams import TcpListener
 
         return TcpListener(endpoint, _reachable(endpoint, signed, allow_unsigned))
@@ -117,7 +117,7 @@ def open_listener(url: str, *, signed: bool = False, allow_unsigned: bool = Fals
 def _reachable(endpoint: Endpoint, signed: bool, allow_unsigned: bool) -> tuple[int, str]:
     import socket
 
-    datagram = endpoint.scheme in (Scheme.UDP_IN, Scheme.UDP_OUT)
+    datagram = endpoint.scheme in (UrlScheme.UDP_IN, UrlScheme.UDP_OUT)
     kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
     family, address = resolve(endpoint, kind)
     check_reach(endpoint, address, signed=signed, allow_unsigned=allow_unsigned)

@@ -24,7 +24,7 @@ from mavfi_cli.fi.source.activation import Follower
 from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.injection import Injection, NoInjection
+from mavfi_cli.mission.injection import NoInjection, SourceInjection
 
 M = TypeVar("M", CollisionReport, Trajectory, Command)
 
@@ -102,14 +102,15 @@ class Trunk(NoInjection):
             if member.config.fault is not None
         }
         self._branch = branch
-        self._waiting: dict[int, Injection] = {}
+        self._waiting: dict[int, SourceInjection] = {}
         self._own = NoInjection()
         self.follower: Follower = Follower()  # follows nothing yet
 
     def prepare(self, shortest_flight_s: float) -> None:
         """Draw the faults, as soon as it is known over which time."""
         self._waiting = {
-            number: Injection(fault, shortest_flight_s) for number, fault in self._faults.items()
+            number: SourceInjection(fault, shortest_flight_s)
+            for number, fault in self._faults.items()
         }
 
     @property

@@ -156,7 +156,7 @@ def parse_trigger(text: str) -> Trigger:
         UnknownName: The kind of trigger or the phase does not exist.
         FaultSpecError: The number is missing or invalid.
     """
-    from mavfi_cli.autonomy.orders import Mode
+    from mavfi_cli.autonomy.orders import PilotMode
 
     kind, _, value = text.partition("=")
     if not value and kind.replace(".", "", 1).isdigit():
@@ -165,7 +165,7 @@ def parse_trigger(text: str) -> Trigger:
     if when in (When.RANDOM, When.FORESEEN):
         return Trigger(when=when)
     if when is When.PHASE:
-        return Trigger(when=when, phase=_member(Mode, "phase", value).value)
+        return Trigger(when=when, phase=_member(PilotMode, "phase", value).value)
     try:
         return Trigger(when=when, number=float(value))
     except ValueError:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import TURN_S
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
@@ -33,9 +33,9 @@ from mavfi_cli.mission.companion.protection import gate_of, protection_of
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import (
     DetectorInjection,
-    Injection,
     NoInjection,
     ProcessInjection,
+    SourceInjection,
 )
 from mavfi_cli.mission.narrator import Narrator
 from mavfi_cli.mission.orders import Recorder
@@ -128,7 +128,7 @@ class Flight:
         elif fault is not None and fault.attacks_detector:
             self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
         elif fault is not None:
-            self.injection = Injection(fault, shortest_s)
+            self.injection = SourceInjection(fault, shortest_s)
         elif isinstance(self.injection, Trunk):
             self.injection.prepare(shortest_s)
         self.companion = Companion(
@@ -363,9 +363,9 @@ class Flight:
             self.end(Outcome.FAILSAFE, session.failsafe_text or "")
         elif session.link_lost:
             self.end(Outcome.LINK_LOST, "no heartbeat for 3 s")
-        elif companion is not None and companion.mode is Mode.ARRIVED:
+        elif companion is not None and companion.mode is PilotMode.ARRIVED:
             self.end(Outcome.SUCCESS)
-        elif companion is not None and companion.mode is Mode.GAVE_UP:
+        elif companion is not None and companion.mode is PilotMode.GAVE_UP:
             self.end(
                 Outcome.NO_PATH, f"{companion.pilot.params.attempts_max} plans in a row failed"
             )

@@ -127,7 +127,7 @@ class _Recorded(NoInjection, ABC):
         }
 
 
-class Injection(_Recorded):
+class SourceInjection(_Recorded):
     """Injection of one source-level fault into a mission.
 
     Args:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 
-class Verdict(Enum):
+class CheckResult(Enum):
     """Result of a check."""
 
     OK = "ok"
@@ -32,7 +32,7 @@ class Check:
     """One line of the report."""
 
     name: str
-    verdict: Verdict
+    verdict: CheckResult
     found: str
     remedy: str = ""
 
@@ -49,9 +49,9 @@ _WHEELS = {
 }  # fmt: skip
 _LOAD_VEHICLE = """
 from sitl.vehicle.profile_files import load_profile
-from sitl.vehicle.vehicle import Vehicle
+from sitl.vehicle.vehicle import Quadrotor
 import numpy, sys
-vehicle = Vehicle(load_profile("solo"), position_enu_m=numpy.zeros(3), yaw_enu_rad=0.0)
+vehicle = Quadrotor(load_profile("solo"), position_enu_m=numpy.zeros(3), yaw_enu_rad=0.0)
 target = numpy.full(11, numpy.nan)
 target[3:6] = 0.0, 0.0, -1.0
 for _ in range(500):
@@ -82,7 +82,7 @@ def _python() -> Check:
     version = platform.python_version()
     good = sys.version_info >= (3, 11)
     return Check(
-        name="Python", verdict=Verdict.OK if good else Verdict.FAILED, found=version,
+        name="Python", verdict=CheckResult.OK if good else CheckResult.FAILED, found=version,
         remedy="" if good else "install Python 3.11 or newer",
     )  # fmt: skip
 
@@ -92,12 +92,12 @@ def _processor() -> Check:
     system, machine = platform.system(), platform.machine()
     found = f"{system} {machine}, {cores} core{'s' if cores != 1 else ''} usable"
     if system != "Linux" or machine not in ("x86_64", "aarch64"):
-        return Check(name="Processor", verdict=Verdict.LIMITED, found=found,
+        return Check(name="Processor", verdict=CheckResult.LIMITED, found=found,
                      remedy="wheels exist for Linux on x86-64")  # fmt: skip
     if machine == "aarch64":
-        return Check(name="Processor", verdict=Verdict.LIMITED, found=found,
+        return Check(name="Processor", verdict=CheckResult.LIMITED, found=found,
                      remedy="jsbsim and pyoctomap have no wheel here: build them")  # fmt: skip
-    return Check(name="Processor", verdict=Verdict.OK, found=found)
+    return Check(name="Processor", verdict=CheckResult.OK, found=found)
 
 
 def _wheels() -> Iterator[Check]:
@@ -110,24 +110,24 @@ def _wheels() -> Iterator[Check]:
             missing.append(f"{distribution} ({error})")
     if missing:
         problem = "missing: " + "; ".join(missing)
-        yield Check(name="Libraries", verdict=Verdict.FAILED, found=problem,
+        yield Check(name="Libraries", verdict=CheckResult.FAILED, found=problem,
                     remedy="pip install -e . in the project's folder")  # fmt: skip
     else:
-        yield Check(name="Libraries", verdict=Verdict.OK, found=", ".join(found))
+        yield Check(name="Libraries", verdict=CheckResult.OK, found=", ".join(found))
 
 
 def _extras() -> Check:
     have = [extra for extra, module in _EXTRAS.items() if importlib.util.find_spec(module)]
     lack = [extra for extra in _EXTRAS if extra not in have]
     found = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
-    return Check(name="Extras", verdict=Verdict.OK, found=found)
+    return Check(name="Extras", verdict=CheckResult.OK, found=found)
 
 
 def _disk() -> Check:
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     good = free > 1.0
     return Check(
-        name="Disk", verdict=Verdict.OK if good else Verdict.LIMITED,
+        name="Disk", verdict=CheckResult.OK if good else CheckResult.LIMITED,
         found=f"{free:.1f} GB free here",
         remedy="" if good else "a campaign wants more room; name another folder with --out",
     )  # fmt: skip
@@ -142,9 +142,9 @@ def _loopback() -> Check:
                 here.sendto(b"mavfi", there.getsockname())
             good = there.recv(16) == b"mavfi"
     except OSError as error:
-        return Check(name="Loopback", verdict=Verdict.LIMITED, found=f"UDP fails: {error}",
+        return Check(name="Loopback", verdict=CheckResult.LIMITED, found=f"UDP fails: {error}",
                      remedy="`mavfi fly` does not need it; ground stations do")  # fmt: skip
-    return Check(name="Loopback", verdict=Verdict.OK if good else Verdict.LIMITED,
+    return Check(name="Loopback", verdict=CheckResult.OK if good else CheckResult.LIMITED,
                  found="UDP on 127.0.0.1 works")  # fmt: skip
 
 
@@ -156,9 +156,9 @@ def _physics() -> Check:
             timeout=120.0, check=False,
         )  # fmt: skip
     if run.returncode == 0:
-        return Check(name="Vehicle", verdict=Verdict.OK, found=run.stdout.strip())
+        return Check(name="Vehicle", verdict=CheckResult.OK, found=run.stdout.strip())
     last = ((run.stderr or run.stdout).strip().splitlines() or ["no message"])[-1]
-    return Check(name="Vehicle", verdict=Verdict.FAILED, found=last,
+    return Check(name="Vehicle", verdict=CheckResult.FAILED, found=last,
                  remedy="pip install -e . in the project's folder")  # fmt: skip
 
 
@@ -168,7 +168,7 @@ def _injection() -> Iterator[Check]:
     from mavfi_cli.fi.tracer.doctor import check_counting, check_tracing
 
     if not SUPPORTED:
-        yield Check(name="Tracing", verdict=Verdict.LIMITED, found="not Linux on x86-64",
+        yield Check(name="Tracing", verdict=CheckResult.LIMITED, found="not Linux on x86-64",
                     remedy="instruction-level injection is not available here")  # fmt: skip
         return
 
@@ -178,7 +178,7 @@ def _injection() -> Iterator[Check]:
             remedy = remedy or _ALLOW_PTRACE
         yield Check(
             name=capability.name,
-            verdict=Verdict.LIMITED if remedy else Verdict.OK,
+            verdict=CheckResult.LIMITED if remedy else CheckResult.OK,
             found=capability.problem or capability.found,
             remedy=remedy,
         )

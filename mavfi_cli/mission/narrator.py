@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.progress import Progress, Watcher
+from mavfi_cli.mission.progress import FlightProgress, Watcher
 from mavfi_cli.mission.record.events import EventLog
 
 PROGRESS_EVERY_S = 1.0
@@ -26,7 +26,7 @@ class Narrator:
         self.log = EventLog(watcher)
         self._watcher = watcher
         self._phase: Phase | None = None
-        self._mode: Mode | None = None
+        self._mode: PilotMode | None = None
         self._texts = 0
         self._losses = 0
         self._next_progress_s = 0.0
@@ -88,11 +88,11 @@ class Narrator:
         self._mode = mode
         if mode is before:
             return []
-        if mode is Mode.SLOWING:
+        if mode is PilotMode.SLOWING:
             return [("slow", "slows down before an obstacle")]
-        if mode is Mode.STOPPING:
+        if mode is PilotMode.STOPPING:
             return [("stop", "stops before an obstacle")]
-        if mode is Mode.FLYING and before is not None:
+        if mode is PilotMode.FLYING and before is not None:
             again = companion.pilot.counters.replans > 0
             return [("replan", "flies a new plan") if again else ("plan", "flies a plan")]
         return []
@@ -100,9 +100,9 @@ class Narrator:
 
 def _progress(
     stamp_s: float, state: VehicleState, session: OffboardSession, companion: Companion | None
-) -> Progress:
+) -> FlightProgress:
     offboard = companion is not None and session.phase is Phase.OFFBOARD
-    return Progress(
+    return FlightProgress(
         stamp_s=stamp_s,
         phase=companion.mode.value if offboard and companion else session.phase.value,
         speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),

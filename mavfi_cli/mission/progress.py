@@ -8,7 +8,7 @@ from mavfi_cli.mission.record.events import Event
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
+class FlightProgress:
     """State of the flight, reported once per simulated second."""
 
     stamp_s: float
@@ -21,7 +21,7 @@ class Progress:
 class Watcher:
     """Receives progress and events. Subclasses override the methods of interest."""
 
-    def on_progress(self, progress: Progress) -> None:
+    def on_progress(self, progress: FlightProgress) -> None:
         """Handle a progress report, once per simulated second."""
 
     def on_note(self, text: str) -> None:

@@ -11,11 +11,11 @@ import numpy as np
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot import services
 from sitl.autopilot.commander import GPS_FIX_US, Commander, Result
-from sitl.autopilot.commands import Command, acknowledge, execute, from_int, from_long
+from sitl.autopilot.commands import VehicleCommand, acknowledge, execute, from_int, from_long
 from sitl.autopilot.flight_modes import External, Hold, Land, Return, Sticks, Takeoff
 from sitl.autopilot.guidance import Guidance, Situation, climbs
 from sitl.autopilot.link import Link
-from sitl.autopilot.modes import Mode, mode_from_custom
+from sitl.autopilot.modes import FlightMode, mode_from_custom
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import (
     Setpoint,
@@ -28,7 +28,7 @@ from sitl.autopilot.snapshot import Snapshot
 from sitl.autopilot.streams import Preset
 from sitl.autopilot.telemetry_status import consumed_mah
 from sitl.autopilot.text import Severity, text_messages
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 from sitl.geodesy import Origin
 
 COMPONENT = 1
@@ -51,7 +51,9 @@ class Autopilot:
         origin: Geographic origin of the local frame.
     """
 
-    def __init__(self, truth: Truth, *, system_id: int = 1, origin: Origin | None = None) -> None:
+    def __init__(
+        self, truth: StateEstimate, *, system_id: int = 1, origin: Origin | None = None
+    ) -> None:
         self.system_id = system_id
         self.parameters = Parameters(system_id)
         self.commander = Commander(self.parameters)
@@ -70,7 +72,7 @@ class Autopilot:
         self._sticks = _BUTTONS_CENTRED
         self._takeoff_down_m = math.nan
         self._hold: Hold | None = None  # guidance of the next entry into LOITER
-        self._flown: Mode | None = None
+        self._flown: FlightMode | None = None
         self._guidance: Guidance = Hold()
         self._elapsed_s = 0.0
         self._text_id = 0
@@ -117,19 +119,19 @@ class Autopilot:
             handler(message, link)
             self._flush_texts()
 
-    def enter_mode(self, mode: Mode | None) -> Result:
+    def enter_mode(self, mode: FlightMode | None) -> Result:
         """Change the mode on a user's request. Entering the present mode restarts it."""
         result = self.commander.request_mode(mode)
         if result is Result.ACCEPTED:
             self._flown = None
             self._hold = None
-            if mode is Mode.TAKEOFF:
+            if mode is FlightMode.TAKEOFF:
                 self._takeoff_down_m = math.nan
         return result
 
     def take_off(self, target_down_m: float) -> Result:
         """Enter AUTO.TAKEOFF to a height. A disarmed vehicle takes off after arming."""
-        result = self.enter_mode(Mode.TAKEOFF)
+        result = self.enter_mode(FlightMode.TAKEOFF)
         if result is Result.ACCEPTED:
             self._takeoff_down_m = target_down_m
         return result
@@ -138,7 +140,7 @@ class Autopilot:
         """Enter AUTO.LOITER at a position."""
         if self.commander.landed:
             return Result.DENIED
-        result = self.enter_mode(Mode.LOITER)
+        result = self.enter_mode(FlightMode.LOITER)
         if result is Result.ACCEPTED:
             self._hold = Hold(target_ned_m, yaw_rad)
         return result
@@ -157,7 +159,7 @@ class Autopilot:
 
     # Updates over time.
 
-    def observe(self, stamp_us: int, truth: Truth) -> None:
+    def observe(self, stamp_us: int, truth: StateEstimate) -> None:
         """Take the vehicle's state at a stamp and update the commander."""
         now = self.snapshot
         self._elapsed_s = elapsed_s = (stamp_us - now.stamp_us) * 1e-6
@@ -173,7 +175,7 @@ class Autopilot:
     @property
     def may_touch_ground(self) -> bool:
         """True if a gentle ground contact now counts as a landing."""
-        if self.commander.mode is not Mode.OFFBOARD:
+        if self.commander.mode is not FlightMode.OFFBOARD:
             return True
         north, east, down = self.setpoint[3:6]
         return bool(math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0)
@@ -208,17 +210,17 @@ class Autopilot:
         self.setpoint = self.snapshot.setpoint = setpoint
         self.motors_on = self.snapshot.motors_on = motors_on
 
-    def _enter(self, mode: Mode) -> Guidance:
+    def _enter(self, mode: FlightMode) -> Guidance:
         """Create the guidance of a mode at its entry."""
-        if mode is Mode.OFFBOARD:
+        if mode is FlightMode.OFFBOARD:
             return External(lambda: self._offboard)
-        if mode is Mode.POSCTL:
+        if mode is FlightMode.POSCTL:
             return Sticks(lambda: self._sticks)
-        if mode is Mode.TAKEOFF:
+        if mode is FlightMode.TAKEOFF:
             return self._begin_takeoff()
-        if mode is Mode.LAND:
+        if mode is FlightMode.LAND:
             return Land()
-        if mode is Mode.RTL:
+        if mode is FlightMode.RTL:
             return Return(self._announce_return)
         hold, self._hold = self._hold or Hold(), None
         return hold
@@ -338,7 +340,7 @@ class Autopilot:
         if message.target_system != self.system_id:
             return
         mode = mode_from_custom(message.custom_mode) if message.base_mode & 1 else None
-        command = Command(
+        command = VehicleCommand(
             number=dialect.MAV_CMD_DO_SET_MODE, p1=1.0, p2=0.0, p3=0.0, p4=0.0,
             latitude_deg=math.nan, longitude_deg=math.nan, altitude_m=math.nan,
             above_home=False, system=message.get_srcSystem(),

@@ -8,19 +8,19 @@ from __future__ import annotations
 from enum import IntEnum
 
 from sitl.autopilot.landing import LandDetector
-from sitl.autopilot.modes import Mode
+from sitl.autopilot.modes import FlightMode
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.text import Severity
-from sitl.autopilot.truth import Truth
+from sitl.autopilot.truth import StateEstimate
 
 GPS_FIX_US = 2_500_000  # first fix and home position after boot
 POSITION_US = 3_060_000  # global position fused
 READY_US = 4_000_000  # pre-arm checks pass
 
 _CONTROL_BACK_US = 1_000_000  # time for which a lost setpoint source must be back
-_RETRIED_MODES = (Mode.TAKEOFF, Mode.LAND, Mode.RTL)  # ended by disarming
-_UNARMABLE = (Mode.LAND, Mode.RTL)
-_OBL_ACTIONS = {4: Mode.LAND, 5: Mode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
+_RETRIED_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RTL)  # ended by disarming
+_UNARMABLE = (FlightMode.LAND, FlightMode.RTL)
+_OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
 _OBL_TERMINATE = 6
 
 
@@ -44,7 +44,7 @@ class SystemStatus(IntEnum):
     FLIGHT_TERMINATION = 8
 
 
-class LandedState(IntEnum):
+class FlightState(IntEnum):
     """MAV_LANDED_STATE."""
 
     ON_GROUND = 1
@@ -67,8 +67,8 @@ class Commander:
         self._parameters = parameters
         self._detector = LandDetector()
         self.stamp_us = 0
-        self.user_mode = Mode.LOITER
-        self.failsafe: Mode | None = None
+        self.user_mode = FlightMode.LOITER
+        self.failsafe: FlightMode | None = None
         self.armed = False
         self.terminated = False
         self.texts: list[tuple[Severity, str]] = []
@@ -81,7 +81,7 @@ class Commander:
         self._battery_warned = 0
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> FlightMode:
         """Active mode."""
         return self.failsafe or self.user_mode
 
@@ -127,20 +127,20 @@ class Commander:
         return SystemStatus.STANDBY if self.can_arm else SystemStatus.UNINIT
 
     @property
-    def landed_state(self) -> LandedState:
+    def landed_state(self) -> FlightState:
         """EXTENDED_SYS_STATE.landed_state."""
         if self.landed:
-            return LandedState.ON_GROUND
-        special = {Mode.TAKEOFF: LandedState.TAKEOFF, Mode.LAND: LandedState.LANDING}
-        return special.get(self.mode, LandedState.IN_AIR)
+            return FlightState.ON_GROUND
+        special = {FlightMode.TAKEOFF: FlightState.TAKEOFF, FlightMode.LAND: FlightState.LANDING}
+        return special.get(self.mode, FlightState.IN_AIR)
 
-    def is_available(self, mode: Mode) -> bool:
+    def is_available(self, mode: FlightMode) -> bool:
         """Return True if the mode has its inputs: setpoints for OFFBOARD, sticks for POSCTL."""
-        if mode is Mode.OFFBOARD:
+        if mode is FlightMode.OFFBOARD:
             return self._is_fresh(self._offboard_us, "COM_OF_LOSS_T")
-        if mode is Mode.POSCTL:
+        if mode is FlightMode.POSCTL:
             return self._is_fresh(self._sticks_us, "COM_RC_LOSS_T")
-        return mode is not Mode.MANUAL  # MANUAL needs radio control, which does not exist
+        return mode is not FlightMode.MANUAL  # MANUAL needs radio control, which does not exist
 
     def _is_fresh(self, stamp_us: int | None, parameter: str) -> bool:
         if stamp_us is None:
@@ -161,7 +161,7 @@ class Commander:
 
     # Requests of clients.
 
-    def request_mode(self, mode: Mode | None) -> Result:
+    def request_mode(self, mode: FlightMode | None) -> Result:
         """Change the user's mode. A disarmed vehicle accepts any mode."""
         if mode is None:
             return Result.TEMPORARILY_REJECTED
@@ -203,7 +203,7 @@ class Commander:
 
     # Updates over time.
 
-    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool) -> None:
+    def update(self, stamp_us: int, truth: StateEstimate, *, wants_up: bool) -> None:
         """Advance to a stamp with the newest state of the vehicle.
 
         Args:
@@ -222,8 +222,8 @@ class Commander:
 
     def takeoff_finished(self) -> None:
         """Change from AUTO.TAKEOFF to AUTO.LOITER at the take-off height."""
-        if self.mode is Mode.TAKEOFF:
-            self.user_mode = Mode.LOITER
+        if self.mode is FlightMode.TAKEOFF:
+            self.user_mode = FlightMode.LOITER
 
     def _note_landing(self) -> None:
         self._landed_us = self.stamp_us
@@ -247,7 +247,7 @@ class Commander:
         if self.failsafe is not None or self.terminated:
             return
         action = int(self._parameters.effective("COM_OBL_RC_ACT"))
-        self.failsafe = _OBL_ACTIONS.get(action, Mode.RTL)
+        self.failsafe = _OBL_ACTIONS.get(action, FlightMode.RTL)
         self.say(Severity.CRITICAL, "Failsafe activated")
         if action >= _OBL_TERMINATE:
             self.terminate("Flight termination active")
@@ -270,7 +270,7 @@ class Commander:
         self._control_back_us = None
         self.say(Severity.INFO, f"Disarmed by {reason}")
         if self.user_mode in _RETRIED_MODES:
-            self.user_mode = Mode.LOITER
+            self.user_mode = FlightMode.LOITER
 
     def _watch_battery(self, remaining: float) -> None:
         levels = (("BAT_LOW_THR", "Low battery level"), ("BAT_CRIT_THR", "Critical battery level"))

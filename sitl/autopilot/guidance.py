@@ -10,7 +10,7 @@ import numpy as np
 
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 
 POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4
 _CLIMB_MPS = 0.3  # minimum climb speed of a setpoint that leaves the ground
@@ -22,7 +22,7 @@ _STOPPED_MPS = 0.3
 class Situation:
     """Inputs of a flight mode at one tick."""
 
-    truth: Truth
+    truth: StateEstimate
     dt_s: float
     parameters: Parameters
     landed: bool
@@ -38,7 +38,7 @@ class Guidance(Protocol):
         """Write the setpoint of this tick into `out`, which holds NaN."""
 
 
-def climbs(out: Setpoint, truth: Truth) -> bool:
+def climbs(out: Setpoint, truth: StateEstimate) -> bool:
     """Return True if a setpoint climbs; NaN does not."""
     lift = out[2] - truth.position_ned_m[2]
     return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sitl.autopilot.truth import Truth
+from sitl.autopilot.truth import StateEstimate
 
 _STILL_MPS = 0.5
 
@@ -16,7 +16,9 @@ class LandDetector:
         self.landed = True
         self._settled_since_us: int | None = None
 
-    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool, trigger_s: float) -> bool:
+    def update(
+        self, stamp_us: int, truth: StateEstimate, *, wants_up: bool, trigger_s: float
+    ) -> bool:
         """Take the newest state. Return True if `landed` has changed."""
         if self.landed:
             self.landed = truth.on_ground
@@ -31,6 +33,6 @@ class LandDetector:
         return self.landed
 
 
-def _is_still(truth: Truth) -> bool:
+def _is_still(truth: StateEstimate) -> bool:
     velocity = truth.velocity_ned_mps
     return bool(abs(velocity[0]) + abs(velocity[1]) + abs(velocity[2]) < _STILL_MPS)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from sitl.autopilot.commander import Commander
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint, no_setpoint
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 from sitl.geodesy import Origin
 
 UNIX_EPOCH_S = 1_750_000_000  # Unix time of boot; fixed, so that runs are repeatable
@@ -21,7 +21,7 @@ class Snapshot:
     commander: Commander
     parameters: Parameters
     origin: Origin
-    truth: Truth
+    truth: StateEstimate
     home_ned_m: Vector  # (3,)
     stamp_us: int = 0
     setpoint: Setpoint = field(default_factory=no_setpoint)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 
-class Truth(Protocol):
+class StateEstimate(Protocol):
     """State of the vehicle at one stamp, in NED and FRD, SI units."""
 
     @property

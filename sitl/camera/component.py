@@ -18,7 +18,7 @@ from mavfi_cli.link.codec import dialect
 from sitl.camera import messages
 from sitl.camera.depth import render_depth
 from sitl.camera.geometry import CameraPose, Optics, camera_pose
-from sitl.camera.schedule import Schedule
+from sitl.camera.schedule import PeriodicSchedule
 from sitl.geodesy import Origin
 
 Vector = NDArray[np.float64]
@@ -82,10 +82,10 @@ class Camera:
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
         self._pose: CameraPose | None = None
         self._stamp_s = 0.0
-        self._heartbeat = Schedule(interval_s=_HEARTBEAT_S)
-        self._frames: Schedule | None = None
+        self._heartbeat = PeriodicSchedule(interval_s=_HEARTBEAT_S)
+        self._frames: PeriodicSchedule | None = None
         self._frames_left = 0  # 0: unlimited
-        self._streams: dict[int, Schedule] = {}
+        self._streams: dict[int, PeriodicSchedule] = {}
         self._commands: dict[int, Callable[[Message], int]] = {
             dialect.MAV_CMD_IMAGE_START_CAPTURE: self._start_capture,
             dialect.MAV_CMD_IMAGE_STOP_CAPTURE: self._stop_capture,
@@ -203,7 +203,7 @@ class Camera:
         if math.isnan(interval_s) or interval_s == 0.0:
             interval_s = self._default_interval_s
         interval_s = round(interval_s, 6)  # a float32 of 0.1 would drift against ticks
-        self._frames = Schedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
+        self._frames = PeriodicSchedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
         self._frames_left = count
         return int(dialect.MAV_RESULT_ACCEPTED)
 
@@ -225,7 +225,7 @@ class Camera:
         self._streams.pop(message_id, None)
         if interval_us > 0:
             interval_s = max(interval_us / 1e6, 1.0 / MAX_RATE_HZ)
-            self._streams[message_id] = Schedule(interval_s=interval_s)
+            self._streams[message_id] = PeriodicSchedule(interval_s=interval_s)
         return int(dialect.MAV_RESULT_ACCEPTED)
 
 

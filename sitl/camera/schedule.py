@@ -8,7 +8,7 @@ _SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding err
 
 
 @dataclass(slots=True, kw_only=True)
-class Schedule:
+class PeriodicSchedule:
     """Due at the first poll and then every `interval_s` in phase with it.
 
     A late poll does not shift the phase. Missed times are skipped.

@@ -122,7 +122,7 @@ class Battery:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
+class ControlLimits:
     """Limits of the flight controller's setpoints."""
 
     tilt_deg: float = 35.0
@@ -168,7 +168,7 @@ class VehicleProfile:
     drag: Drag
     gear: Gear
     battery: Battery
-    limits: Limits
+    limits: ControlLimits
     energy: EnergyRegression
 
     def __post_init__(self) -> None:

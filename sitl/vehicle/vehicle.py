@@ -149,7 +149,7 @@ def refresh(
     measurement[M_ON_GROUND] = truth[T_ON_GROUND]
 
 
-class Vehicle:
+class Quadrotor:
     """Deterministic physics and flight controller of one quadrotor.
 
     Args:

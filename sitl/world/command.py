@@ -14,7 +14,7 @@ import click
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_svg, write_atomically, write_text
 from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
-from sitl.world.generate import Pair
+from sitl.world.generate import GeneratorParams
 from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, world_names
 from sitl.world.scene import read_scene, scene_toml
 from sitl.world.world import World, show
@@ -91,7 +91,7 @@ def _describe(name: str) -> str:
     return use + _describe_pair(pair)
 
 
-def _describe_pair(pair: Pair) -> str:
+def _describe_pair(pair: GeneratorParams) -> str:
     return (
         f"towers of {pair.size_m:g} x {pair.size_m:g} m in {100 * pair.density:g} % "
         "of the 10 x 10 m cells"

@@ -37,7 +37,7 @@ DEFAULT_GOAL_ENU_M = (30.0, 40.0, 5.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pair:
+class GeneratorParams:
     """The generator's two numbers and the family of the random streams."""
 
     density: float  # probability that a cell contains an obstacle
@@ -51,7 +51,9 @@ class Pair:
             raise WorldError(f"size {self.size_m:g} m does not fit a cell (above 0, to {CELL_M:g})")
 
 
-def generate(name: str, pair: Pair, seed: int, start_enu_m: Vector, goal_enu_m: Vector) -> World:
+def generate(
+    name: str, pair: GeneratorParams, seed: int, start_enu_m: Vector, goal_enu_m: Vector
+) -> World:
     """Generate the world of a pair and a seed between a start (3,) and a goal (3,), ENU m.
 
     The area contains start and goal with a margin of at least 20 m, in whole cells.
@@ -96,7 +98,7 @@ def _cells(low_m: float, high_m: float) -> range:
     return range(math.floor(low_m / CELL_M), math.ceil(high_m / CELL_M))
 
 
-def _occupied(pair: Pair, seed: int, i: int, j: int) -> bool:
+def _occupied(pair: GeneratorParams, seed: int, i: int, j: int) -> bool:
     stream = generator(
         seed, Stream.WORLD, pair.family, f"{pair.density:g}", f"{pair.size_m:g}", i, j
     )

@@ -8,17 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.core.errors import UnknownName, WorldError
-from sitl.world.generate import DEFAULT_GOAL_ENU_M, DEFAULT_START_ENU_M, Pair, generate
+from sitl.world.generate import DEFAULT_GOAL_ENU_M, DEFAULT_START_ENU_M, GeneratorParams, generate
 from sitl.world.scene import read_scene, world_of_scene
 from sitl.world.world import Vector, World
 
 SCENE_FOLDER = Path(__file__).parent / "scenes"
 
-GENERATED: dict[str, Pair] = {
-    "sparse": Pair(density=0.05, size_m=3.0),
-    "dense": Pair(density=0.2, size_m=5.0),
+GENERATED: dict[str, GeneratorParams] = {
+    "sparse": GeneratorParams(density=0.05, size_m=3.0),
+    "dense": GeneratorParams(density=0.2, size_m=5.0),
     **{
-        f"train-{density:g}-{size:g}": Pair(density=density, size_m=size, family="training")
+        f"train-{density:g}-{size:g}": GeneratorParams(
+            density=density, size_m=size, family="training"
+        )
         for density in (0.05, 0.2)
         for size in (3.0, 5.0)
     },
@@ -84,7 +86,7 @@ def _is_path(text: str) -> bool:
     return text.endswith(".toml") or "/" in text
 
 
-def _pair_of_spec(text: str) -> Pair | None:
+def _pair_of_spec(text: str) -> GeneratorParams | None:
     """Parse `gen:density,size`. Return None if the text is not such a spec."""
     if not text.startswith("gen:"):
         return None
@@ -92,4 +94,4 @@ def _pair_of_spec(text: str) -> Pair | None:
         density, size = (float(part) for part in text.removeprefix("gen:").split(","))
     except ValueError:
         raise WorldError(f"{text!r}: expected gen:density,size, such as gen:0.2,5") from None
-    return Pair(density=density, size_m=size)
+    return GeneratorParams(density=density, size_m=size)

@@ -11,7 +11,7 @@ from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.mission.branching import Branching, Member, Trunk, can_branch
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.injection import Injection
+from mavfi_cli.mission.injection import SourceInjection
 
 FAULTS = [
     FaultConfig(target="command_vx", at="tick=3", seed=1),
@@ -79,7 +79,7 @@ def test_the_common_flight_never_sees_a_struck_message():
 @pytest.mark.parametrize("wanted", [1, 2, 3])
 def test_a_mission_that_branches_off_sees_what_it_would_see_alone(wanted):
     together = Together(*FAULTS, wanted=wanted)
-    alone = Injection(FAULTS[wanted - 1], 20.0)
+    alone = SourceInjection(FAULTS[wanted - 1], 20.0)
     for tick in range(1, 10):
         sent = together.trunk.pass_on(command(tick), moment(tick))
         assert values(sent) == values(alone.pass_on(command(tick), moment(tick)))
@@ -92,7 +92,7 @@ def test_a_mission_that_branches_off_sees_what_it_would_see_alone(wanted):
 
 def test_a_fault_that_never_acts_has_the_record_of_one_that_waited_alone():
     together = Together(*FAULTS)
-    alone = Injection(FAULTS[3], 20.0)
+    alone = SourceInjection(FAULTS[3], 20.0)
     for tick in range(1, 10):
         together.trunk.pass_on(command(tick), moment(tick))
         alone.pass_on(command(tick), moment(tick))
@@ -113,7 +113,7 @@ def test_an_error_in_one_mission_is_not_the_others(monkeypatch):
     def fails(self, message, moment, index=0):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(Injection, "pass_on", fails)
+    monkeypatch.setattr(SourceInjection, "pass_on", fails)
     message = command(1)
     assert Together(FAULTS[0]).trunk.pass_on(message, moment(1)) is message
     with pytest.raises(ZeroDivisionError):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.detect.gate import Alarm
@@ -64,7 +64,7 @@ class Desk:
         self.pilot.update(1.0, STATE)
         self.plan = a_plan()
         self.pilot.flown.begin(self.plan, time_s=0.7, rate=1.0)
-        self.pilot.mode = Mode.FLYING
+        self.pilot.mode = PilotMode.FLYING
         self.exchanged = []
         self.follower = Follower()
         self.looks = 0
@@ -110,7 +110,7 @@ def test_to_hold_is_to_give_up_the_plan_and_hover():
     desk = Desk(Told(Response.HOLD))
     assert not desk.recovery.admit_report(REPORT, 1.0)
     assert desk.pilot.flown.trajectory is None
-    assert desk.pilot.mode is Mode.WAITING
+    assert desk.pilot.mode is PilotMode.WAITING
 
 
 def test_a_command_is_first_computed_again_as_before():

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.autonomy import occupancy
-from mavfi_cli.autonomy.orders import Directive, Mode, PlanFailure
+from mavfi_cli.autonomy.orders import Directive, PilotMode, PlanFailure
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.trajectory import waypoint_index
@@ -398,7 +398,7 @@ class Companion:
         return trajectory, self.pilot.flown.waypoint
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> PilotMode:
         """Present mode of the pilot."""
         return self.pilot.mode
 

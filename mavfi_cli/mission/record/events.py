@@ -16,7 +16,7 @@ class Event:
     position_enu_m: tuple[float, float, float] | None = None
 
 
-class Listener(Protocol):
+class EventListener(Protocol):
     """Receiver of events."""
 
     def on_event(self, event: Event) -> None:
@@ -27,7 +27,7 @@ class Listener(Protocol):
 class EventLog:
     """Collects events and passes them on."""
 
-    listener: Listener
+    listener: EventListener
     events: list[Event] = field(default_factory=list)
 
     def add(
