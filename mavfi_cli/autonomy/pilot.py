@@ -5,7 +5,7 @@ is a directive: the trajectory to track, the point on it, the rate of its clock,
 a new plan if one is needed.
 
 A vehicle that plans in motion slows down and stops by slowing the trajectory's clock, so that it
-stays on the checked path; see `flown`. A vehicle that stops on a report drops the trajectory and
+stays on the checked path; see `active_plan`. A vehicle that stops on a report drops the trajectory and
 brakes at once. A vehicle that does not plan in motion comes to rest before it plans.
 """
 
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mavfi_cli.autonomy.flown import FlownPlan
+from mavfi_cli.autonomy.active_plan import ActivePlan
 from mavfi_cli.autonomy.orders import Directive, PilotMode, PlanFailure, PlanRequest
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
@@ -83,7 +83,7 @@ class Pilot:
         goal_enu_m: Goal (3,), m.
 
     Attributes:
-        flown: Active trajectory and the present point on it.
+        active: Active trajectory and the present point on it.
         mode: Present mode.
         counters: Counters of the mission's record.
     """
@@ -93,7 +93,7 @@ class Pilot:
         self.goal_enu_m = goal_enu_m
         self.counters = Counters()
         self.mode = PilotMode.WAITING
-        self.flown = FlownPlan(params.v_max_mps, params.brake_mps2)
+        self.active = ActivePlan(params.v_max_mps, params.brake_mps2)
         self._next: Trajectory | None = None
         self._hold: FloatArray | None = None
         self._hold_yaw = 0.0
@@ -120,7 +120,7 @@ class Pilot:
         if report.future_collision_seq < self._collision_seq:
             self.counters.reports_ignored += 1
             return False
-        if not report.collision or self.flown.trajectory is None:
+        if not report.collision or self.active.trajectory is None:
             return False
         if report.future_collision_seq > self._collision_seq:
             self.counters.collisions_foreseen += 1
@@ -137,7 +137,7 @@ class Pilot:
     def holds(self, trajectory: object) -> bool:
         """Return True if this trajectory is active or next."""
         return trajectory is not None and (
-            trajectory is self.flown.trajectory or trajectory is self._next
+            trajectory is self.active.trajectory or trajectory is self._next
         )
 
     def _react(self, report: CollisionReport) -> None:
@@ -146,7 +146,7 @@ class Pilot:
         left_s = 0.0
         if p.uses_time_to_collision:
             left_s = report.time_to_collision_s - (self._stamp_s - report.stamp_s)
-        brake_s = self.flown.stopping_s() + p.margin_s
+        brake_s = self.active.stopping_s() + p.margin_s
         if p.stops_on_report:
             self._stop_s = self._stamp_s + (left_s - brake_s if left_s > brake_s else 0.0)
             return
@@ -195,7 +195,7 @@ class Pilot:
             return
         p = self.params
         stale = not self._is_new(result) or result.stamp_s != self._asked_s
-        late = self.flown.rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
+        late = self.active.rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
         if stale or late:
             self.counters.plans_ignored += 1
             self._wanted = True
@@ -248,7 +248,7 @@ class Pilot:
         self._not_before_s = self._stamp_s + self.params.retry_s
         if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
             return
-        if self.flown.trajectory is not None:
+        if self.active.trajectory is not None:
             self._brake()
         if self._failures >= self.params.attempts_max:
             self.mode = PilotMode.GAVE_UP
@@ -274,15 +274,15 @@ class Pilot:
             if self._has_arrived(state):
                 self.mode = PilotMode.ARRIVED
                 self._hold, self._hold_yaw = self.goal_enu_m, state.yaw_rad
-                self.flown.stand()
+                self.active.stand()
         plan = self._plan_request(stamp_s, state)
         assert self._hold is not None
         return Directive(
             mode=self.mode,
-            trajectory=self.flown.trajectory,
-            time_s=self.flown.time_s,
-            rate=self.flown.rate,
-            rate_change_per_s=self.flown.rate_change_per_s,
+            trajectory=self.active.trajectory,
+            time_s=self.active.time_s,
+            rate=self.active.rate,
+            rate_change_per_s=self.active.rate_change_per_s,
             hold_enu_m=self._hold,
             hold_yaw_rad=self._hold_yaw + self._look_round_angle(stamp_s),
             plan=plan,
@@ -307,7 +307,7 @@ class Pilot:
         if not distance_m <= self.params.goal_tolerance_m:
             return False
         return not self.params.arrives_at_rest or (
-            self.flown.trajectory is None and self._at_rest(state)
+            self.active.trajectory is None and self._at_rest(state)
         )
 
     def _at_rest(self, state: VehicleState) -> bool:
@@ -318,19 +318,19 @@ class Pilot:
         if stamp_s < self._stop_s:
             return
         self._stop_s = math.inf
-        if self.flown.trajectory is not None:
+        if self.active.trajectory is not None:
             self.abandon(state)
 
     def _hover(self, state: VehicleState) -> None:
         """Drop the trajectory and hover here, or where the vehicle comes to rest."""
         self._hold_here(state)
-        self.flown.stand()
+        self.active.stand()
         self._next = None
         self.mode = PilotMode.WAITING if self.params.plans_in_motion else PilotMode.STOPPING
 
     def _settle(self, state: VehicleState) -> None:
         """Move the hover position with the vehicle while it brakes without a trajectory."""
-        if self.mode is PilotMode.STOPPING and self.flown.trajectory is None:
+        if self.mode is PilotMode.STOPPING and self.active.trajectory is None:
             self._hold_here(state)
             if self._at_rest(state):
                 self.mode = PilotMode.WAITING
@@ -343,11 +343,11 @@ class Pilot:
         self._adopted = True
         moving = self.mode not in (PilotMode.WAITING, PilotMode.STOPPING)
         late_s = stamp_s - self._next.stamp_s
-        self.flown.begin(
+        self.active.begin(
             self._next,
             time_s=max(0.0, late_s) if moving else 0.0,
             # The plan departs at the velocity of its request, so the clock keeps that rate.
-            rate=min(1.0, self.flown.rate / self._asked_rate) if moving else 1.0,
+            rate=min(1.0, self.active.rate / self._asked_rate) if moving else 1.0,
         )
         self._next = None
         self._stop_s = math.inf
@@ -355,15 +355,15 @@ class Pilot:
 
     def _advance(self, step_s: float, state: VehicleState) -> None:
         """Run the trajectory's clock at the rate of the mode. Hover at the trajectory's end."""
-        if self.flown.trajectory is None:
+        if self.active.trajectory is None:
             return
         slower = {PilotMode.STOPPING: 0.0, PilotMode.SLOWING: self.params.slow_rate}
         rate = slower.get(self.mode, 1.0)
         if self.params.slows_where_blind and self._flies_blind(state):
             rate = min(rate, self.params.slow_rate)
-        self.flown.advance(step_s, rate)
-        stopped = self.mode is PilotMode.STOPPING and self.flown.rate <= 0.0
-        if not (stopped or (self.flown.over and self._next is None)):
+        self.active.advance(step_s, rate)
+        stopped = self.mode is PilotMode.STOPPING and self.active.rate <= 0.0
+        if not (stopped or (self.active.over and self._next is None)):
             return
         if self.params.plans_in_motion:
             self._stop_here()
@@ -373,16 +373,16 @@ class Pilot:
 
     def _flies_blind(self, state: VehicleState) -> bool:
         """Return True if the trajectory leaves the camera's field of view."""
-        east, north = self.flown.reference()[4:6]
+        east, north = self.active.reference()[4:6]
         if not math.hypot(east, north) > self.params.rest_mps:
             return False
         return abs(wrap_angle(math.atan2(north, east) - state.yaw_rad)) > self.params.sight_rad
 
     def _guard(self, state: VehicleState) -> None:
         """Stop and replan from here if the vehicle is too far from the reference."""
-        if self.flown.trajectory is None or not self.params.guards_tracking:
+        if self.active.trajectory is None or not self.params.guards_tracking:
             return
-        reference_enu_m = self.flown.reference()[0:3]
+        reference_enu_m = self.active.reference()[0:3]
         error_m = float(np.linalg.norm(state.position_enu_m - reference_enu_m))
         if not error_m <= self.params.tracking_error_max_m:
             self.abandon(state)
@@ -391,7 +391,7 @@ class Pilot:
         """Handle a restart of control: its queue is empty and its own counters are 0."""
         if self.params.owns_sequence_numbers:
             self._trajectory_seq = self._collision_seq = 0
-        if self.flown.trajectory is not None:
+        if self.active.trajectory is not None:
             self.abandon(state)
 
     def abandon(self, state: VehicleState) -> None:
@@ -404,9 +404,9 @@ class Pilot:
 
     def _stop_here(self) -> None:
         """Hover and request a plan when the trajectory is over or its clock has stopped."""
-        reference = self.flown.reference()
+        reference = self.active.reference()
         self._hold, self._hold_yaw = reference[0:3].copy(), float(reference[3])
-        self.flown.stand()
+        self.active.stand()
         self.want_plan()
         self.mode = PilotMode.WAITING
 
@@ -423,14 +423,14 @@ class Pilot:
             PilotMode.TURNING,
         )
         if not self.params.plans_in_motion:
-            idle = idle or self.flown.trajectory is not None or not self._at_rest(state)
+            idle = idle or self.active.trajectory is not None or not self._at_rest(state)
         if idle or not self._wanted or self._awaiting_plan or stamp_s < self._not_before_s:
             return None
         self._wanted = False
         self._awaiting_plan = True
         self.counters.plans_requested += 1
         start = self._start_of_plan(stamp_s, state)
-        self._asked_s, self._asked_rate = start[0], self.flown.rate or 1.0
+        self._asked_s, self._asked_rate = start[0], self.active.rate or 1.0
         return PlanRequest(
             stamp_s=start[0],
             position_enu_m=start[1],
@@ -446,18 +446,18 @@ class Pilot:
         self, stamp_s: float, state: VehicleState
     ) -> tuple[float, FloatArray, FloatArray, float]:
         """Return stamp, position, velocity and yaw at the start of the next trajectory."""
-        if self.flown.trajectory is None:
+        if self.active.trajectory is None:
             assert self._hold is not None
             start = self._hold if self._near(self._hold, state) else state.position_enu_m
             return stamp_s, start.copy(), np.zeros(3), state.yaw_rad
         lead_s = self.params.plan_lead_s
-        waypoint = self.flown.reference(lead_s)
+        waypoint = self.active.reference(lead_s)
         if not self._near(waypoint[0:3], state):
             return stamp_s + lead_s, state.position_enu_m.copy(), np.zeros(3), state.yaw_rad
         return (
             stamp_s + lead_s,
             waypoint[0:3].copy(),
-            self.flown.rate * waypoint[4:7],
+            self.active.rate * waypoint[4:7],
             float(waypoint[3]),
         )
 

@@ -17,7 +17,7 @@ SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
 _CHUNK = 1 << 16
 # Waking a sleeping process took 0.2 to 0.3 ms on a virtual machine, more than the peer needs for
 # one tick. Kernels take longer: then the wait sleeps after all.
-LOCKSTEP_LOOK_OUT_S = 0.001
+LOCKSTEP_POLL_S = 0.001
 
 
 class StreamTransport:
@@ -28,7 +28,7 @@ class StreamTransport:
         url: URL for error messages.
         patient: Wait for a slow reader. Otherwise sends that do not fit its buffer are dropped as a
             whole, as autopilots do on a slow telemetry link.
-        look_out_s: Time to poll, yielding to other processes, before a wait sleeps. A wake-up costs
+        poll_s: Time to poll, yielding to other processes, before a wait sleeps. A wake-up costs
             more time than a lockstep peer needs to answer.
     """
 
@@ -40,12 +40,12 @@ class StreamTransport:
         url: str,
         *,
         patient: bool = True,
-        look_out_s: float = 0.0,
+        poll_s: float = 0.0,
     ) -> None:
         connection.settimeout(0.0)
         self._socket = connection
         self._patient = patient
-        self._look_out_s = look_out_s
+        self._poll_s = poll_s
         self._unsent = b""
         self.url = url
 
@@ -77,15 +77,15 @@ class StreamTransport:
         """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         data = self._pull()
         if data is None and timeout_s > 0.0:
-            if self._look_out_s > 0.0:
-                data = self._look_out()
+            if self._poll_s > 0.0:
+                data = self._poll()
             if data is None and readable(self._socket.fileno(), timeout_s):
                 data = self._pull()
         return data or b""
 
-    def _look_out(self) -> bytes | None:
-        """Poll for the next bytes. Return None after `look_out_s`."""
-        end_s = perf_counter() + self._look_out_s
+    def _poll(self) -> bytes | None:
+        """Poll for the next bytes. Return None after `poll_s`."""
+        end_s = perf_counter() + self._poll_s
         while perf_counter() < end_s:
             data = self._pull()
             if data is not None:
@@ -135,7 +135,7 @@ def inherited(endpoint: Endpoint) -> StreamTransport:
     if connection.type != socket.SOCK_STREAM:
         connection.detach()
         raise EndpointError(endpoint.url, "not a stream socket")
-    return StreamTransport(connection, endpoint.url, look_out_s=LOCKSTEP_LOOK_OUT_S)
+    return StreamTransport(connection, endpoint.url, poll_s=LOCKSTEP_POLL_S)
 
 
 def connected(endpoint: Endpoint, where: tuple[int, str]) -> StreamTransport:

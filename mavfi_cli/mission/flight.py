@@ -31,13 +31,13 @@ from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.protection import gate_of, protection_of
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.flight_logger import FlightLogger
 from mavfi_cli.mission.injection import (
     DetectorInjection,
     NoInjection,
     ProcessInjection,
     SourceInjection,
 )
-from mavfi_cli.mission.narrator import Narrator
 from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Watcher
@@ -83,7 +83,7 @@ class Flight:
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
         self.injection = NoInjection()
-        self._narrator = Narrator(watcher)
+        self._logger = FlightLogger(watcher)
         self.trace = Trace()
         self.wall = WallClock()
         self.stamp_s = 0.0
@@ -295,7 +295,7 @@ class Flight:
         if not self._camera_asked and self._nearly_up(state):
             self._camera_asked = True
             self._session.camera.start(1.0 / self._config.camera_rate_hz)
-        self._narrator.tell(stamp_s, self._session, companion, self.injection)
+        self._logger.tell(stamp_s, self._session, companion, self.injection)
         return True
 
     def _take_clock(self, stamp_s: float) -> None:
@@ -373,7 +373,7 @@ class Flight:
             self.end(Outcome.TIMEOUT, f"{self._config.time_limit_s:g} s")
 
     def _note(self, kind: str, text: str) -> None:
-        self._narrator.note(self.stamp_s, kind, text, self._session.state)
+        self._logger.note(self.stamp_s, kind, text, self._session.state)
 
     # Record ---------------------------------------------------------------------------------------
 
@@ -396,7 +396,7 @@ class Flight:
     @property
     def log(self) -> EventLog:
         """All events so far."""
-        return self._narrator.log
+        return self._logger.log
 
     @property
     def images(self) -> ImageReceiver:

@@ -573,7 +573,7 @@ def test_no_sequence_of_messages_breaks_it(plan):
             driver.tick(ticks, at=state(*place, yaw=yaw))
         assert 0.0 <= driver.last.rate <= 1.0
         assert driver.last.time_s >= 0.0
-        hovers = driver.pilot.flown.trajectory is None
+        hovers = driver.pilot.active.trajectory is None
         assert hovers or driver.pilot.mode not in (PilotMode.WAITING, PilotMode.ARRIVED)
 
 
@@ -698,7 +698,7 @@ def test_a_plan_never_begins_at_a_corrupted_waypoint(place):
     plan = driver.fly()
     corrupted = plan.waypoints.copy()
     corrupted[:, 0] = place
-    driver.pilot.flown.trajectory = replace(plan, waypoints=corrupted)
+    driver.pilot.active.trajectory = replace(plan, waypoints=corrupted)
     driver.foresee(30.0)
     driver.tick(at=moving(5.0, 2.0))
     assert driver.requests[-1].position_enu_m[0] == 5.0

@@ -98,7 +98,7 @@ class Companion:
             briefing.goal_enu_m,
         )
         self._recovery = Recovery(
-            protection, self.pilot, injection.follower, self._exchange, self._look_anew
+            protection, self.pilot, injection.follower, self._exchange, self._recompute_perception
         )
         self._latency = latency_model(platform, config.seed, wall)
         self.executor = Executor(
@@ -170,7 +170,7 @@ class Companion:
             states = VERDICT_STATES if timely else VERDICT_STATES - {"time_to_collision"}
             self._injection.follower.read(report, "mission logic", stamp_s, states)
 
-    def _look_anew(self) -> None:
+    def _recompute_perception(self) -> None:
         """Run point cloud, OctoMap and collision check again on the newest frame."""
         if self._frame is not None:
             self.executor.submit("point_cloud", self._frame)
@@ -214,7 +214,7 @@ class Companion:
     def _check(self, stamp_s: float) -> None:
         """Submit the present trajectory and the newest map to the collision check."""
         self._recovery.look_ahead(stamp_s)
-        trajectory = self.pilot.flown.trajectory
+        trajectory = self.pilot.active.trajectory
         if self._snapshot is None or trajectory is None:
             return
         self._checked = trajectory
@@ -223,7 +223,7 @@ class Companion:
             CheckInput(
                 snapshot=self._snapshot,
                 trajectory=trajectory,
-                time_s=self.pilot.flown.time_s,
+                time_s=self.pilot.active.time_s,
                 position_enu_m=self._front(),
             ),
         )
@@ -254,8 +254,8 @@ class Companion:
         self._state = self._recovery.state = state
         self._injection.strike_memory(self._moment(stamp_s))
         copy = None
-        if self.pilot.flown.trajectory is not None:
-            flown = self.pilot.flown.trajectory
+        if self.pilot.active.trajectory is not None:
+            flown = self.pilot.active.trajectory
             copy = self._strike_latched(flown, stamp_s)
             self._recovery.look_round(stamp_s, flown)
         if self._injection.follower is not None:
@@ -290,7 +290,7 @@ class Companion:
             same.
         """
         struck = self._injection.strike_latched(
-            flown, self._moment(stamp_s), self.pilot.flown.waypoint
+            flown, self._moment(stamp_s), self.pilot.active.waypoint
         )
         if self._injection.in_queue and not self._stack.control_owns_queue:
             return None if struck is flown else struck
@@ -299,8 +299,8 @@ class Companion:
 
     def _exchange(self, flown: Trajectory, changed: Trajectory) -> None:
         """Replace the active plan by a changed version without a new collision check."""
-        if self.pilot.flown.trajectory is flown:
-            self.pilot.flown.trajectory = changed
+        if self.pilot.active.trajectory is flown:
+            self.pilot.active.trajectory = changed
         if self._checked is flown:
             self._checked = changed
 
@@ -308,9 +308,9 @@ class Companion:
         """Note that mission logic and control read the present waypoint and the next yaw."""
         if not follower.waits:
             return
-        flown = copy or self.pilot.flown.trajectory
+        flown = copy or self.pilot.active.trajectory
         if flown is not None:
-            at = self.pilot.flown.waypoint
+            at = self.pilot.active.waypoint
             follower.read(flown, "control", stamp_s, FOLLOWED_STATES, at)
             follower.read(flown, "control", stamp_s, {"waypoint_yaw"}, at + 1)
         follower.settle(lambda m: m is self.report or m is copy or self.pilot.holds(m))
@@ -359,9 +359,9 @@ class Companion:
         if not passes:
             return
         self.command = command
-        self.pilot.flown.pace = command.pace
-        if command.skips_waypoint and setpoint.directive.trajectory is self.pilot.flown.trajectory:
-            self.pilot.flown.skip_waypoint()
+        self.pilot.active.pace = command.pace
+        if command.skips_waypoint and setpoint.directive.trajectory is self.pilot.active.trajectory:
+            self.pilot.active.skip_waypoint()
         if self._injection.follower is not None:
             self._injection.follower.read(command, "setpoint", stamp_s, COMMAND_STATES)
         if setpoint.frame_s is not None:
@@ -392,10 +392,10 @@ class Companion:
     @property
     def tracked(self) -> tuple[Trajectory, int] | None:
         """Return the tracked trajectory and the index of its present waypoint."""
-        trajectory = self.pilot.flown.trajectory
+        trajectory = self.pilot.active.trajectory
         if trajectory is None or not len(trajectory.waypoints):
             return None
-        return trajectory, self.pilot.flown.waypoint
+        return trajectory, self.pilot.active.waypoint
 
     @property
     def mode(self) -> PilotMode:

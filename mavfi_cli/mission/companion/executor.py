@@ -218,7 +218,7 @@ class Executor:
             self._working -= 1
         node.busy, node.pending = True, None
         self._note_loss(node, stamp_s, NodeLost(hung=False, how="killed by SIGKILL"))
-        self._at(stamp_s + self.restart_s, lambda up_s: self._revive(node, up_s))
+        self._at(stamp_s + self.restart_s, lambda up_s: self._restart(node, up_s))
         self._start_waiting()
 
     def close(self) -> None:
@@ -260,7 +260,7 @@ class Executor:
         node.busy = True
         gone_s = stamp_s + self.watchdog_s if lost.hung else stamp_s
         self._note_loss(node, gone_s, lost)
-        self._at(gone_s + self.restart_s, lambda stamp_s: self._revive(node, stamp_s))
+        self._at(gone_s + self.restart_s, lambda stamp_s: self._restart(node, stamp_s))
         return None
 
     @property
@@ -350,7 +350,7 @@ class Executor:
         gone_s = max(end_s, job.start_s + self.watchdog_s) if loss.hung else end_s
         job.node.busy_s += gone_s - end_s
         self._note_loss(job.node, gone_s, loss)
-        self._at(gone_s, lambda stamp_s: self._bury(job.node, stamp_s))
+        self._at(gone_s, lambda stamp_s: self._end_process(job.node, stamp_s))
 
     def _note_loss(self, node: Node, gone_s: float, loss: NodeLost) -> None:
         entry = Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how,
@@ -360,12 +360,12 @@ class Executor:
         for mate in node.mates:
             mate.pending = None
 
-    def _bury(self, node: Node, stamp_s: float) -> None:
+    def _end_process(self, node: Node, stamp_s: float) -> None:
         self._working -= 1
-        self._at(stamp_s + self.restart_s, lambda up_s: self._revive(node, up_s))
+        self._at(stamp_s + self.restart_s, lambda up_s: self._restart(node, up_s))
         self._start_waiting()
 
-    def _revive(self, node: Node, _stamp_s: float) -> None:
+    def _restart(self, node: Node, _stamp_s: float) -> None:
         """Start a new process with fresh state, as the nodes' copies in this process never ran."""
         if node.process is not None:
             node.process.close(kill=True)

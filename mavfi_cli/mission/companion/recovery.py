@@ -64,7 +64,7 @@ class Recovery:
         pilot: Pilot whose plan is dropped, changed or requested.
         follower: Gets withheld messages; None without a fault.
         exchange: Replaces the active plan by a changed version.
-        look_anew: Has perception recompute from the newest frame.
+        recompute_perception: Has perception recompute from the newest frame.
 
     Attributes:
         state: Newest vehicle state, from which a holding vehicle plans anew.
@@ -76,13 +76,13 @@ class Recovery:
         pilot: Pilot,
         follower: Follower | None,
         exchange: Callable[[Trajectory, Trajectory], None],
-        look_anew: Callable[[], None],
+        recompute_perception: Callable[[], None],
     ) -> None:
         self._protection = protection
         self._pilot = pilot
         self._follower = follower
         self._exchange = exchange
-        self._look_anew = look_anew
+        self._recompute_perception = recompute_perception
         self._looked: tuple[Trajectory | None, int] = (None, -1)
         self.state: VehicleState | None = None
 
@@ -93,7 +93,7 @@ class Recovery:
             return True
         self._withhold(report)
         if stage is Stage.PERCEPTION:
-            self._look_anew()
+            self._recompute_perception()
         if response is Response.HOLD:
             self._hold()
         return False
@@ -156,13 +156,13 @@ class Recovery:
             stamp_s: Present stamp, s.
             unharmed: Plan before this tick's strike, which the gate has already judged.
         """
-        if self._pilot.flown.trajectory is None:
+        if self._pilot.active.trajectory is None:
             return
-        at, (seen, seen_at) = self._pilot.flown.waypoint, self._looked
-        if self._pilot.flown.trajectory is not seen or at != seen_at:
+        at, (seen, seen_at) = self._pilot.active.waypoint, self._looked
+        if self._pilot.active.trajectory is not seen or at != seen_at:
             known = unharmed is seen and at == seen_at
             self.look_ahead(stamp_s, at if known else None)
-        self._looked = (self._pilot.flown.trajectory, at)
+        self._looked = (self._pilot.active.trajectory, at)
 
     def look_ahead(self, stamp_s: float, only: int | None = None) -> None:
         """Drop anomalous waypoints of the plan ahead before other nodes use them.
@@ -172,9 +172,9 @@ class Recovery:
             only: Drop this waypoint only.
         """
         pilot = self._pilot
-        while pilot.flown.trajectory is not None:
-            flown = pilot.flown.trajectory
-            response, alarm = self._protection.ahead(flown, pilot.flown.waypoint, only, stamp_s)
+        while pilot.active.trajectory is not None:
+            flown = pilot.active.trajectory
+            response, alarm = self._protection.ahead(flown, pilot.active.waypoint, only, stamp_s)
             if response is Response.HOLD:
                 self._hold()
             elif response is Response.RECOMPUTE and alarm is not None:
@@ -185,7 +185,7 @@ class Recovery:
                     self._drop(flown, alarm.waypoint)
                 if alarm.stage is Stage.PLANNING:
                     pilot.want_plan()
-                if pilot.flown.trajectory is not flown:
+                if pilot.active.trajectory is not flown:
                     continue
             return
 

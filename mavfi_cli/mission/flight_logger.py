@@ -15,7 +15,7 @@ from mavfi_cli.mission.record.events import EventLog
 PROGRESS_EVERY_S = 1.0
 
 
-class Narrator:
+class FlightLogger:
     """Finds events by comparing each tick with the last.
 
     Attributes:

@@ -17,7 +17,7 @@ from mavfi_cli.core.types import FloatArray, Trajectory
 SPEED_MIN_MPS = 0.5  # lower limit of the speed from which the ramp is computed
 
 
-class FlownPlan:
+class ActivePlan:
     """The active trajectory and the present point on it.
 
     Args:
