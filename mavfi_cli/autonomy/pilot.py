@@ -5,8 +5,8 @@ is a directive: the trajectory to track, the point on it, the rate of its clock,
 a new plan if one is needed.
 
 A vehicle that plans in motion slows down and stops by slowing the trajectory's clock, so that it
-stays on the checked path; see `active_plan`. A vehicle that stops on a report drops the trajectory and
-brakes at once. A vehicle that does not plan in motion comes to rest before it plans.
+stays on the checked path; see `active_plan`. A vehicle that stops on a report drops the trajectory
+and brakes at once. A vehicle that does not plan in motion comes to rest before it plans.
 """
 
 from __future__ import annotations
