@@ -25,9 +25,9 @@ from mavfi_cli.core.channel import receive, send
 
 Run = Callable[[Any, float], Any]
 
-# A node hangs if one invocation exceeds this CPU time, or this wall time while it waits. The slowest
-# healthy invocation takes well under half a second. The record does not depend on the limits
-# themselves, but only on whether they were exceeded.
+# A node hangs if one invocation exceeds this CPU time, or this wall time while it waits. A healthy
+# invocation takes well under half a second. The record does not depend on the limits themselves,
+# but only on whether they were exceeded.
 HANG_CPU_S = 5.0
 HANG_WALL_S = 120.0
 _LOOK_S = 0.25
