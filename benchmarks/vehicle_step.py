@@ -10,7 +10,7 @@ import numpy as np
 
 from sitl.control.cascade import control_step
 from sitl.vehicle.profile_files import load_profile, profile_names
-from sitl.vehicle.vehicle import Vehicle
+from sitl.vehicle.vehicle import Quadrotor
 
 STEPS = 500
 ROUNDS = 20
@@ -31,7 +31,7 @@ def main() -> None:
     """Time every shipped profile in forward flight."""
     setpoint = np.array([np.nan] * 3 + [1.0, 0.5, -0.2] + [np.nan] * 3 + [0.3, np.nan])
     for name in profile_names():
-        vehicle = Vehicle(load_profile(name), position_enu_m=(0.0, 0.0, 5.0), yaw_enu_rad=0.0)
+        vehicle = Quadrotor(load_profile(name), position_enu_m=(0.0, 0.0, 5.0), yaw_enu_rad=0.0)
         for _ in range(STEPS):
             vehicle.step(setpoint, armed=True)
         whole = median_us(lambda vehicle=vehicle: vehicle.step(setpoint, armed=True))

@@ -1,1 +1,1 @@
-"""The vehicle side: world, physics, flight controller, camera and referee behind MAVLink."""
+"""The simulated vehicle: world, physics, flight controller, camera and referee behind MAVLink."""

@@ -1,4 +1,4 @@
-"""`python -m sitl`: the simulated vehicle on its own."""
+"""`python -m sitl`: runs the simulated vehicle alone."""
 
 import sys
 
@@ -7,6 +7,6 @@ INTERRUPTED = 130
 if __name__ == "__main__":
     try:
         from sitl.server.main import main
-    except KeyboardInterrupt:  # before the server listens for it
+    except KeyboardInterrupt:  # before the server handles the signal
         sys.exit(INTERRUPTED)
     sys.exit(main())

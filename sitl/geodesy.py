@@ -1,7 +1,7 @@
-"""Between the local NED frame and latitude, longitude and altitude.
+"""Conversion between the local NED frame and latitude, longitude and altitude.
 
-Azimuthal equidistant projection on a sphere of 6,371,000 m (Snyder, Map Projections: A Working
-Manual, 1987, equations 25-15 and 20-14), which is what PX4 uses.
+The conversion is an azimuthal equidistant projection on a sphere of 6,371,000 m (Snyder, Map
+Projections: A Working Manual, 1987, equations 25-15 and 20-14), as in PX4.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ EARTH_RADIUS_M = 6_371_000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
-    """Where on earth the local frame's origin is. The default is PX4 SITL's home near Zurich."""
+    """Geographic origin of the local frame. The default is PX4 SITL's home near Zurich."""
 
     latitude_deg: float = 47.397742
     longitude_deg: float = 8.545594
@@ -27,7 +27,7 @@ class Origin:
         object.__setattr__(self, "_cos", math.cos(math.radians(self.latitude_deg)))
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[float, float]:
-        """Latitude and longitude, degrees, of a point of the local frame."""
+        """Return latitude and longitude, degrees, of a point of the local frame."""
         distance = math.hypot(north_m, east_m)
         if distance < 1e-9:
             return self.latitude_deg, self.longitude_deg
@@ -41,7 +41,7 @@ class Origin:
         return math.degrees(latitude), math.degrees(longitude)
 
     def local(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """North and east, m, of a point given in degrees."""
+        """Return north and east, m, of a point given in degrees."""
         latitude = math.radians(latitude_deg)
         delta = math.radians(longitude_deg - self.longitude_deg)
         sin_latitude, cos_latitude = math.sin(latitude), math.cos(latitude)

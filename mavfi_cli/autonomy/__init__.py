@@ -1,25 +1,25 @@
-"""The companion's kernels: perception, planning and control as pure steps.
+"""The companion's kernels: perception, planning and control as pure step functions.
 
 point_cloud -> occupancy -> collision        perception
 planners -> shortcut -> smoothing            planning
 tracking                                     control
 
-Importing this package is cheap; each kernel module brings numba or a native library with it.
+Importing this package is cheap. Each kernel module imports numba or a native library.
 """
 
 from __future__ import annotations
 
 
 def is_compiled() -> bool:
-    """Whether `warm_up` finds its kernels compiled; else it takes many seconds."""
-    from mavfi_cli.autonomy.tracking import track  # the last one that it calls
+    """Return True if all kernels are compiled. Otherwise `warm_up` takes many seconds."""
+    from mavfi_cli.autonomy.tracking import track  # the last kernel that `warm_up` calls
     from mavfi_cli.core.compiled import in_cache
 
     return in_cache(track)
 
 
 def warm_up() -> None:
-    """Load (or compile, the first time on a machine) every kernel, so that no tick is slow."""
+    """Load every kernel, or compile it the first time on a machine, so that no tick is slow."""
     from mavfi_cli.autonomy.warm import run_every_kernel
 
     run_every_kernel()

@@ -1,12 +1,12 @@
-"""Collision check: the whole remaining trajectory against the map, with FCL on the octree.
+"""Collision check of the whole remaining trajectory against the map, with FCL on the octree.
 
-The vehicle is a sphere. It is placed along the reference that the tracker will follow, densely
-enough that the spheres cover the swept capsule: spheres of radius sqrt(r^2 + (s/2)^2) at spacing s
-contain the capsule of radius r. Unknown space is free, as in the reference.
+The vehicle is a sphere. The check places spheres along the reference that the tracker will follow
+so that they cover the swept capsule: spheres of radius sqrt(r^2 + (s/2)^2) at spacing s contain
+the capsule of radius r. Unknown space is free, as in MAVBench.
 
-A check that refuses far waypoints reports one that is not finite or too far away as a collision. A
-check that does not, looks for obstacles in the known map only, as the reference casts its rays:
-towards a far waypoint as far as `REACH_M`, and past one that is not finite.
+If the check refuses far waypoints, it reports a waypoint that is not finite or too far away as a
+collision. Otherwise it looks for obstacles in the known map only, as MAVBench's ray casting does:
+it follows the path to a far waypoint up to `REACH_M` and skips a waypoint that is not finite.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory
 MAX_SAMPLES = 4096
 MAX_SAMPLES_A_PIECE = 256
 LONGEST_DURATION_S = 60.0
-REACH_M = 150.0  # no map reaches farther from one waypoint to the next
-FASTEST_MPS = 100.0  # a faster waypoint leaves the map within its duration
+REACH_M = 150.0  # longest distance between two waypoints inside any map
+FASTEST_MPS = 100.0  # a faster vehicle would leave the map within one waypoint's duration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionParams:
-    """Size of the vehicle and density of the check.
+    """Size of the vehicle and sample spacing of the check.
 
-    The radius is the body's half diagonal (about 0.3 m for `solo`) and a margin for tracking
-    error, depth quantisation (0.1 m) and half a voxel. The reference uses a box of 1.5 m.
+    The radius is the body's half diagonal (about 0.3 m for `solo`) plus a margin for tracking
+    error, depth quantisation (0.1 m) and half a voxel. MAVBench uses a box of 1.5 m.
     """
 
     radius_m: float = 0.9
     spacing_m: float = 0.2
-    body_radius_m: float = 0.35  # never shrunk below, even where the vehicle starts in contact
+    body_radius_m: float = 0.35  # lower limit of the radius if the vehicle starts in contact
     refuses_far_waypoints: bool = True
     farthest_m: float = 1000.0  # a waypoint farther than this from the first one is unflyable
     owns_sequence_numbers: bool = False
@@ -48,32 +48,32 @@ class CollisionParams:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionState:
-    """What the check remembers from one call to the next."""
+    """State of the check between two calls."""
 
     future_collision_seq: int = 0
-    foreseen_on_seq: int | None = None  # trajectory on which a collision stands foreseen
+    foreseen_on_seq: int | None = None  # trajectory on which a collision is predicted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionInputs:
-    """One call's worth of messages."""
+    """Input messages of one call."""
 
     stamp_s: float
     snapshot: MapSnapshot
     trajectory: Trajectory | None
     time_s: float  # present point on the trajectory, from its first waypoint
-    front_enu_m: FloatArray | None = None  # (3,) where the path shall begin; None: where it does
+    front_enu_m: FloatArray | None = None  # (3,) start of the checked path; None: the path's own
 
 
 def step(
     state: CollisionState, inputs: CollisionInputs, params: CollisionParams
 ) -> tuple[CollisionState, CollisionReport]:
-    """Check what remains of the trajectory.
+    """Check the rest of the trajectory.
 
     The report's time_to_collision_s runs from `inputs.time_s` along the trajectory to the first
-    contact, inf where there is none. future_collision_seq grows by one when a collision is
-    foreseen on a trajectory that was free, or not checked, before. A waypoint that is not finite
-    or farther than `farthest_m` counts as a collision at its time: it cannot be flown.
+    contact. It is inf if there is none. future_collision_seq increases by one when the check
+    predicts a collision on a trajectory that was free or unchecked before. A waypoint that is not
+    finite or farther than `farthest_m` cannot be flown and counts as a collision at its time.
     """
     time_s = math.inf
     if inputs.trajectory is not None:
@@ -84,7 +84,7 @@ def step(
     collision = math.isfinite(time_s)
     seq, on_seq = state.future_collision_seq, None
     if inputs.trajectory is not None and not params.owns_sequence_numbers:
-        # A check that was restarted counts on from the plan's number.
+        # A restarted check continues from the number in the plan.
         seq = max(seq, inputs.trajectory.future_collision_seq)
     if collision and inputs.trajectory is not None:
         on_seq = inputs.trajectory.trajectory_seq
@@ -102,9 +102,9 @@ def step(
 def time_to_collision(
     snapshot: MapSnapshot, trajectory: Trajectory, time_s: float, params: CollisionParams
 ) -> float:
-    """Time from `time_s` along the trajectory to the first contact, s; inf where it is free.
+    """Return the time from `time_s` along the trajectory to the first contact, s; inf if free.
 
-    Never too late, and early by no more than one or two spacings.
+    The result is never late, and early by one or two spacings at most.
     """
     farthest_m = params.farthest_m
     if not params.refuses_far_waypoints:
@@ -125,23 +125,23 @@ def time_to_collision(
     if not snapshot.payload:
         return float(unflyable_s)
     hit = _first_contact(snapshot, points[:count], params)
-    # The sphere before was free: contact comes between the two, so not before its time.
+    # The previous sphere is free, so contact is not earlier than its time.
     return float(times_s[max(hit - 1, 0)]) if hit is not None else float(unflyable_s)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of corrupted waypoints
+@np.errstate(over="ignore", invalid="ignore")  # waypoints may be corrupted
 def _shifted(trajectory: Trajectory, time_s: float, front_enu_m: FloatArray) -> Trajectory:
-    """The trajectory moved rigidly until its reference at `time_s` is at the front (3,)."""
+    """Translate the trajectory so that its reference at `time_s` is at the front (3,)."""
     waypoints = trajectory.waypoints.copy()
     waypoints[:, 0:3] += front_enu_m - reference_waypoint(trajectory, time_s)[0:3]
     return replace(trajectory, waypoints=waypoints)
 
 
 def _castable(trajectory: Trajectory) -> Trajectory:
-    """The trajectory without what leaves every map.
+    """Bound the trajectory to distances that a map can have.
 
-    A far waypoint is drawn in along the ray towards it, and a fast one slowed down. One that is
-    not finite is where the one before is, at rest.
+    A far waypoint moves closer along the ray towards it, and a fast one is slowed down. A waypoint
+    that is not finite is replaced by the previous position at rest.
     """
     waypoints = trajectory.waypoints
     fine: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(waypoints), axis=1)
@@ -165,7 +165,7 @@ def _castable(trajectory: Trajectory) -> Trajectory:
 
 
 def _within(vector: FloatArray, limit: float) -> FloatArray:
-    """The vector (3,), no longer than the limit; safe where its square overflows."""
+    """Limit the length of a vector (3,). Safe if its square overflows."""
     largest = float(np.abs(vector).max())
     if largest <= limit / 2.0:
         return vector
@@ -175,7 +175,7 @@ def _within(vector: FloatArray, limit: float) -> FloatArray:
 
 
 class SphereProbe:
-    """A sphere that can be tried at points of a map."""
+    """A sphere to test for contact at points of a map."""
 
     def __init__(self, snapshot: MapSnapshot, radius_m: float) -> None:
         tree = fcl.OcTree(snapshot.resolution_m, snapshot.signed_bytes())
@@ -184,7 +184,7 @@ class SphereProbe:
         self._request = fcl.CollisionRequest()
 
     def touches(self, point_enu_m: FloatArray) -> bool:
-        """True where the sphere centred on the point (3,) meets an occupied voxel."""
+        """Return True if the sphere centred on the point (3,) meets an occupied voxel."""
         self._sphere.setTranslation(point_enu_m)
         found = fcl.collide(self._sphere, self._map, self._request, fcl.CollisionResult())
         return bool(found)
@@ -193,11 +193,10 @@ class SphereProbe:
 def _first_contact(
     snapshot: MapSnapshot, points: FloatArray, params: CollisionParams
 ) -> int | None:
-    """Index of the first point (n, 3) in contact, or None.
+    """Return the index of the first of the points (n, 3) in contact, or None.
 
-    A vehicle that already is within the radius of an obstacle may leave: until a first point is
-    free at full radius, and no farther than two radii from the start, points are tried with the
-    body's radius only.
+    A vehicle that is already within the radius of an obstacle may leave. Until a point is free at
+    full radius, and within two radii of the start, points are tested with the body's radius only.
     """
     padding_m = 0.5 * params.spacing_m
     probe = SphereProbe(snapshot, math.hypot(params.radius_m, padding_m))
@@ -227,13 +226,13 @@ def sample_ahead(
     points: FloatArray,
     times_s: FloatArray,
 ) -> tuple[int, float]:
-    """Points of the remaining reference at most `spacing_m` apart, and when they are reached.
+    """Sample the remaining reference at most `spacing_m` apart, with the time of each point.
 
-    Gaps between the end of one waypoint's motion and the next waypoint are bridged straight.
-    Every loop is bounded: by the number of waypoints, by MAX_SAMPLES_A_PIECE, by `points`.
+    A straight line bridges a gap between the end of one waypoint's motion and the next waypoint.
+    Every loop is bounded by the number of waypoints, by MAX_SAMPLES_A_PIECE or by `points`.
 
     Returns:
-        Number of samples written, and the time of the first unflyable point (inf where none).
+        Number of samples written, and the time of the first unflyable point (inf if none).
     """
     current, elapsed = locate(durations_s, time_s)
     count, now = 0, 0.0
@@ -266,7 +265,7 @@ def sample_ahead(
 
 @compiled
 def _pieces(length_m: float, spacing_m: float) -> int:
-    """Pieces no longer than the spacing, at least one and at most MAX_SAMPLES_A_PIECE."""
+    """Return the number of pieces no longer than the spacing, from 1 to MAX_SAMPLES_A_PIECE."""
     wanted = length_m / spacing_m
     if not wanted < MAX_SAMPLES_A_PIECE:
         return MAX_SAMPLES_A_PIECE
@@ -290,7 +289,7 @@ def _bridge(
     at_s: float,
     spacing_m: float,
 ) -> int:
-    """Append a point, and points between it and the last one where that is far away."""
+    """Append a point, and points between it and the last one if that is far away."""
     pieces = 1
     if count > 0:
         last = points[count - 1]

@@ -1,11 +1,11 @@
 """Geometry and speeds of a polyline flown with parabolic corner blends.
 
-On each straight segment the vehicle accelerates evenly, cruises, and brakes evenly. A corner is
-cut by one blend of even acceleration, from c u_1 to c u_2 (c the corner speed, u the directions):
-it lasts |c u_2 - c u_1| / a, starts and ends h = c^2 sin(theta / 2) / a from the corner, and passes
-the corner at c^2 sin(theta / 2)^2 / (2 a). So the velocity is continuous, and the norms of velocity
-and acceleration keep their limits exactly: inside a blend the velocity is a convex combination of
-its ends.
+On each straight segment the vehicle accelerates constantly, cruises, and brakes constantly. One
+blend of constant acceleration cuts each corner, from velocity c u_1 to c u_2 (c the corner speed, u
+the directions). It lasts |c u_2 - c u_1| / a, starts and ends h = c^2 sin(theta / 2) / a from the
+corner, and passes the corner at c^2 sin(theta / 2)^2 / (2 a). The velocity is continuous. The norms
+of velocity and acceleration keep their limits exactly, because the velocity inside a blend is a
+convex combination of the velocities at its ends.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mavfi_cli.core.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """What a motion may not exceed."""
+class MotionLimits:
+    """Limits of a motion."""
 
     speed_mps: float
     climb_mps: float
@@ -30,7 +30,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Polyline:
-    """Vertices (n, 3) with no two consecutive ones the same, and what follows from them."""
+    """Vertices (n, 3) without consecutive duplicates, and quantities derived from them."""
 
     vertices: FloatArray  # (n, 3)
     lengths: FloatArray  # (n - 1,)
@@ -39,8 +39,8 @@ class Polyline:
     half_sines: FloatArray  # (n,) sin of half the turn at each vertex; 0 at the ends
 
 
-def polyline(vertices: FloatArray, limits: Limits) -> Polyline:
-    """The geometry of a path (n, 3); points closer than 1 mm to their predecessor are left out."""
+def polyline(vertices: FloatArray, limits: MotionLimits) -> Polyline:
+    """Compute the geometry of a path (n, 3) without points within 1 mm of their predecessor."""
     kept = [vertices[0]]
     for vertex in vertices[1:]:
         if np.linalg.norm(vertex - kept[-1]) > 1e-3:
@@ -61,8 +61,8 @@ def polyline(vertices: FloatArray, limits: Limits) -> Polyline:
     )
 
 
-def _speed_cap(rise: float, limits: Limits) -> float:
-    """Speed along a direction with vertical component `rise` that keeps the vertical limits."""
+def _speed_cap(rise: float, limits: MotionLimits) -> float:
+    """Return the speed that keeps the vertical limits along a direction of vertical part `rise`."""
     cap = limits.speed_mps
     if rise > 0.0:
         cap = min(cap, limits.climb_mps / rise)
@@ -74,10 +74,10 @@ def _speed_cap(rise: float, limits: Limits) -> float:
 def squared_corner_speeds(
     line: Polyline, start_speed_mps: float, caps: FloatArray, acceleration_mps2: float
 ) -> FloatArray:
-    """Squares of the speeds at the vertices (n,), as high as caps and lengths allow.
+    """Return the highest squared speeds at the vertices (n,) that caps and lengths allow.
 
-    The start has its given speed, the end is at rest. `caps` (n,) are squares of speeds. On the
-    first segment there must be room to stop from the start speed.
+    The start has its given speed, the end is at rest. `caps` (n,) are squares of speeds. The first
+    segment must be long enough to stop from the start speed.
     """
     a = acceleration_mps2
     lengths, sines = line.lengths, line.half_sines
@@ -88,7 +88,7 @@ def squared_corner_speeds(
         q[i] = min(q[i], line.speed_caps[i - 1] ** 2, line.speed_caps[i] ** 2)
         if sines[i] > 0.0:
             q[i] = min(q[i], 0.5 * min(lengths[i - 1], lengths[i]) * a / sines[i])
-    if last > 1 and sines[1] > 0.5:  # braking into the first corner, its blend taken off the room
+    if last > 1 and sines[1] > 0.5:  # the first corner's blend shortens the braking distance
         room = 2.0 * a * lengths[0] - q[0]
         q[1] = min(q[1], max(0.0, room) / (2.0 * sines[1] - 1.0))
     for _ in range(last + 2):
@@ -104,23 +104,23 @@ def squared_corner_speeds(
 
 
 def _reachable(q_from: float, sine_from: float, sine_to: float, length: float, a: float) -> float:
-    """Largest squared speed at one end of a segment for the squared speed at its other end."""
+    """Return the largest squared speed at one end of a segment, given that at the other end."""
     return max(0.0, (q_from * (1.0 - 2.0 * sine_from) + 2.0 * a * length) / (1.0 + 2.0 * sine_to))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """Consecutive phases of even acceleration."""
+    """Consecutive phases of constant acceleration."""
 
-    starts_s: FloatArray  # (m,) when each phase begins
-    positions: FloatArray  # (m, 3) at its beginning
+    starts_s: FloatArray  # (m,) start of each phase
+    positions: FloatArray  # (m, 3) at the start of each phase
     velocities: FloatArray  # (m, 3)
     accelerations: FloatArray  # (m, 3)
-    corners: FloatArray  # (m,) index of the vertex that the phase rounds or waits at, else -1
+    corners: FloatArray  # (m,) vertex that the phase rounds or waits at; -1 for none
     duration_s: float
 
     def position(self, times_s: FloatArray) -> FloatArray:
-        """Positions (k, 3) at the times (k,); at rest at the end after it."""
+        """Return positions (k, 3) at the times (k,). After its end the motion rests there."""
         times = np.clip(times_s, 0.0, self.duration_s)
         index = np.searchsorted(self.starts_s, times, side="right") - 1
         t = (times - self.starts_s[index])[:, None]
@@ -143,12 +143,13 @@ class _Phases:
     def add(
         self, duration_s: float, velocity: FloatArray, acceleration: FloatArray, corner: int = -1
     ) -> None:
-        """A phase at an even acceleration; one that takes no time is left out.
+        """Append a phase of constant acceleration unless its duration is zero.
 
         Args:
-            velocity: (3,), at its beginning, m/s.
-            acceleration: (3,), m/s^2.
-            corner: the vertex that it rounds; -1 for none.
+            duration_s: Duration, s.
+            velocity: Velocity at its start (3,), m/s.
+            acceleration: Acceleration (3,), m/s^2.
+            corner: Vertex that the phase rounds; -1 for none.
         """
         if not duration_s > 0.0:
             return
@@ -165,9 +166,9 @@ def motion(
     dwells_s: FloatArray,
     acceleration_mps2: float,
 ) -> Motion:
-    """The phases of flying the line with squared corner speeds `q` (n,).
+    """Return the motion along the line with squared corner speeds `q` (n,).
 
-    `dwells_s` (n,) is how long to wait at each vertex; only for vertices passed at rest.
+    `dwells_s` (n,) is the waiting time at each vertex. It must be 0 unless the speed there is 0.
     """
     a = acceleration_mps2
     phases = _Phases(line.vertices[0])
@@ -185,7 +186,7 @@ def motion(
                 if lasting > 0.0:
                     phases.add(lasting, speeds[i + 1] * direction, turn / lasting, i + 1)
             else:
-                phases.position = line.vertices[i + 1]  # no rounding errors carried on
+                phases.position = line.vertices[i + 1]  # drops accumulated rounding errors
                 phases.add(dwells_s[i + 1], zero, zero, i + 1)
     phases.position = line.vertices[-1]
     phases.add(1e-3, zero, zero)
@@ -208,7 +209,7 @@ def _straight(
     cap: float,
     a: float,
 ) -> None:
-    """Accelerate to as much as the cap and the distance allow, cruise, and brake."""
+    """Accelerate as far as the cap and the distance allow, cruise, and brake."""
     first, last = float(speeds[0]), float(speeds[1])
     peak = math.sqrt(max(0.0, a * distance + 0.5 * (first * first + last * last)))
     peak = max(min(peak, cap), last)
@@ -220,6 +221,6 @@ def _straight(
 
 
 def _change(phases: _Phases, direction: FloatArray, begin: float, end: float, a: float) -> None:
-    """From one speed to another along a line."""
+    """Change speed along a line."""
     rate = math.copysign(a, end - begin)
     phases.add((end - begin) / rate, begin * direction, rate * direction)

@@ -1,8 +1,8 @@
-"""Obstacle grid: the map's occupied voxels, dilated by the planning radius, for fast segment tests.
+"""Obstacle grid for fast segment tests: occupied voxels dilated by the planning radius.
 
-A voxel is blocked where some point of it is closer than the radius to some point of an occupied
-voxel, so a path through free voxels keeps the radius from everything that is mapped (it may keep
-up to one voxel diagonal more). Unknown space is free, as in the reference.
+A voxel is blocked if any point of it is closer than the radius to any point of an occupied voxel. A
+path through free voxels therefore keeps at least the radius from every mapped obstacle, and at most
+one voxel diagonal more than needed. Unknown space is free, as in MAVBench.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from mavfi_cli.core.types import FloatArray
 
 Blocked = NDArray[np.uint8]
 
-MAX_VOXELS = 60_000_000  # bounds the memory that a corrupted map or bound can ask for
+MAX_VOXELS = 60_000_000  # limits the memory for a corrupted map or bound
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObstacleGrid:
-    """Blocked voxels in a box around the obstacles; outside it, all of `bounds_enu_m` is free."""
+    """Blocked voxels in a box around the obstacles. Outside the box, `bounds_enu_m` is free."""
 
-    blocked: Blocked  # (nx, ny, nz), 1 where the vehicle's centre must not be
+    blocked: Blocked  # (nx, ny, nz), 1 if the vehicle's centre must not be there
     origin_enu_m: FloatArray  # (3,) lower corner of voxel (0, 0, 0)
     resolution_m: float
-    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax; leaving it is blocked
+    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax; outside is blocked
     radius_m: float
 
     def point_free(self, point_enu_m: FloatArray) -> bool:
-        """True where the vehicle's centre may be."""
+        """Return True if the vehicle's centre may be at the point (3,)."""
         return self.segment_free(point_enu_m, point_enu_m)
 
     def segment_free(self, start_enu_m: FloatArray, end_enu_m: FloatArray) -> bool:
-        """True where the vehicle's centre may fly straight from start to end, each (3,)."""
+        """Return True if the vehicle's centre may fly straight from start to end, each (3,)."""
         s, e = start_enu_m, end_enu_m
         free: bool = segment_free(
             self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m,
@@ -47,7 +47,7 @@ class ObstacleGrid:
         return free
 
     def path_free(self, points_enu_m: FloatArray) -> bool:
-        """True where every straight piece between consecutive points (n, 3) is free."""
+        """Return True if every segment between consecutive points (n, 3) is free."""
         free: bool = path_free(
             self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m,
             np.ascontiguousarray(points_enu_m),
@@ -56,9 +56,9 @@ class ObstacleGrid:
 
 
 def build(snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> ObstacleGrid:
-    """The grid of a map inside `bounds_enu_m` (6,), dilated by `radius_m`.
+    """Build the grid of a map inside `bounds_enu_m` (6,), dilated by `radius_m`.
 
-    Occupied voxels outside the bounds count as far as their dilation reaches in.
+    Occupied voxels outside the bounds count if their dilation reaches inside.
     """
     resolution = snapshot.resolution_m
     reach = math.ceil(radius_m / resolution) + 1
@@ -81,12 +81,12 @@ def build(snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> O
 def _extent(
     leaves: NDArray[np.int64], bounds: FloatArray, resolution: float, reach: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Lower voxel index (3,) and size (3,) of the box that dilated obstacles can reach."""
+    """Return lower voxel index (3,) and size (3,) of the box that dilated obstacles can reach."""
     if not len(leaves):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     low = leaves[:, :3].min(axis=0) - reach
     high = (leaves[:, :3] + leaves[:, 3:4]).max(axis=0) + reach
-    # One reach beyond the bounds, so that obstacles just outside still dilate inwards.
+    # The box extends one reach beyond the bounds, so that obstacles just outside dilate inwards.
     low = np.maximum(low, np.floor(bounds[:3] / resolution).astype(np.int64) - reach)
     high = np.minimum(high, np.ceil(bounds[3:] / resolution).astype(np.int64) + reach)
     size = np.maximum(high - low, 0)
@@ -96,9 +96,9 @@ def _extent(
 
 
 def run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
-    """Half height in z of the dilation for each column offset (dx, dy), (w, w); -1 where none.
+    """Return half the dilation's height in z for each column offset (dx, dy), (w, w); -1 for none.
 
-    Offset k between two voxels leaves a gap of max(|k| - 1, 0) voxels between them.
+    An offset of k between two voxels leaves a gap of max(|k| - 1, 0) voxels between them.
     """
     reach = math.ceil(radius_m / resolution_m) + 1
     offsets = np.abs(np.arange(-reach, reach + 1))
@@ -115,7 +115,7 @@ def run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
 
 @compiled
 def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Blocked) -> None:
-    """Set the voxels of every leaf (x, y, z, size) that lie in the grid."""
+    """Mark the voxels inside the grid of every leaf (x, y, z, size)."""
     nx, ny, nz = occupied.shape
     for i in range(leaves.shape[0]):
         x, y, z = leaves[i, 0] - low[0], leaves[i, 1] - low[1], leaves[i, 2] - low[2]
@@ -127,9 +127,9 @@ def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Bloc
 
 @compiled
 def _dilate(occupied: Blocked, widths: NDArray[np.int64], blocked: Blocked) -> None:
-    """Spread every occupied run of z over its neighbour columns, by run, not by voxel.
+    """Dilate every occupied run in z, instead of every voxel, into the neighbouring columns.
 
-    Walls are upright, so one run stands for a whole column of them.
+    Walls are upright, so one run covers a whole column of voxels.
     """
     nx, ny, nz = occupied.shape
     reach = widths.shape[0] // 2
@@ -164,12 +164,12 @@ def segment_free(
     y1: float,
     z1: float,
 ) -> bool:
-    """True where a straight segment stays in the bounds and meets no blocked voxel.
+    """Return True if a straight segment stays in the bounds and meets no blocked voxel.
 
-    Traverses exactly the voxels that the segment crosses (Amanatides and Woo 1987). Ends that
-    are not finite are not free.
+    The traversal visits exactly the voxels that the segment crosses (Amanatides and Woo 1987). A
+    segment with an end that is not finite is not free.
     """
-    # Written so that NaN fails every comparison.
+    # The form of the comparisons makes NaN fail.
     if not (bounds[0] <= x0 <= bounds[3] and bounds[0] <= x1 <= bounds[3]):
         return False
     if not (bounds[1] <= y0 <= bounds[4] and bounds[1] <= y1 <= bounds[4]):
@@ -222,7 +222,7 @@ def path_free(
     bounds: FloatArray,
     points: FloatArray,
 ) -> bool:
-    """`segment_free` along a whole polyline (n, 3)."""
+    """Apply `segment_free` to every segment of a polyline (n, 3)."""
     for i in range(points.shape[0] - 1):
         if not segment_free(
             blocked, origin, resolution, bounds,
@@ -236,7 +236,7 @@ def path_free(
 def blend(
     grid: ObstacleGrid, inner: ObstacleGrid, centre_enu_m: FloatArray, radius_m: float
 ) -> Blocked:
-    """The blocked voxels of `grid`, but those of `inner` within the radius of the centre."""
+    """Return the blocked voxels of `inner` within the radius of the centre, of `grid` elsewhere."""
     blocked = grid.blocked.copy()
     resolution = grid.resolution_m
     to_inner = np.rint((grid.origin_enu_m - inner.origin_enu_m) / resolution).astype(np.int64)

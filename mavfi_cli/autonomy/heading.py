@@ -1,4 +1,4 @@
-"""Where the camera looks: the yaw of each waypoint along the direction of travel."""
+"""Yaw of each waypoint, which points the camera along the direction of travel."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import FloatArray
 
-SHORTEST_M = 0.3  # a shorter horizontal way has no direction worth turning to
+SHORTEST_M = 0.3  # minimum horizontal distance that defines a direction
 
 
 def headings(
     positions_enu_m: FloatArray, start_yaw_rad: float, ahead: int, turn_max_rad: float
 ) -> FloatArray:
-    """Yaw (n,) of waypoints at positions (n, 3), continuous from `start_yaw_rad`.
+    """Return the yaw (n,) of waypoints at positions (n, 3), continuous from `start_yaw_rad`.
 
-    Each looks to where the vehicle is `ahead` waypoints later, or, where that is too near, to
-    where it is when it next gets away; at the end the yaw stays. From one waypoint to the next
-    it turns by at most `turn_max_rad`.
+    Each yaw points to the position `ahead` waypoints later, or to the first later position that is
+    far enough if that one is too near. The yaw stays constant at the end. It turns by at most
+    `turn_max_rad` from one waypoint to the next.
     """
     count = len(positions_enu_m)
     yaws = np.empty(count)
@@ -33,7 +33,7 @@ def headings(
 
 
 def _direction(positions: FloatArray, k: int, ahead: int) -> float | None:
-    """Yaw from position k to the first one, `ahead` or more later, that is far enough."""
+    """Return the yaw from position k to the first far enough one, `ahead` or more later."""
     ways = positions[min(k + ahead, len(positions) - 1) :, :2] - positions[k, :2]
     far = np.flatnonzero(np.hypot(ways[:, 0], ways[:, 1]) >= SHORTEST_M)
     if not len(far):
@@ -44,7 +44,10 @@ def _direction(positions: FloatArray, k: int, ahead: int) -> float | None:
 def turn_time_s(
     yaw_rad: float, direction: FloatArray, threshold_rad: float, rate_radps: float
 ) -> float:
-    """Time to turn from a yaw to a direction (3,) of travel; 0 within the threshold or vertical."""
+    """Return the time to turn from a yaw to a direction of travel (3,).
+
+    It is 0 within the threshold and for a vertical direction.
+    """
     if math.hypot(direction[0], direction[1]) < 0.1 or not math.isfinite(yaw_rad):
         return 0.0
     turn = abs(wrap_angle(math.atan2(direction[1], direction[0]) - yaw_rad))

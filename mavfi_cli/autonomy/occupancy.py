@@ -1,7 +1,7 @@
 """OctoMap: log-odds occupancy of the world in an octree, and immutable snapshots of it.
 
 The tree is OctoMap's own C++ (pyoctomap), so a fault in it is a fault in OctoMap. Defaults are
-those of the reference's octomap_server, except the resolution; see `OccupancyParams`.
+those of MAVBench's octomap_server, except the resolution; see `OccupancyParams`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from mavfi_cli.core.types import FloatArray, PointCloud
 class OccupancyParams:
     """OctoMap's sensor model (Hornung et al. 2013) as octomap_server ships it.
 
-    The reference maps at 0.1 m; the default here is 0.2 m, about the spacing of neighbouring
-    rays of a 64-column, 90-degree image at full range: finer voxels would be left with holes.
+    MAVBench maps at 0.1 m. The default here is 0.2 m, about the spacing of neighbouring rays of a
+    64-column, 90-degree image at full range. Finer voxels would leave holes in the map.
     """
 
     resolution_m: float = 0.2
@@ -32,38 +32,38 @@ class OccupancyParams:
     clamp_min: float = 0.12
     clamp_max: float = 0.97
     occupancy_threshold: float = 0.5
-    z_min_m: float = -2.0  # points below or above are ignored
+    z_min_m: float = -2.0  # points below z_min_m or above z_max_m are ignored
     z_max_m: float = 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=True)
 class MapSnapshot:
-    """The map at one moment, as the occupied voxels in OctoMap's `.bt` format."""
+    """The occupied voxels of the map at one moment, in OctoMap's `.bt` format."""
 
     stamp_s: float
     resolution_m: float
-    payload: bytes  # the node stream that follows the header's `data` line; empty: nothing known
+    payload: bytes  # node stream after the header's `data` line; empty for an empty map
 
     def signed_bytes(self) -> NDArray[np.int8]:
-        """The payload as `fcl.OcTree` takes it, (n,)."""
+        """Return the payload (n,) in the type that `fcl.OcTree` takes."""
         return np.frombuffer(self.payload, np.int8)
 
 
 class OccupancyMap:
-    """An octree that integrates point clouds, and which of its voxels are occupied.
+    """An octree that integrates point clouds, with a list of its occupied voxels.
 
-    Only a voxel that some ray has ended in can be occupied, so these are remembered, and those
-    that a cloud may have changed are looked up in the tree after it. That makes a snapshot cheap:
-    OctoMap's own binary export would have to visit every free node, and, worse, replaces the
-    tree's probabilities by their extremes, after which a new obstacle in cleared space needs
-    several sightings. For the same reason inner nodes are never summed up: nobody asks them.
+    A voxel can be occupied only if a ray has ended in it. The map keeps a list of these voxels and,
+    after each cloud, looks up in the tree those that the cloud may have changed. This makes a
+    snapshot cheap. OctoMap's own binary export visits every free node. It also replaces the tree's
+    probabilities by their extremes, so that a new obstacle in cleared space would need several
+    observations. Inner nodes are never updated, because nothing reads them.
     """
 
     def __init__(self, params: OccupancyParams) -> None:
         self._params = params
         self._stamp_s = -math.inf
         self._ended_in: octree.Codes = np.empty(0, np.int64)  # sorted
-        self._occupied = np.empty(0, np.bool_)  # of each of these
+        self._occupied = np.empty(0, np.bool_)  # one flag for each code in _ended_in
         self._tree = pyoctomap.OcTree(params.resolution_m)
         self._tree.setProbHit(params.probability_hit)
         self._tree.setProbMiss(params.probability_miss)
@@ -73,19 +73,19 @@ class OccupancyMap:
 
     @property
     def nodes(self) -> int:
-        """How many nodes the tree has."""
+        """Return the number of nodes in the tree."""
         return int(self._tree.size())
 
     @property
     def occupied_voxels(self) -> int:
-        """How many voxels are occupied."""
+        """Return the number of occupied voxels."""
         return int(self._occupied.sum())
 
     def insert(self, cloud: PointCloud) -> None:
-        """Integrate one cloud: rays clear, end points within the range fill.
+        """Integrate one cloud: rays clear voxels, end points within the range mark them occupied.
 
         Points that are not finite, out of the octree's range or outside the height limits are
-        ignored, as is a whole cloud whose origin is.
+        ignored. A cloud with such an origin is ignored as a whole.
         """
         self._stamp_s = cloud.stamp_s
         points = self._usable(cloud.points_enu_m)
@@ -103,7 +103,7 @@ class OccupancyMap:
         self._look_up(np.maximum(low, origin - reach), np.minimum(high, origin + reach))
 
     def snapshot(self) -> MapSnapshot:
-        """The map as it is now; later insertions do not change it."""
+        """Return a snapshot of the map, which later insertions do not change."""
         return MapSnapshot(
             stamp_s=self._stamp_s,
             resolution_m=self._params.resolution_m,
@@ -117,13 +117,13 @@ class OccupancyMap:
         return np.ascontiguousarray(points if kept.all() else points[kept])
 
     def _in_range(self, coordinates: FloatArray) -> NDArray[np.bool_]:
-        """Which coordinates the octree can hold, with room for a ray's length; NaN is out."""
+        """Return True for coordinates in the octree's range less a ray's length; False for NaN."""
         limit = octree.HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
         inside: NDArray[np.bool_] = np.abs(coordinates) < limit
         return inside
 
     def _remember(self, ends: FloatArray) -> None:
-        """Add the voxels of ray ends (n, 3) to those that may be occupied."""
+        """Add the voxels of ray ends (n, 3) to the voxels that may be occupied."""
         codes = np.empty(len(ends), np.int64)
         count = octree.morton_codes(ends, self._params.resolution_m, codes)
         fresh = np.setdiff1d(codes[:count], self._ended_in)
@@ -133,7 +133,7 @@ class OccupancyMap:
             self._occupied = np.insert(self._occupied, places, False)
 
     def _look_up(self, low: FloatArray, high: FloatArray) -> None:
-        """Ask the tree for the remembered voxels in the box from low to high, each (3,)."""
+        """Look up in the tree all listed voxels in the box from low to high, each (3,)."""
         resolution = self._params.resolution_m
         centres = np.empty((len(self._ended_in), 3))
         octree.voxel_centres(self._ended_in, resolution, centres)
@@ -142,12 +142,12 @@ class OccupancyMap:
 
 
 def empty_snapshot(resolution_m: float = 0.2) -> MapSnapshot:
-    """The map of a world of which nothing was seen yet."""
+    """Return the snapshot of an empty map."""
     return MapSnapshot(stamp_s=-math.inf, resolution_m=resolution_m, payload=b"")
 
 
 def snapshot_of(points_enu_m: FloatArray, resolution_m: float = 0.2) -> MapSnapshot:
-    """A map in which exactly the voxels of the points (n, 3) are occupied."""
+    """Return a snapshot in which exactly the voxels of the points (n, 3) are occupied."""
     codes = np.empty(len(points_enu_m), np.int64)
     count = octree.morton_codes(np.asarray(points_enu_m, np.float64), resolution_m, codes)
     payload = octree.encode(np.unique(codes[:count]))

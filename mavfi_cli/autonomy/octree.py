@@ -1,13 +1,13 @@
-"""Octrees as bytes: OctoMap's binary node stream, written and read.
+"""Encoder and decoder of OctoMap's binary node stream.
 
-Depth first, two bytes a node, two bits a child, of which the low one says "free or inner" and
-the high one "occupied or inner"; inner children follow in order. Child c lies in the upper half
-along x, y, z for bits 0, 1, 2 of c. The root covers 2^16 voxels a side, centred on the world's
-origin. Source: the format as OctoMap's `AbstractOccupancyOcTree` writes it.
+Nodes are stored depth first with two bytes per node and two bits per child. The low bit means
+"free or inner", the high bit "occupied or inner". Inner children follow in order. Bits 0, 1, 2 of
+child number c select the upper half along x, y, z. The root covers 2^16 voxels per side and is
+centred on the world's origin. Source: OctoMap's `AbstractOccupancyOcTree`.
 
-A voxel's Morton code interleaves the bits of its indices (x lowest), so sorted codes are the
-voxels in the stream's order. Voxel (i, j, k) spans [i, i + 1) x [j, j + 1) x [k, k + 1) in units of
-the resolution.
+A voxel's Morton code interleaves the bits of its indices (x lowest), so sorted codes are in the
+stream's order. Voxel (i, j, k) spans [i, i + 1) x [j, j + 1) x [k, k + 1) in units of the
+resolution.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ Codes = NDArray[np.int64]
 
 @compiled
 def morton_codes(points: FloatArray, resolution: float, codes: Codes) -> int:
-    """Write the codes of the voxels of points (n, 3); returns how many.
+    """Write the codes of the voxels of points (n, 3) and return their number.
 
-    Points outside the octree's range, or not finite, have none. Rounds to single precision
-    first, as OctoMap does.
+    Points that are not finite or outside the octree's range have no code. Coordinates are rounded
+    to single precision first, as in OctoMap.
     """
     count = 0
     factor = 1.0 / resolution
@@ -53,7 +53,7 @@ def morton_codes(points: FloatArray, resolution: float, codes: Codes) -> int:
 
 @compiled
 def voxel_centres(codes: Codes, resolution: float, centres: FloatArray) -> None:
-    """Write the centres (n, 3), m, of the voxels with these codes (n,)."""
+    """Write the centres (n, 3), m, of the voxels with the given codes (n,)."""
     for i in range(codes.shape[0]):
         for axis in range(3):
             index = 0
@@ -63,9 +63,9 @@ def voxel_centres(codes: Codes, resolution: float, centres: FloatArray) -> None:
 
 
 def encode(codes: Codes) -> bytes:
-    """The node stream of a tree in which exactly these voxels are occupied, all else unknown.
+    """Encode a tree in which exactly these voxels are occupied and all others unknown.
 
-    `codes` (n,) must be sorted and distinct. Cubes that are wholly occupied become one leaf.
+    `codes` (n,) must be sorted and distinct. A fully occupied cube becomes one leaf.
     """
     if not len(codes):
         return b""
@@ -75,7 +75,7 @@ def encode(codes: Codes) -> bytes:
 
 @compiled
 def _encode(codes: Codes, stream: NDArray[np.uint8]) -> int:
-    """Fill `stream`; returns how many bytes."""
+    """Fill `stream` and return the number of bytes."""
     stack = np.empty((8 * TREE_DEPTH + 8, 3), np.int64)  # first code, end of codes, height
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, len(codes), TREE_DEPTH
     depth, position = 1, 0
@@ -110,11 +110,11 @@ def _encode(codes: Codes, stream: NDArray[np.uint8]) -> int:
 
 
 def occupied_leaves(stream: bytes) -> NDArray[np.int64]:
-    """Occupied cubes of a node stream as voxel indices (n, 4): x y z of the lower corner, size.
+    """Decode the occupied cubes of a node stream as voxel indices (n, 4): lower corner x y z, size.
 
-    A stream that is cut short or senseless gives the leaves up to that point.
+    A truncated or invalid stream gives the leaves up to the error.
     """
-    # A node of two bytes has at most eight leaves.
+    # A two-byte node has at most eight leaves.
     leaves = np.empty((4 * len(stream), 4), np.int64)
     count = decode_leaves(np.frombuffer(stream, np.uint8), leaves)
     return leaves[:count].copy()
@@ -122,7 +122,7 @@ def occupied_leaves(stream: bytes) -> NDArray[np.int64]:
 
 @compiled
 def decode_leaves(stream: NDArray[np.uint8], leaves: NDArray[np.int64]) -> int:
-    """Fill `leaves` from the node stream; returns how many."""
+    """Fill `leaves` from the node stream and return their number."""
     stack = np.empty((8 * TREE_DEPTH + 8, 4), np.int64)  # x y z of the lower corner, size
     stack[0, 0], stack[0, 1], stack[0, 2] = -HALF_RANGE, -HALF_RANGE, -HALF_RANGE
     stack[0, 3] = 2 * HALF_RANGE

@@ -1,4 +1,4 @@
-"""What the mission logic and the nodes that work for it say to each other."""
+"""Messages between the mission logic and the planning and control nodes."""
 
 from __future__ import annotations
 
@@ -8,46 +8,46 @@ from enum import Enum
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 
-class Mode(Enum):
-    """What the pilot is doing."""
+class PilotMode(Enum):
+    """Mode of the pilot."""
 
-    TURNING = "turning"  # hovering, looking all round before the first plan
-    WAITING = "waiting"  # hovering, a plan is wanted
-    FLYING = "flying"  # on a trajectory, nothing foreseen on it
-    EVADING = "evading"  # on a blocked trajectory, with time to go on while a new one is planned
-    SLOWING = "slowing"  # the same, with less time: at reduced speed
-    STOPPING = "stopping"  # braking, then planning from a hover
+    TURNING = "turning"  # hovers and turns once round before the first plan
+    WAITING = "waiting"  # hovers and waits for a plan
+    FLYING = "flying"  # follows a trajectory without a predicted collision
+    EVADING = "evading"  # follows a blocked trajectory at full speed while a new one is planned
+    SLOWING = "slowing"  # follows a blocked trajectory at reduced speed, as there is less time
+    STOPPING = "stopping"  # brakes, then plans from a hover
     ARRIVED = "arrived"
     GAVE_UP = "gave_up"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanRequest:
-    """What a plan must connect, and what its maker must know."""
+    """Request for a trajectory."""
 
-    stamp_s: float  # when the trajectory shall begin
+    stamp_s: float  # start of the trajectory
     position_enu_m: FloatArray  # (3,)
     velocity_enu_mps: FloatArray  # (3,)
     yaw_rad: float
     goal_enu_m: FloatArray  # (3,)
-    attempt: int  # counts all plans of the mission; seeds the planner
-    trajectory_seq: int  # newest one known; the plan's own comes after it
+    attempt: int  # number of the plan in the mission; seeds the planner
+    trajectory_seq: int  # newest known number; the plan takes the next
     future_collision_seq: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanFailure:
-    """A planner that found nothing."""
+    """Report that the planner found no trajectory."""
 
-    stamp_s: float  # when the trajectory should have begun
+    stamp_s: float  # requested start of the trajectory
     reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Directive:
-    """What the control stage shall do in this tick."""
+    """Input of the control stage in one tick."""
 
-    mode: Mode
+    mode: PilotMode
     trajectory: Trajectory | None  # None: hold `hold_enu_m`
     time_s: float  # point on the trajectory, from its first waypoint
     rate: float  # trajectory seconds per second, 0..1

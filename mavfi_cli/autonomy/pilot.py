@@ -1,12 +1,12 @@
-"""The mission state machine: when to plan, to fly on, to slow down, to stop, and to give up.
+"""The mission state machine. It decides when to plan, fly on, slow down, stop and give up.
 
-It sees only messages: collision reports, planned trajectories, and the vehicle's state. What it
-puts out is a directive: which trajectory to track, at which point of it, how fast its clock runs,
-and whether a new plan is wanted.
+Its inputs are messages: collision reports, planned trajectories and the vehicle's state. Its output
+is a directive: the trajectory to track, the point on it, the rate of its clock, and a request for
+a new plan if one is needed.
 
-A vehicle that plans in motion slows down and stops by running the trajectory's own clock slower, so
-it stays on the path that was checked: see `flown`. One that stops on a report drops the trajectory
-and brakes where it is. A vehicle that does not plan in motion comes to rest before it plans.
+A vehicle that plans in motion slows down and stops by slowing the trajectory's clock, so that it
+stays on the checked path; see `active_plan`. A vehicle that stops on a report drops the trajectory
+and brakes at once. A vehicle that does not plan in motion comes to rest before it plans.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mavfi_cli.autonomy.flown import FlownPlan
-from mavfi_cli.autonomy.orders import Directive, Mode, PlanFailure, PlanRequest
+from mavfi_cli.autonomy.active_plan import ActivePlan
+from mavfi_cli.autonomy.orders import Directive, PilotMode, PlanFailure, PlanRequest
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
-TURN_S = 6.0  # one turn all round; the release's takes as long, its two pauses of 1 s included
+TURN_S = 6.0  # duration of one full turn; as in the released code with its two pauses of 1 s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PilotParams:
-    """Limits and patience of the mission.
+    """Limits and time-outs of the mission.
 
-    Sources: v_max, a_max, the 0.25 s planning lead and the 40 attempts are those of the released
-    package_delivery application (reference facts, sections 4.1, 4.5 and 4.8).
+    v_max, a_max, the 0.25 s planning lead and the 40 attempts are those of the released
+    package_delivery application (MAVBench/MAV_apps, branch mavfi).
     """
 
     v_max_mps: float = 3.0
     a_max_mps2: float = 5.0
     goal_tolerance_m: float = 1.0
-    plan_lead_s: float = 0.25  # a plan made in flight starts this far ahead of now
-    late_plan_s: float = 0.5  # a plan that comes later than this after its start is not used
-    brake_mps2: float = 3.0  # deceleration that stopping counts on
-    margin_s: float = 0.4  # reserve on top of braking before a foreseen collision
-    slow_rate: float = 0.5  # share of the planned speed while slowing
-    attempts_max: int = 40  # failed plans in a row before giving up
+    plan_lead_s: float = 0.25  # time from the request to the start of a plan made in flight
+    late_plan_s: float = 0.5  # maximum delay of a plan after its own start
+    brake_mps2: float = 3.0  # deceleration assumed for stopping
+    margin_s: float = 0.4  # time added to braking before a predicted collision
+    slow_rate: float = 0.5  # fraction of the planned speed while slowing
+    attempts_max: int = 40  # consecutive failed plans before the mission is given up
     retry_s: float = 0.1  # pause after a failed plan
-    look_round_after: int = 3  # failed plans in a row before looking all round
+    look_round_after: int = 3  # consecutive failed plans before the vehicle turns once round
     guards_tracking: bool = True
-    tracking_error_max_m: float = 2.0  # farther than this from the reference: stop and plan anew
-    stops_on_report: bool = False  # a foreseen collision ends the plan
+    tracking_error_max_m: float = 2.0  # larger distance from the reference: stop and replan
+    stops_on_report: bool = False  # a predicted collision ends the plan
     uses_time_to_collision: bool = True
     acts_on_report_once: bool = False
     owns_sequence_numbers: bool = False
@@ -54,16 +54,14 @@ class PilotParams:
     turns_before_departure: bool = False
     rejected_plan_pause_s: float = 0.0
     slows_where_blind: bool = False
-    sight_rad: float = (
-        math.pi / 4.0
-    )  # farther from its yaw the vehicle does not see; camera: 90 deg
-    rest_mps: float = 0.3  # a slower vehicle is at rest
-    start_error_max_m: float = 10.0  # a plan begins no farther than this from the vehicle
+    sight_rad: float = math.pi / 4.0  # half the field of view that counts as seen; camera: 90 deg
+    rest_mps: float = 0.3  # a slower vehicle counts as at rest
+    start_error_max_m: float = 10.0  # maximum distance between a plan's start and the vehicle
 
 
 @dataclass(slots=True)
 class Counters:
-    """What the record of the mission counts."""
+    """Counters of the mission's record."""
 
     plans_requested: int = 0
     plans_failed: int = 0
@@ -78,58 +76,58 @@ class Counters:
 
 
 class Pilot:
-    """The state machine. Drive it with the messages, then ask `update` once a control tick.
+    """The mission state machine. Pass it every message, then call `update` once per control tick.
 
     Args:
-        params: limits and patience.
-        goal_enu_m: (3,), m.
+        params: Limits and time-outs.
+        goal_enu_m: Goal (3,), m.
 
     Attributes:
-        flown: the plan that is flown, and how far.
-        mode: what it is doing.
-        counters: for the record.
+        active: Active trajectory and the present point on it.
+        mode: Present mode.
+        counters: Counters of the mission's record.
     """
 
     def __init__(self, params: PilotParams, goal_enu_m: FloatArray) -> None:
         self.params = params
         self.goal_enu_m = goal_enu_m
         self.counters = Counters()
-        self.mode = Mode.WAITING
-        self.flown = FlownPlan(params.v_max_mps, params.brake_mps2)
+        self.mode = PilotMode.WAITING
+        self.active = ActivePlan(params.v_max_mps, params.brake_mps2)
         self._next: Trajectory | None = None
         self._hold: FloatArray | None = None
         self._hold_yaw = 0.0
         self._trajectory_seq = 0
         self._collision_seq = 0
         self._awaiting_plan = False
-        self._asked_s = 0.0  # start of the plan that is awaited
-        self._asked_rate = 1.0  # rate of the clock when it was asked for
-        self._abandoned: set[float] = set()  # starts of plans that are on their way for nothing
-        self._adopted = False  # whether any plan has been adopted yet
+        self._asked_s = 0.0  # start of the requested plan
+        self._asked_rate = 1.0  # rate of the clock at the request
+        self._abandoned: set[float] = set()  # starts of requested plans that are no longer needed
+        self._adopted = False  # True once any plan has been adopted
         self._wanted = True
         self._not_before_s = 0.0
         self._failures = 0
         self._stamp_s = 0.0
         self._look_started_s: float | None = None
-        self._stop_s = math.inf  # when a report that was acted on stops the vehicle
+        self._stop_s = math.inf  # time at which a report stops the vehicle
 
     @np.errstate(over="ignore", invalid="ignore")
     def on_report(self, report: CollisionReport) -> bool:
-        """Take the verdict of the collision check; whether its time to the collision mattered.
+        """Handle a report of the collision check. Return True if its time to collision was used.
 
-        A report whose future_collision_seq is older than the newest known is ignored.
+        A report with a future_collision_seq older than the newest known is ignored.
         """
         if report.future_collision_seq < self._collision_seq:
             self.counters.reports_ignored += 1
             return False
-        if not report.collision or self.flown.trajectory is None:
+        if not report.collision or self.active.trajectory is None:
             return False
         if report.future_collision_seq > self._collision_seq:
             self.counters.collisions_foreseen += 1
         elif self.params.acts_on_report_once:
             return False
         self._collision_seq = report.future_collision_seq
-        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.WAITING):
+        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP, PilotMode.WAITING):
             return False
         self._next = None
         self.want_plan()
@@ -137,55 +135,55 @@ class Pilot:
         return True
 
     def holds(self, trajectory: object) -> bool:
-        """Whether a trajectory is flown, or about to be."""
+        """Return True if this trajectory is active or next."""
         return trajectory is not None and (
-            trajectory is self.flown.trajectory or trajectory is self._next
+            trajectory is self.active.trajectory or trajectory is self._next
         )
 
     def _react(self, report: CollisionReport) -> None:
-        """Go on, slow down or stop: whichever the time to the collision still allows."""
+        """Fly on, slow down or stop, depending on the time to the collision."""
         p = self.params
         left_s = 0.0
         if p.uses_time_to_collision:
             left_s = report.time_to_collision_s - (self._stamp_s - report.stamp_s)
-        brake_s = self.flown.stopping_s() + p.margin_s
+        brake_s = self.active.stopping_s() + p.margin_s
         if p.stops_on_report:
             self._stop_s = self._stamp_s + (left_s - brake_s if left_s > brake_s else 0.0)
             return
-        if not left_s > brake_s:  # a NaN is no time at all
-            mode = Mode.STOPPING
+        if not left_s > brake_s:  # also stops on NaN
+            mode = PilotMode.STOPPING
         elif left_s <= brake_s + p.plan_lead_s + p.late_plan_s:
-            mode = Mode.SLOWING
+            mode = PilotMode.SLOWING
         else:
-            mode = Mode.EVADING
-        severity = (Mode.FLYING, Mode.EVADING, Mode.SLOWING, Mode.STOPPING)
+            mode = PilotMode.EVADING
+        severity = (PilotMode.FLYING, PilotMode.EVADING, PilotMode.SLOWING, PilotMode.STOPPING)
         if severity.index(mode) > severity.index(self.mode):
-            if mode is Mode.STOPPING:
+            if mode is PilotMode.STOPPING:
                 self._brake()
                 self._plan_anew()
-            elif mode is Mode.SLOWING:
+            elif mode is PilotMode.SLOWING:
                 self.counters.slowdowns += 1
             self.mode = mode
 
     def _brake(self) -> None:
         """Stop on the trajectory."""
-        if self.mode is not Mode.STOPPING:
+        if self.mode is not PilotMode.STOPPING:
             self.counters.stops += 1
-        self.mode = Mode.STOPPING
+        self.mode = PilotMode.STOPPING
 
     def _plan_anew(self) -> None:
-        """Want a plan; the one under way would begin where the vehicle will not be."""
+        """Request a plan and abandon the pending one, whose start is no longer valid."""
         self._wanted = True
         if self._awaiting_plan:
             self._awaiting_plan = False
             self._abandoned.add(self._asked_s)
 
     def on_plan(self, result: Trajectory | PlanFailure) -> None:
-        """Take a plan, or the news that there is none.
+        """Handle a plan or a failure to plan.
 
-        A trajectory is ignored when it is out of order, does not know of the newest foreseen
-        collision, begins at another time than asked for, or comes too late for its own start.
-        So is every answer to a request that was given up meanwhile.
+        A trajectory is ignored if it is out of order, does not know of the newest predicted
+        collision, begins at another time than requested, or arrives too late for its own start.
+        An answer to an abandoned request is ignored, too.
         """
         if not self._awaiting_plan or result.stamp_s in self._abandoned:
             self._abandoned.discard(result.stamp_s)
@@ -197,7 +195,7 @@ class Pilot:
             return
         p = self.params
         stale = not self._is_new(result) or result.stamp_s != self._asked_s
-        late = self.flown.rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
+        late = self.active.rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
         if stale or late:
             self.counters.plans_ignored += 1
             self._wanted = True
@@ -212,10 +210,10 @@ class Pilot:
         self._next = result
 
     def _is_new(self, plan: Trajectory) -> bool:
-        """Whether a plan's numbers are those of a new plan that knows of the newest collision.
+        """Return True if a plan's numbers show that it is new and knows of the newest collision.
 
-        A pilot that owns its numbers takes a plan's trajectory_seq over before it looks at the
-        other number, as the released follow_trajectory.cpp does.
+        A pilot that owns its numbers stores a plan's trajectory_seq before it checks the other
+        number, as the released follow_trajectory.cpp does.
         """
         if not self.params.owns_sequence_numbers:
             newer = plan.trajectory_seq > self._trajectory_seq
@@ -224,23 +222,23 @@ class Pilot:
         return newer and plan.future_collision_seq >= self._collision_seq
 
     def expects(self, result: Trajectory | PlanFailure) -> bool:
-        """Whether a result answers a request that still stands."""
+        """Return True if a result answers the pending request."""
         return self._awaiting_plan and result.stamp_s not in self._abandoned
 
     def reject_plan(self) -> None:
-        """The plan that is awaited has come and cannot be trusted: ask for another."""
+        """Reject the requested plan, which a detector has withheld, and request another."""
         self.counters.plans_rejected += 1
         self.plan_lost()
 
     def plan_lost(self) -> None:
-        """The plan that is awaited will not come, as its planner died: ask for another."""
+        """Request another plan after the planner died with the pending request."""
         if self._awaiting_plan:
             self._awaiting_plan = False
             self._wanted = True
 
     def want_plan(self) -> None:
-        """Ask for a new plan from where the vehicle will be, unless one is on its way."""
-        if not self._awaiting_plan and self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
+        """Request a new plan unless one is pending."""
+        if not self._awaiting_plan and self.mode not in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
             self._wanted = True
 
     def _plan_failed(self) -> None:
@@ -248,25 +246,25 @@ class Pilot:
         self._failures += 1
         self._wanted = True
         self._not_before_s = self._stamp_s + self.params.retry_s
-        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
+        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
             return
-        if self.flown.trajectory is not None:
+        if self.active.trajectory is not None:
             self._brake()
         if self._failures >= self.params.attempts_max:
-            self.mode = Mode.GAVE_UP
+            self.mode = PilotMode.GAVE_UP
         elif self._failures == self.params.look_round_after:
             self._look_started_s = self._stamp_s
             self.counters.look_rounds += 1
 
-    @np.errstate(over="ignore", invalid="ignore")  # of corrupted waypoints
+    @np.errstate(over="ignore", invalid="ignore")  # waypoints may be corrupted
     def update(self, stamp_s: float, state: VehicleState) -> Directive:
-        """One control tick: advance along the trajectory and say what to do."""
+        """Run one control tick: advance along the trajectory and return the directive."""
         step_s = stamp_s - self._stamp_s if self._stamp_s else 0.0
         self._stamp_s = stamp_s
         if self._hold is None:
             self._begin(state)
-        if self.mode not in (Mode.ARRIVED, Mode.GAVE_UP):
-            if self.mode is Mode.TURNING:
+        if self.mode not in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
+            if self.mode is PilotMode.TURNING:
                 self._turn(stamp_s)
             self._stop_if_due(stamp_s, state)
             self._advance(step_s, state)
@@ -274,98 +272,98 @@ class Pilot:
             self._adopt_next(stamp_s)
             self._guard(state)
             if self._has_arrived(state):
-                self.mode = Mode.ARRIVED
+                self.mode = PilotMode.ARRIVED
                 self._hold, self._hold_yaw = self.goal_enu_m, state.yaw_rad
-                self.flown.stand()
+                self.active.stand()
         plan = self._plan_request(stamp_s, state)
         assert self._hold is not None
         return Directive(
             mode=self.mode,
-            trajectory=self.flown.trajectory,
-            time_s=self.flown.time_s,
-            rate=self.flown.rate,
-            rate_change_per_s=self.flown.rate_change_per_s,
+            trajectory=self.active.trajectory,
+            time_s=self.active.time_s,
+            rate=self.active.rate,
+            rate_change_per_s=self.active.rate_change_per_s,
             hold_enu_m=self._hold,
             hold_yaw_rad=self._hold_yaw + self._look_round_angle(stamp_s),
             plan=plan,
         )
 
     def _begin(self, state: VehicleState) -> None:
-        """The first tick: hover here, and turn round first where that is asked for."""
+        """Run the first tick: hover here, and turn once round first if the parameters say so."""
         self._hold_here(state)
         if self.params.turns_before_departure:
-            self.mode = Mode.TURNING
+            self.mode = PilotMode.TURNING
             self._look_started_s = self._stamp_s
 
     def _turn(self, stamp_s: float) -> None:
-        """End the turn before departure when it is complete."""
+        """End the turn before departure once it is complete."""
         assert self._look_started_s is not None
         if stamp_s - self._look_started_s >= TURN_S:
             self._look_started_s = None
-            self.mode = Mode.WAITING
+            self.mode = PilotMode.WAITING
 
     def _has_arrived(self, state: VehicleState) -> bool:
         distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
         if not distance_m <= self.params.goal_tolerance_m:
             return False
         return not self.params.arrives_at_rest or (
-            self.flown.trajectory is None and self._at_rest(state)
+            self.active.trajectory is None and self._at_rest(state)
         )
 
     def _at_rest(self, state: VehicleState) -> bool:
         return float(np.linalg.norm(state.velocity_enu_mps)) <= self.params.rest_mps
 
     def _stop_if_due(self, stamp_s: float, state: VehicleState) -> None:
-        """Drop the trajectory when the stop that a report has asked for is due."""
+        """Drop the trajectory if a stop requested by a report is due."""
         if stamp_s < self._stop_s:
             return
         self._stop_s = math.inf
-        if self.flown.trajectory is not None:
+        if self.active.trajectory is not None:
             self.abandon(state)
 
     def _hover(self, state: VehicleState) -> None:
-        """No trajectory any more: hover here, or where the vehicle has braked."""
+        """Drop the trajectory and hover here, or where the vehicle comes to rest."""
         self._hold_here(state)
-        self.flown.stand()
+        self.active.stand()
         self._next = None
-        self.mode = Mode.WAITING if self.params.plans_in_motion else Mode.STOPPING
+        self.mode = PilotMode.WAITING if self.params.plans_in_motion else PilotMode.STOPPING
 
     def _settle(self, state: VehicleState) -> None:
-        """While the vehicle brakes without a trajectory, the place to hover moves with it."""
-        if self.mode is Mode.STOPPING and self.flown.trajectory is None:
+        """Move the hover position with the vehicle while it brakes without a trajectory."""
+        if self.mode is PilotMode.STOPPING and self.active.trajectory is None:
             self._hold_here(state)
             if self._at_rest(state):
-                self.mode = Mode.WAITING
+                self.mode = PilotMode.WAITING
 
     def _adopt_next(self, stamp_s: float) -> None:
-        """Switch to the next trajectory once its start has come."""
+        """Switch to the next trajectory once its start time is reached."""
         if self._next is None or stamp_s < self._next.stamp_s:
             return
         self.counters.replans += self._adopted
         self._adopted = True
-        moving = self.mode not in (Mode.WAITING, Mode.STOPPING)
+        moving = self.mode not in (PilotMode.WAITING, PilotMode.STOPPING)
         late_s = stamp_s - self._next.stamp_s
-        self.flown.begin(
+        self.active.begin(
             self._next,
             time_s=max(0.0, late_s) if moving else 0.0,
-            # It departs at the velocity of its request: its clock goes on as the old one went.
-            rate=min(1.0, self.flown.rate / self._asked_rate) if moving else 1.0,
+            # The plan departs at the velocity of its request, so the clock keeps that rate.
+            rate=min(1.0, self.active.rate / self._asked_rate) if moving else 1.0,
         )
         self._next = None
         self._stop_s = math.inf
-        self.mode = Mode.FLYING
+        self.mode = PilotMode.FLYING
 
     def _advance(self, step_s: float, state: VehicleState) -> None:
-        """Run the trajectory's clock at the rate that the mode asks for; hover where it ends."""
-        if self.flown.trajectory is None:
+        """Run the trajectory's clock at the rate of the mode. Hover at the trajectory's end."""
+        if self.active.trajectory is None:
             return
-        slower = {Mode.STOPPING: 0.0, Mode.SLOWING: self.params.slow_rate}
+        slower = {PilotMode.STOPPING: 0.0, PilotMode.SLOWING: self.params.slow_rate}
         rate = slower.get(self.mode, 1.0)
         if self.params.slows_where_blind and self._flies_blind(state):
             rate = min(rate, self.params.slow_rate)
-        self.flown.advance(step_s, rate)
-        stopped = self.mode is Mode.STOPPING and self.flown.rate <= 0.0
-        if not (stopped or (self.flown.over and self._next is None)):
+        self.active.advance(step_s, rate)
+        stopped = self.mode is PilotMode.STOPPING and self.active.rate <= 0.0
+        if not (stopped or (self.active.over and self._next is None)):
             return
         if self.params.plans_in_motion:
             self._stop_here()
@@ -374,60 +372,65 @@ class Pilot:
             self._hover(state)
 
     def _flies_blind(self, state: VehicleState) -> bool:
-        """Whether the trajectory leads to where the camera does not look."""
-        east, north = self.flown.reference()[4:6]
+        """Return True if the trajectory leaves the camera's field of view."""
+        east, north = self.active.reference()[4:6]
         if not math.hypot(east, north) > self.params.rest_mps:
             return False
         return abs(wrap_angle(math.atan2(north, east) - state.yaw_rad)) > self.params.sight_rad
 
     def _guard(self, state: VehicleState) -> None:
-        """Too far from where the trajectory says it should be: stop and plan from here."""
-        if self.flown.trajectory is None or not self.params.guards_tracking:
+        """Stop and replan from here if the vehicle is too far from the reference."""
+        if self.active.trajectory is None or not self.params.guards_tracking:
             return
-        reference_enu_m = self.flown.reference()[0:3]
+        reference_enu_m = self.active.reference()[0:3]
         error_m = float(np.linalg.norm(state.position_enu_m - reference_enu_m))
         if not error_m <= self.params.tracking_error_max_m:
             self.abandon(state)
 
     def control_lost(self, state: VehicleState) -> None:
-        """Control has started anew, without its queue; its counters, if it owns any, are at 0."""
+        """Handle a restart of control: its queue is empty and its own counters are 0."""
         if self.params.owns_sequence_numbers:
             self._trajectory_seq = self._collision_seq = 0
-        if self.flown.trajectory is not None:
+        if self.active.trajectory is not None:
             self.abandon(state)
 
     def abandon(self, state: VehicleState) -> None:
-        """Give up the trajectory: hover here, and plan anew from here."""
-        if self.mode in (Mode.ARRIVED, Mode.GAVE_UP):
+        """Drop the trajectory, hover here, and request a plan from here."""
+        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
             return
         self._hover(state)
         self._plan_anew()
         self.counters.stops += 1
 
     def _stop_here(self) -> None:
-        """The trajectory is over, or its clock stands: hover there and want a plan."""
-        reference = self.flown.reference()
+        """Hover and request a plan when the trajectory is over or its clock has stopped."""
+        reference = self.active.reference()
         self._hold, self._hold_yaw = reference[0:3].copy(), float(reference[3])
-        self.flown.stand()
+        self.active.stand()
         self.want_plan()
-        self.mode = Mode.WAITING
+        self.mode = PilotMode.WAITING
 
     def _hold_here(self, state: VehicleState) -> None:
         self._hold = state.position_enu_m.copy()
         self._hold_yaw = state.yaw_rad
 
     def _plan_request(self, stamp_s: float, state: VehicleState) -> PlanRequest | None:
-        """A request where one is wanted, none is under way, and the pause is over."""
-        idle = self.mode in (Mode.ARRIVED, Mode.GAVE_UP, Mode.STOPPING, Mode.TURNING)
+        """Return a request if one is due, none is pending, and the pause is over."""
+        idle = self.mode in (
+            PilotMode.ARRIVED,
+            PilotMode.GAVE_UP,
+            PilotMode.STOPPING,
+            PilotMode.TURNING,
+        )
         if not self.params.plans_in_motion:
-            idle = idle or self.flown.trajectory is not None or not self._at_rest(state)
+            idle = idle or self.active.trajectory is not None or not self._at_rest(state)
         if idle or not self._wanted or self._awaiting_plan or stamp_s < self._not_before_s:
             return None
         self._wanted = False
         self._awaiting_plan = True
         self.counters.plans_requested += 1
         start = self._start_of_plan(stamp_s, state)
-        self._asked_s, self._asked_rate = start[0], self.flown.rate or 1.0
+        self._asked_s, self._asked_rate = start[0], self.active.rate or 1.0
         return PlanRequest(
             stamp_s=start[0],
             position_enu_m=start[1],
@@ -442,30 +445,30 @@ class Pilot:
     def _start_of_plan(
         self, stamp_s: float, state: VehicleState
     ) -> tuple[float, FloatArray, FloatArray, float]:
-        """Stamp, position, velocity and yaw at which the next trajectory takes over."""
-        if self.flown.trajectory is None:
+        """Return stamp, position, velocity and yaw at the start of the next trajectory."""
+        if self.active.trajectory is None:
             assert self._hold is not None
             start = self._hold if self._near(self._hold, state) else state.position_enu_m
             return stamp_s, start.copy(), np.zeros(3), state.yaw_rad
         lead_s = self.params.plan_lead_s
-        waypoint = self.flown.reference(lead_s)
+        waypoint = self.active.reference(lead_s)
         if not self._near(waypoint[0:3], state):
             return stamp_s + lead_s, state.position_enu_m.copy(), np.zeros(3), state.yaw_rad
         return (
             stamp_s + lead_s,
             waypoint[0:3].copy(),
-            self.flown.rate * waypoint[4:7],
+            self.active.rate * waypoint[4:7],
             float(waypoint[3]),
         )
 
     def _near(self, place_enu_m: FloatArray, state: VehicleState) -> bool:
-        """Whether a place (3,) can be where a plan begins; a corrupted waypoint may be anywhere."""
+        """Return True if a position (3,), possibly corrupted, is near enough to begin a plan."""
         distance_m = float(np.linalg.norm(place_enu_m - state.position_enu_m))
         return distance_m <= self.params.start_error_max_m
 
     def _look_round_angle(self, stamp_s: float) -> float:
-        """Angle of the look round that failed plans have started, rad: one turn in 6 s."""
-        if self._look_started_s is None or self.mode not in (Mode.WAITING, Mode.TURNING):
+        """Return the angle of the turn after failed plans, rad: one full turn in 6 s."""
+        if self._look_started_s is None or self.mode not in (PilotMode.WAITING, PilotMode.TURNING):
             return 0.0
         turn_s = stamp_s - self._look_started_s
         return min(2.0 * math.pi, turn_s * 2.0 * math.pi / TURN_S)

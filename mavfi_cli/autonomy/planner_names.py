@@ -1,4 +1,4 @@
-"""What our planners are called; without OMPL, so that a configuration is cheap to make."""
+"""Names of our planners. Does not import OMPL, so that a configuration is cheap to make."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ OURS = ("rrtstar", "rrt", "rrtconnect")
 
 
 def canonical(name: str) -> str:
-    """The one name of a planner under which it is recorded and grouped.
+    """Return the canonical name of a planner, under which records and groups list it.
 
-    Case, hyphens, underscores and the star of RRT* do not matter for our own; any other name is
-    returned as it is.
+    For our own planners, case, hyphens, underscores and the star of RRT* do not matter. Any other
+    name is returned unchanged.
     """
     plain = name.lower().replace("*", "star").replace("-", "").replace("_", "")
     return plain if plain in OURS else name

@@ -1,4 +1,4 @@
-"""The planning stage: search, shortcut, smooth; from a map to a trajectory or an honest no."""
+"""The planning stage: search a path, shorten it, smooth it into a trajectory."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mavfi_cli.core.types import FloatArray, Trajectory
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageParams:
-    """What the planning stage keeps to."""
+    """Parameters of the planning stage."""
 
     clearance: PlanningParams = field(default_factory=PlanningParams)
     smoothing: SmoothingParams = field(default_factory=SmoothingParams)
-    shortcut_spacing_m: float = 1.0  # the second shortcut may leave the path between vertices
+    shortcut_spacing_m: float = 1.0  # vertex spacing of the path before the second shortcut
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,17 +27,17 @@ class StageInputs:
     """One planning request with the newest map."""
 
     snapshot: MapSnapshot
-    position_enu_m: FloatArray  # (3,) where the trajectory begins
-    departure: Departure  # when, at which velocity and yaw
+    position_enu_m: FloatArray  # (3,) start of the trajectory
+    departure: Departure  # stamp, velocity and yaw at the start
     goal_enu_m: FloatArray  # (3,)
-    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax of the flight
+    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax of the allowed volume
     sequence: Sequence
     seed: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageOutput:
-    """A trajectory, or None and the reason why there is none."""
+    """A trajectory, or None and the reason for the failure."""
 
     trajectory: Trajectory | None
     reason: str = ""
@@ -47,8 +47,8 @@ class StageOutput:
 def plan(planner: Planner, inputs: StageInputs, params: StageParams) -> StageOutput:
     """Plan from the departure to the goal.
 
-    A start in motion that cannot stop in free space gives no trajectory: the vehicle must brake
-    first.
+    If the vehicle departs in motion and cannot stop in free space, there is no trajectory. It must
+    brake first.
     """
     problem = pose_problem(
         inputs.snapshot,

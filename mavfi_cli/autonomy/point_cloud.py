@@ -1,7 +1,7 @@
-"""Point cloud generation: a depth image back-projected into the world.
+"""Point cloud generation: back-projects a depth image into the world.
 
-Pinhole model with square pixels and the principal point in the middle of the image, as in
-ROS's depth_image_proc: a pixel (row, column) of depth d along the optical axis lies at
+The camera is a pinhole with square pixels and the principal point in the middle of the image, as in
+ROS's depth_image_proc. A pixel (row, column) of depth d along the optical axis lies at
 (d, -(column + 1/2 - columns/2) d / f, -(row + 1/2 - rows/2) d / f) in camera FLU, with
 f = columns / (2 tan(hfov / 2)).
 """
@@ -20,25 +20,25 @@ from mavfi_cli.core.types import DepthFrame, FloatArray, PointCloud
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointCloudParams:
-    """How much of a depth image the map gets to see.
+    """Range and density of the rays that enter the map.
 
-    A ray that ends within `max_range_m` (reference: 7 m) is an observation of an obstacle and is
-    always kept. A longer one, or one without return, only clears space, at ten times the cost: of
-    these, one pixel in `free_stride` x `free_stride` is kept, cut off just beyond the range. With
-    64 columns over 90 degrees, neighbouring rays are 0.11 to 0.22 m apart at 7 m, so a stride of
-    4 clears every voxel of 0.2 m up to about 2 m in one frame, and farther ones while the vehicle
-    moves. As unknown space is free, clearing only matters where the map has been wrong.
+    A ray that ends within `max_range_m` (MAVBench: 7 m) observes an obstacle and is always kept. A
+    longer ray, or one without return, only clears space, at ten times the cost. Of these, one
+    pixel in `free_stride` x `free_stride` is kept, cut off just beyond the range. Neighbouring
+    rays of 64 columns over 90 degrees are 0.11 to 0.22 m apart at 7 m. A stride of 4 therefore
+    clears every voxel of 0.2 m up to about 2 m in one frame, and farther ones while the vehicle
+    moves. Unknown space is free, so clearing matters only where the map is wrong.
     """
 
     max_range_m: float = 7.0
     free_stride: int = 4
-    free_margin_m: float = 0.5  # how far beyond the range the clearing rays end
+    free_margin_m: float = 0.5  # clearing rays end this far beyond the range
 
 
 def generate(frame: DepthFrame, params: PointCloudParams) -> PointCloud:
-    """The world points of a depth image.
+    """Compute the world points of a depth image.
 
-    Pixels that are NaN, negative, zero or -inf are dropped; +inf (nothing in range) and readings
+    Pixels that are NaN, negative, zero or -inf are dropped. Pixels of +inf (nothing in range) and
     beyond the range become clearing rays that end outside `max_range_m`.
     """
     rows, columns = frame.depth_m.shape
@@ -75,7 +75,7 @@ def back_project(
     """Write the world points of `depth_m` (rows, columns) into `points` (rows * columns, 3).
 
     Returns:
-        How many rows of `points` were written.
+        Number of rows of `points` that were written.
     """
     rows, columns = depth_m.shape
     offset = free_stride // 2

@@ -1,4 +1,4 @@
-"""Greedy shortcutting: leave out every vertex that is not needed."""
+"""Greedy shortcutting: removes path vertices that are not needed."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mavfi_cli.core.types import FloatArray
 
 
 def shortcut(path_enu_m: FloatArray, grid: ObstacleGrid) -> FloatArray:
-    """The path (n, 3) with each vertex joined to the farthest later one in free sight.
+    """Connect each vertex of a path (n, 3) to the farthest later vertex in line of sight.
 
-    Starts and ends where it did; never longer than it was; free if it was free. The greedy rule
-    is the reference's (facts, section 4.5).
+    The result has the same start and end and is never longer. It is free if the path was free. The
+    greedy rule is that of the released planner (MAVBench/MAV_apps, branch mavfi).
     """
     kept = [0]
     last = len(path_enu_m) - 1
@@ -28,7 +28,7 @@ def shortcut(path_enu_m: FloatArray, grid: ObstacleGrid) -> FloatArray:
 
 
 def subdivided(path_enu_m: FloatArray, spacing_m: float) -> FloatArray:
-    """The same path with vertices at most `spacing_m` apart, (m, 3)."""
+    """Subdivide a path into vertices (m, 3) at most `spacing_m` apart."""
     pieces = [path_enu_m[:1]]
     for start, end in itertools.pairwise(path_enu_m):
         count = max(1, int(np.ceil(np.linalg.norm(end - start) / spacing_m)))

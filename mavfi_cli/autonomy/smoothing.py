@@ -1,18 +1,18 @@
-"""Smoothing: a path becomes a trajectory that keeps its limits, sampled every 0.5 s.
+"""Smoothing: turns a path into a trajectory within the limits, sampled every 0.5 s.
 
-The path is flown with even accelerations and parabolic corners (see `corners`), then sampled at
-equal times; the samples are the control points of a uniform quadratic B-spline, whose knots are
-the waypoints. Followed as `trajectory` says (p + v t + a t^2 / 2), the waypoints *are* that spline,
-so between them, too:
+The motion along the path has constant accelerations and parabolic corners (see `corners`). Its
+samples at equal times are the control points of a uniform quadratic B-spline, and the knots of the
+spline are the waypoints. Interpolated as in `trajectory` (p + v t + a t^2 / 2), the waypoints are
+exactly that spline. Between the waypoints, too:
 
 - speed and acceleration never exceed those of the motion that was sampled: each is an average
   of it;
 - position and velocity are continuous, and each piece lies in the triangle of three control
   points, within a T^2 / 8 (9 cm) of the motion;
-- it starts with exactly the given position and velocity and ends at rest on the last point.
+- it starts at exactly the given position and velocity and ends at rest on the last point.
 
-Where a piece leaves the free corridor, the corners that it rounds are slowed down, at last to a
-stop on the corner itself, which is on the path that was found free.
+If a piece is not free, the corners that it rounds are slowed down, in the limit to a stop on the
+corner itself, which lies on the free path.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.autonomy import corners
-from mavfi_cli.autonomy.corners import Limits, Motion
+from mavfi_cli.autonomy.corners import Motion, MotionLimits
 from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.heading import headings, turn_time_s
 from mavfi_cli.core.types import FloatArray, Trajectory
 
-NEGLIGIBLE_MPS = 0.1  # slower than this counts as at rest
-RUN_OUT_RESERVE = 1.02  # stopping distance, with a little to spare for rounding
+NEGLIGIBLE_MPS = 0.1  # lower speeds count as rest
+RUN_OUT_RESERVE = 1.02  # factor on the stopping distance, for rounding errors
 SLOWEST_SQUARED = 0.1  # a corner slower than this (squared, m^2/s^2) becomes a stop
 
 
@@ -38,9 +38,9 @@ SLOWEST_SQUARED = 0.1  # a corner slower than this (squared, m^2/s^2) becomes a 
 class SmoothingParams:
     """Limits and sampling of trajectories.
 
-    v_max, a_max, the yaw rate and the 0.5 s of the samples are the reference's (facts, sections
-    4.1 and 4.6). The shares leave the tracker room to catch up. The vertical limits are those
-    that autopilots commonly have.
+    v_max, a_max, the yaw rate and the 0.5 s of the samples are those of the released code
+    (MAVBench/MAV_apps, branch mavfi). The shares leave the tracker room to catch up. The vertical
+    limits are those of common autopilots.
     """
 
     v_max_mps: float = 3.0
@@ -51,14 +51,14 @@ class SmoothingParams:
     descent_max_mps: float = 1.5
     yaw_rate_max_radps: float = math.pi / 2.0
     sample_period_s: float = 0.5
-    corner_cut_m: float = 0.5  # how far a corner may be cut where there is room
-    turn_first_rad: float = math.pi / 4.0  # a larger turn is made at rest, before flying
+    corner_cut_m: float = 0.5  # maximum distance by which a corner is cut
+    turn_first_rad: float = math.pi / 4.0  # a larger turn is made at rest before departure
     passes_max: int = 40
 
     @property
-    def limits(self) -> Limits:
-        """What the planned motion keeps to."""
-        return Limits(
+    def limits(self) -> MotionLimits:
+        """Return the limits of the planned motion."""
+        return MotionLimits(
             speed_mps=self.speed_share * self.v_max_mps,
             climb_mps=self.climb_max_mps,
             descent_mps=self.descent_max_mps,
@@ -68,7 +68,7 @@ class SmoothingParams:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Departure:
-    """The motion that a trajectory takes over from."""
+    """State of motion at the start of a trajectory."""
 
     stamp_s: float
     velocity_enu_mps: FloatArray  # (3,)
@@ -77,7 +77,7 @@ class Departure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sequence:
-    """The numbers that a trajectory carries."""
+    """Sequence numbers of a trajectory."""
 
     trajectory_seq: int = 0
     future_collision_seq: int = 0
@@ -85,7 +85,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smoothed:
-    """A trajectory, and whether all of it lies in free space."""
+    """A trajectory, and a flag that is True if all of it lies in free space."""
 
     trajectory: Trajectory
     free: bool
@@ -98,11 +98,11 @@ def smooth(
     sequence: Sequence,
     params: SmoothingParams,
 ) -> Smoothed:
-    """The trajectory along a free path (n, 3) from its first to its last point.
+    """Compute the trajectory along a free path (n, 3) from its first to its last point.
 
-    It begins with the departure's velocity (cut to v_max). In motion it first runs straight on
-    for the stopping distance, from where it turns to the path as fast as the corner allows; if
-    that stretch is not free, `free` is False, and nothing can be done about it in this place.
+    It begins with the departure's velocity, limited to v_max. A trajectory that begins in motion
+    first runs straight on for the stopping distance, then turns to the path as fast as the corner
+    allows. If the straight part is not free, `free` is False.
     """
     velocity = _cut(departure.velocity_enu_mps, params.v_max_mps)
     path = np.asarray(path_enu_m, np.float64)
@@ -122,9 +122,9 @@ def smooth(
 def brake(
     position_enu_m: FloatArray, departure: Departure, sequence: Sequence, params: SmoothingParams
 ) -> Trajectory:
-    """Straight on to a stop, as short as the planned acceleration allows, then hold.
+    """Compute the shortest straight stop that the planned acceleration allows, then hold.
 
-    The yaw stays as it is.
+    The yaw stays constant.
     """
     velocity = _cut(departure.velocity_enu_mps, params.v_max_mps)
     vertices = _run_out(position_enu_m, velocity, params)
@@ -136,7 +136,7 @@ def brake(
 
 
 class _Flight:
-    """A polyline to be flown from a start in motion, as often as its corner speeds change."""
+    """A polyline from a start in motion, flown again for each choice of corner speeds."""
 
     def __init__(
         self,
@@ -153,14 +153,14 @@ class _Flight:
         self._line = corners.polyline(vertices, params.limits)
 
     def corner_caps(self) -> FloatArray:
-        """Squared speeds (n,) at which each corner is cut by no more than `corner_cut_m`."""
+        """Return the squared speeds (n,) that cut each corner by `corner_cut_m` at most."""
         room = 2.0 * self._params.limits.acceleration_mps2 * self._params.corner_cut_m
         sines = self._line.half_sines
         caps: FloatArray = room / np.maximum(sines, 1e-6) ** 2
         return caps
 
     def fly(self, caps: FloatArray) -> tuple[FloatArray, Motion, FloatArray]:
-        """Squared corner speeds (n,), motion, and control points (m, 3) under the caps (n,)."""
+        """Return squared corner speeds (n,), motion and control points (m, 3) for the caps (n,)."""
         acceleration = self._params.limits.acceleration_mps2
         speed = float(np.linalg.norm(self._velocity))
         q = corners.squared_corner_speeds(self._line, speed, caps, acceleration)
@@ -172,7 +172,7 @@ class _Flight:
         return q, moving, np.vstack([before, ahead])
 
     def _dwells(self, q: FloatArray) -> FloatArray:
-        """How long to wait at each vertex (n,): at corners passed at rest, and to turn there."""
+        """Return the waiting time at each vertex (n,), which includes the time to turn at rest."""
         line, params = self._line, self._params
         dwells = np.zeros(len(q))
         yaw = self._yaw_rad
@@ -181,7 +181,7 @@ class _Flight:
                 turning = turn_time_s(
                     yaw, direction, params.turn_first_rad, params.yaw_rate_max_radps
                 )
-                # Two control points on a corner keep the spline on its legs.
+                # Two control points on a corner keep the spline on the two segments.
                 settling = 2.0 * params.sample_period_s if i > 0 else 0.0
                 dwells[i] = max(turning, settling)
             if math.hypot(direction[0], direction[1]) >= 0.1:
@@ -190,7 +190,7 @@ class _Flight:
 
 
 def _cut(velocity: FloatArray, limit: float) -> FloatArray:
-    """The velocity (3,), no faster than the limit; zero where it is not finite or negligible."""
+    """Limit a velocity (3,). Return zero if it is negligible or not finite."""
     velocity = np.asarray(velocity, np.float64)
     if not np.isfinite(velocity).all():
         return np.zeros(3)
@@ -204,7 +204,7 @@ def _cut(velocity: FloatArray, limit: float) -> FloatArray:
 
 
 def _run_out(position: FloatArray, velocity: FloatArray, params: SmoothingParams) -> FloatArray:
-    """Vertices (1 or 2, 3) of going straight on for half a sample, then braking to a stop."""
+    """Return vertices (1 or 2, 3) that run straight on for half a sample, then brake to a stop."""
     speed = float(np.linalg.norm(velocity))
     if speed == 0.0:
         return np.array([position])
@@ -216,10 +216,10 @@ def _run_out(position: FloatArray, velocity: FloatArray, params: SmoothingParams
 def _with_run_out(
     path: FloatArray, velocity: FloatArray, grid: ObstacleGrid | None, params: SmoothingParams
 ) -> tuple[FloatArray, bool]:
-    """The vertices to fly, and whether the way on from a start in motion is free.
+    """Return the vertices to fly, and True if the straight stretch from the start is free.
 
-    From where the vehicle could stop it goes to the farthest path vertex in sight, or, where it
-    sees none, back to the start of the path.
+    From the stopping point the path leads to the farthest path vertex in line of sight, or back to
+    the start of the path if none is in sight.
     """
     vertices = _run_out(path[0], velocity, params)
     if len(vertices) == 1:
@@ -237,12 +237,12 @@ def _with_run_out(
 def _blocked_corners(
     spline: FloatArray, moving: Motion, grid: ObstacleGrid | None, params: SmoothingParams
 ) -> list[int]:
-    """Vertices whose rounding belongs to spline pieces that are not free."""
+    """Return the vertices that are rounded by spline pieces that are not free."""
     period = params.sample_period_s
     blamed: set[int] = set()
     ends_s = np.append(moving.starts_s[1:], moving.duration_s)
     for piece in np.flatnonzero(~_piecewise_free(spline, grid)):
-        # Piece k is made of the control points at (k - 1) T, k T and (k + 1) T.
+        # Piece k depends on the control points at (k - 1) T, k T and (k + 1) T.
         begin_s, end_s = (piece - 1) * period, (piece + 1) * period
         during = (moving.starts_s <= end_s) & (ends_s >= begin_s) & (moving.corners >= 0)
         blamed.update(moving.corners[during].astype(int).tolist())
@@ -250,7 +250,7 @@ def _blocked_corners(
 
 
 def _piecewise_free(spline: FloatArray, grid: ObstacleGrid | None) -> NDArray[np.bool_]:
-    """Which of the spline's pieces (m - 2,) are free, each tried along four chords."""
+    """Return a flag for each spline piece (m - 2,): True if its four chords are free."""
     pieces = len(spline) - 2
     if grid is None:
         return np.ones(pieces, np.bool_)
@@ -265,7 +265,7 @@ def _piecewise_free(spline: FloatArray, grid: ObstacleGrid | None) -> NDArray[np
 def _waypoints(
     spline: FloatArray, departure: Departure, sequence: Sequence, params: SmoothingParams
 ) -> Trajectory:
-    """The knots of the spline with control points (m, 3) as a trajectory of m - 1 waypoints."""
+    """Convert control points (m, 3) to the trajectory of the spline's m - 1 knots."""
     period = params.sample_period_s
     velocities = np.diff(spline, axis=0) / period
     accelerations = np.zeros_like(velocities)

@@ -1,22 +1,22 @@
-"""Path tracking: a PID on the position error with velocity and acceleration feed-forward.
+"""Path tracking: PID control of the position error, with velocity and acceleration feed-forward.
 
     v = v_ref + Kp e + Ki integral(e) + Kd (v_ref - v_now),   |v| <= v_max
     a = a_ref,                                                |a| <= a_max
 
-The reference is the trajectory's (see `trajectory`), run at `rate`: slowed down by a rate r that
-changes by dr/dt, it has the velocity r v and the acceleration r^2 a + dr/dt v.
+The reference comes from the trajectory (see `trajectory`), run at `rate`. At a rate r that changes
+by dr/dt, it has the velocity r v and the acceleration r^2 a + dr/dt v.
 
-A command that the limit clips to a share of its speed has that share as its `pace`, where the
-follower's clock is stretched: then the trajectory's clock runs that much slower while the command
-is in force, so that a waypoint is flown until its distance is flown (the released common.cpp).
-There a waypoint is flown in slices of 10 ms, and a stretched slice is slept through. The release's
-C++ library (ROS Kinetic, GCC 5) hands a slice of 2^63 s or more to nanosleep as a negative number
-of seconds, which nanosleep refuses: such a slice, and with it the waypoint, is over at once.
+With `stretches_clock`, a command that the speed limit clips has the ratio of clipped to demanded
+speed as its `pace`. The trajectory's clock runs slower by this factor while the command holds, so
+that a waypoint lasts until its distance is flown, as in the released common.cpp. That code flies a
+waypoint in slices of 10 ms and sleeps through a stretched slice. Its C++ library (ROS Kinetic, GCC
+5) passes a slice of 2^63 s or more to nanosleep as a negative number of seconds. nanosleep rejects
+it, so the slice and the waypoint end at once.
 
-A corrupted reference: a term that is not finite is left out (the position error, the velocity or
-the acceleration of that axis counts as zero, a yaw as the last one). As position and velocity
-between waypoints depend on acceleration, a NaN there takes the whole axis out. Anything finite is
-obeyed as far as the limits let it. So the output is always finite and within its limits.
+A term of a corrupted reference that is not finite is left out: the position error, the velocity or
+the acceleration of that axis counts as zero, and the last yaw is kept. Position and velocity
+between waypoints depend on the acceleration, so a NaN there disables the whole axis. Finite values
+are followed within the limits. The output is always finite and within its limits.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from mavfi_cli.autonomy.trajectory import angle_between, reference
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import Command, FloatArray, Trajectory
 
-SLICE_S = 0.01  # of a waypoint, in the released common.cpp
-ENDLESS_S = 2.0**63  # a slice that is stretched so far does not fit into a count of seconds
+SLICE_S = 0.01  # time slice of a waypoint in the released common.cpp
+ENDLESS_S = 2.0**63  # a slice of this length overflows a signed 64-bit number of seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingParams:
-    """Gains and limits. v_max, a_max and the yaw rate are the reference's (facts, section 4.1)."""
+    """Gains and limits. v_max, a_max and the yaw rate are those of the released code."""
 
     kp_per_s: float = 0.8
     kp_climb_per_s: float = 0.8
     ki_per_s2: float = 0.05
     kd: float = 0.1
-    integral_max_mps: float = 0.5  # limit of the integral term, each axis
+    integral_max_mps: float = 0.5  # limit of the integral term for each axis
     v_max_mps: float = 3.0
     a_max_mps2: float = 5.0
     yaw_rate_max_radps: float = math.pi / 2.0
-    step_max_s: float = 0.1  # longer pauses between calls count as this long
+    step_max_s: float = 0.1  # upper limit of the time step
     stretches_clock: bool = False
     skips_endless_slices: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingState:
-    """What the controller remembers: integral term, last commanded yaw, last stamp."""
+    """State of the controller: integral term, last commanded yaw, last stamp."""
 
     integral_mps: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,)
     yaw_rad: float
@@ -62,7 +62,7 @@ class TrackingState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingInputs:
-    """One tick's worth: where the vehicle is, and what to follow."""
+    """Inputs of one tick: the vehicle's state and the reference to follow."""
 
     stamp_s: float
     position_enu_m: FloatArray  # (3,)
@@ -71,14 +71,14 @@ class TrackingInputs:
     time_s: float = 0.0  # point on the trajectory, from its first waypoint
     rate: float = 1.0  # trajectory seconds per second
     rate_change_per_s: float = 0.0
-    hold_enu_m: FloatArray  # (3,) where there is no trajectory
+    hold_enu_m: FloatArray  # (3,) position to hold without a trajectory
     hold_yaw_rad: float
 
 
 def step(
     state: TrackingState, inputs: TrackingInputs, params: TrackingParams
 ) -> tuple[TrackingState, Command]:
-    """One control tick: the command, and the state for the next."""
+    """Run one control tick. Return the command and the state for the next tick."""
     target = np.zeros(10)
     if inputs.trajectory is None:
         target[0:3] = inputs.hold_enu_m
@@ -86,7 +86,7 @@ def step(
     else:
         trajectory = inputs.trajectory
         reference(trajectory.waypoints, trajectory.durations_s, inputs.time_s, target)
-    if params.kp_climb_per_s != params.kp_per_s:  # one gain for all axes, so the error is scaled
+    if params.kp_climb_per_s != params.kp_per_s:  # scale the error, as `track` has one gain
         height_m = inputs.position_enu_m[2]
         share = params.kp_climb_per_s / params.kp_per_s
         target[2] = height_m + share * (target[2] - height_m)
@@ -145,7 +145,7 @@ def track(
     step_max_s: float,
     out: FloatArray,
 ) -> None:
-    """The controller on plain numbers; writes velocity, acceleration, integral, yaw into `out`."""
+    """Run the controller; write velocity, acceleration, integral and yaw into `out`."""
     step_s = elapsed_s if elapsed_s > 0.0 else 0.0
     step_s = min(step_s, step_max_s)
     for axis in range(3):
@@ -159,7 +159,7 @@ def track(
         grown = finite_or(integral[axis] + ki * error * step_s, 0.0)
         out[6 + axis] = min(max(grown, -integral_max), integral_max)
     if limit_norm(out, 0, v_max):
-        # Anti-windup: while the output is at its limit, the integral may only shrink.
+        # Anti-windup: the integral may only shrink while the output is at its limit.
         for axis in range(3):
             if abs(out[6 + axis]) > abs(integral[axis]):
                 out[6 + axis] = integral[axis]
@@ -188,7 +188,7 @@ def demanded_mps(
     yaw_rate_max: float,
     step_max_s: float,
 ) -> float:
-    """Speed that the controller would command without its speed limit, m/s; inf at an overflow."""
+    """Return the commanded speed before the speed limit, m/s; inf on overflow."""
     out = np.empty(10)
     track(
         target, rate, rate_change_per_s, position, velocity, integral, last_yaw, elapsed_s,
@@ -203,13 +203,13 @@ def demanded_mps(
 
 @compiled
 def finite_or(value: float, fallback: float) -> float:
-    """The value, or the fallback where it is NaN or infinite."""
+    """Return the value, or the fallback if the value is NaN or infinite."""
     return value if math.isfinite(value) else fallback
 
 
 @compiled
 def limit_norm(vectors: FloatArray, start: int, limit: float) -> bool:
-    """Scale the three components from `start` to at most `limit` in norm; True where it did.
+    """Limit the norm of the three components from `start`. Return True if they were scaled.
 
     Safe for components whose squares overflow.
     """

@@ -1,12 +1,12 @@
-"""What a sampled trajectory means between its waypoints, in one place for all its consumers.
+"""Interpolation of a sampled trajectory between its waypoints.
 
-Waypoint i is followed for durations_s[i]; t seconds into it the reference is
+Waypoint i holds for durations_s[i]. The reference t seconds after its start is
 
     p = p_i + v_i t + a_i t^2 / 2,   v = v_i + a_i t,   a = a_i,
 
-so acceleration is part of the motion, not an annotation. Yaw turns at an even rate towards the
-next waypoint's, the short way round. After the end the last waypoint's final point is held. A
-duration that is NaN or negative counts as zero; an endless one is followed for ever.
+so the acceleration is part of the motion. Yaw turns at a constant rate towards the next waypoint's
+yaw, the shorter way round. After the end the reference stays at the last waypoint's final point. A
+duration that is NaN or negative counts as zero. An infinite duration never ends.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ TWO_PI = 2.0 * math.pi
 
 
 def reference_waypoint(trajectory: Trajectory, time_s: float) -> FloatArray:
-    """The reference (10,), in the order of WAYPOINT_FIELDS, `time_s` after the first waypoint.
+    """Return the reference (10,), in the order of WAYPOINT_FIELDS, `time_s` after the start.
 
-    Clamped to the trajectory: before it the first waypoint holds, after it the last point, at
-    rest. Corrupted waypoints pass through as they are.
+    Before the start it is the first waypoint, after the end the last point at rest. Corrupted
+    waypoints are used unchanged.
     """
     out = np.empty(10)
     reference(trajectory.waypoints, trajectory.durations_s, time_s, out)
@@ -34,22 +34,22 @@ def reference_waypoint(trajectory: Trajectory, time_s: float) -> FloatArray:
 
 
 def waypoint_index(trajectory: Trajectory, time_s: float) -> int:
-    """Index of the waypoint that is followed at that time; 0 where the trajectory has none."""
+    """Return the index of the waypoint at that time; 0 if the trajectory has none."""
     return max(0, int(locate(trajectory.durations_s, time_s)[0]))
 
 
 def end_of_waypoint(trajectory: Trajectory, index: int) -> float:
-    """When a waypoint is over, s after the first one begins."""
+    """Return the end of a waypoint, s after the start of the first one."""
     durations_s = trajectory.durations_s[: index + 1]
     return float(durations_s[durations_s > 0.0].sum())
 
 
 def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
-    """The trajectory with one waypoint dropped and its time filled from the next.
+    """Drop one waypoint and fill its time from the next one.
 
-    The next waypoint's motion is run backwards over the dropped duration, so the trajectory
-    keeps its timing and joins without a jump. The last waypoint is replaced by rest at the end
-    of the one before it; the only one is left as it is.
+    The next waypoint's motion is extended backwards over the dropped duration, so the trajectory
+    keeps its timing and stays continuous there. The last waypoint is replaced by rest at the end of
+    the one before it. A single waypoint stays unchanged.
     """
     waypoints = trajectory.waypoints.copy()
     last = len(waypoints) - 1
@@ -69,7 +69,7 @@ def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
 
 @compiled
 def locate(durations_s: FloatArray, time_s: float) -> tuple[int, float]:
-    """Waypoint that is followed at `time_s`, and the time spent in it; (-1, 0) where none is.
+    """Return the waypoint at `time_s` and the time since its start; (-1, 0) if there is none.
 
     A time that is NaN counts as zero.
     """
@@ -91,7 +91,7 @@ def locate(durations_s: FloatArray, time_s: float) -> tuple[int, float]:
 def reference(
     waypoints: FloatArray, durations_s: FloatArray, time_s: float, out: FloatArray
 ) -> None:
-    """Write the reference at `time_s` into `out` (10,); all NaN where there is no waypoint."""
+    """Write the reference at `time_s` into `out` (10,), or NaN if there is no waypoint."""
     index, t = locate(durations_s, time_s)
     if index < 0 or index >= waypoints.shape[0]:
         out[:] = math.nan
@@ -105,13 +105,13 @@ def reference(
     duration = durations_s[index]
     if index + 1 < waypoints.shape[0] and duration > 0.0:
         yaw += angle_between(yaw, waypoints[index + 1, 3]) * min(1.0, t / duration)
-    elif t >= duration:  # the end: rest
+    elif t >= duration:  # at rest after the end
         out[4:10] = 0.0
     out[3] = yaw
 
 
 @compiled
 def angle_between(start_rad: float, end_rad: float) -> float:
-    """The turn from start to end the short way round, in (-pi, pi]; NaN where one is not finite."""
+    """Return the shorter turn from start to end in (-pi, pi]; NaN if an angle is not finite."""
     turn = (end_rad - start_rad) % TWO_PI
     return turn - TWO_PI if turn > math.pi else turn

@@ -1,4 +1,4 @@
-"""Running every kernel once on a toy scene, so that each is loaded before the first tick."""
+"""Run every kernel once on a toy scene, so that each is loaded before the first tick."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BOUNDS = np.array([-5.0, -10.0, 0.0, 15.0, 10.0, 10.0])
 
 
 def run_every_kernel() -> None:
-    """See a wall, map it, plan round it, check the plan, track it."""
+    """Observe a wall, map it, plan round it, check the plan and track it."""
     snapshot = _see_a_wall()
     start, goal = np.array([0.0, 0.0, 5.0]), np.array([9.0, 0.0, 5.0])
     trajectory: Trajectory | None = None

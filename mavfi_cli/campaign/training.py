@@ -17,7 +17,7 @@ from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.detect import model as model_file
-from mavfi_cli.detect.dataset import Dataset, Flight
+from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.fit import KINDS, check, fit
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import columns_of, flight_of
@@ -99,7 +99,7 @@ def fly_training(
         missions, folder / FLIGHTS_FOLDER, replace(options, keep=Keep.ALL), spectator
     )
     preprocess = PreprocessParams()
-    flights: list[Flight] = []
+    flights: list[FlightSamples] = []
     with ledger:
         for entry in ledger.results():
             config = missions[entry.number].config

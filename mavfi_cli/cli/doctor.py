@@ -20,7 +20,7 @@ def doctor(as_json: bool) -> None:
 
     Exits with 1 where flying would not work; what is only limited does not count.
     """
-    from mavfi_cli.mission.machine import Verdict, check_machine
+    from mavfi_cli.mission.machine import CheckResult, check_machine
 
     checks = []
     for check in check_machine():
@@ -35,5 +35,5 @@ def doctor(as_json: bool) -> None:
                 click.echo(f"{'':<{_INDENT}}-> {check.remedy}")
     if as_json:
         click.echo(json.dumps([check.to_dict() for check in checks], indent=2))
-    if any(check.verdict is Verdict.FAILED for check in checks):
+    if any(check.verdict is CheckResult.FAILED for check in checks):
         raise click.exceptions.Exit(1)

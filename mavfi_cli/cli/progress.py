@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mavfi_cli.mission.progress import Progress, Watcher
+from mavfi_cli.mission.progress import FlightProgress, Watcher
 from mavfi_cli.mission.record.events import Event
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class _Plain(Watcher):
         self._title = title
         self._next_s = _PLAIN_EVERY_S
 
-    def on_progress(self, progress: Progress) -> None:
+    def on_progress(self, progress: FlightProgress) -> None:
         """A line now and then, by simulated time."""
         if progress.stamp_s >= self._next_s:
             self._next_s = progress.stamp_s + _PLAIN_EVERY_S
@@ -54,7 +54,7 @@ class _Live(Watcher):
         self._live = live
         self._title = title
 
-    def on_progress(self, progress: Progress) -> None:
+    def on_progress(self, progress: FlightProgress) -> None:
         """Rewrite the line."""
         self._live.update(_line(progress), refresh=True)
 
@@ -76,7 +76,7 @@ class _Live(Watcher):
             self._live.console.print(Text.assemble(stamp, "  ", event.text))
 
 
-def _line(progress: Progress) -> str:
+def _line(progress: FlightProgress) -> str:
     goal = "" if progress.goal_distance_m is None else f"{progress.goal_distance_m:5.1f} m to go  "
     return (
         f"{progress.stamp_s:7.2f} s  {progress.phase:<12} {goal}"

@@ -1,1 +1,1 @@
-"""Types, frames, states table, seeds, errors, configuration; imports numpy only (numba on use)."""
+"""Types, frames, state table, seeds, errors, configuration. Imports numpy; numba on first use."""

@@ -1,4 +1,4 @@
-"""Values over a socket between two of our own processes, as pickles."""
+"""Sends values as pickles over a socket between two of our own processes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def receive(connection: socket.socket) -> Any:
     """Receive one value.
 
     Raises:
-        EOFError: the other end has closed.
+        EOFError: The other end has closed.
     """
     size = int.from_bytes(_exactly(connection, _LENGTH), "little")
     return pickle.loads(_exactly(connection, size))
 
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:
-    """In one buffer whatever the pieces, so that the memory of a node is the same each time."""
+    """Receive into a single buffer, so that a node's memory is the same in every run."""
     data = bytearray(size)
     view, filled = memoryview(data), 0
     while filled < size:

@@ -1,29 +1,30 @@
-"""Rows of cells as aligned lines of text."""
+"""Format rows of cells as aligned columns of text."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 
-WIDTH = 100  # columns of a screen that every table fits into, as far as its labels let it
+WIDTH = 100  # characters; default maximum width of a table
 _GAP = 2
-_LEAST_ROOM = 20  # for prose
+_LEAST_ROOM = 20  # characters; minimum width of the prose column
 
 
 def columns(rows: Iterable[Sequence[str]], labels: int | None = None) -> list[str]:
-    """A line a row, two blanks between the cells.
+    """Return one aligned line per row, with two blanks between the cells.
 
     Args:
-        rows: the heads first, if any; a row may be shorter than the others.
-        labels: how many columns stand to the left, the others to the right; None: all to the left.
+        rows: Rows of cells, headings first if there are any. Rows may differ in length.
+        labels: Number of left-aligned columns; the others are right-aligned. None aligns all left.
     """
     return _aligned(_padded(rows), labels)
 
 
 def blocks(rows: Iterable[Sequence[str]], labels: int, width: int = WIDTH) -> list[str]:
-    """The same in as many tables below each other as it takes to be no wider than `width`.
+    """Split the columns into several tables, each at most `width` characters wide.
 
-    Each has the first `labels` columns, and of the others at least one; an empty line between two.
+    Every table repeats the first `labels` columns and has at least one other column. An empty line
+    separates two tables.
     """
     cells = _padded(rows)
     lines: list[str] = []
@@ -34,18 +35,18 @@ def blocks(rows: Iterable[Sequence[str]], labels: int, width: int = WIDTH) -> li
 
 
 def wrapped(rows: Iterable[Sequence[str]], width: int = WIDTH) -> list[str]:
-    """All columns to the left; the last, which is prose, goes on below itself beyond `width`."""
+    """Align all columns left and wrap the last one, which is prose, at `width`."""
     cells = _padded(rows)
     room = width - sum(each + _GAP for each in _widths(cells)[:-1])
-    told = []
+    lines = []
     for *row, prose in cells:
         first, *rest = textwrap.wrap(prose, max(room, _LEAST_ROOM)) or [""]
-        told += [[*row, first], *([""] * len(row) + [each] for each in rest)]
-    return _aligned(told, None)
+        lines += [[*row, first], *([""] * len(row) + [each] for each in rest)]
+    return _aligned(lines, None)
 
 
 def _cut(widths: Sequence[int], labels: int, width: int) -> Iterator[tuple[int, int]]:
-    """First column and the one after the last of each table."""
+    """Yield the first column of each table and the column after its last."""
     own = sum(each + _GAP for each in widths[:labels])
     first, used = labels, own
     for place in range(labels, len(widths)):

@@ -1,4 +1,4 @@
-"""The one way in which Python becomes machine code here. numba is imported on first use only."""
+"""Compile Python functions with numba, which is imported on first use only."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ _BLAS = "scipy.linalg.cython_blas"
 
 
 def compiled(function: F) -> F:
-    """`function` as machine code, cached on disk; IEEE arithmetic without reordering, no threads.
+    """Compile `function` and cache the machine code on disk.
 
-    numba's cache knows the file of a function, but not the files of the functions that were
-    compiled into it. Here the stamp of a cache entry covers all sources in the folder of the
-    function and in those of the compiled functions it can call, so code from before an edit or an
-    upgrade is never run.
+    The code uses IEEE arithmetic without reordering, and no threads.
+
+    numba's cache checks the source file of a function, but not the files of the functions that
+    were compiled into it. Here a cache entry's stamp covers all sources in the folder of the
+    function and in the folders of the compiled functions it can call. Outdated code is never run.
     """
     numba = _numba()
     dispatcher = numba.njit(cache=True, error_model="numpy")(function)
@@ -34,24 +35,25 @@ def compiled(function: F) -> F:
 
 
 def in_cache(kernel: Callable[..., Any]) -> bool:
-    """Whether a compiled function has machine code on disk that a call would load.
+    """Return True if a call of a compiled function would load its machine code from disk.
 
-    True as well where it is not compiled at all (NUMBA_DISABLE_JIT), for then no call takes long.
+    Also True if compilation is disabled (NUMBA_DISABLE_JIT), because then no call takes long.
     """
     cache_file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
     return cache_file is None or bool(cache_file._load_index())
 
 
 def _numba() -> Any:
-    """numba, without BLAS: it would import all of scipy.linalg to look for it.
+    """Import numba without BLAS support.
 
-    That takes 0.14 s of processor time in every process, for nothing: no kernel here multiplies
-    matrices. One that did (`@`, `np.dot`, `np.linalg`) would not compile, and says so.
+    To find BLAS, numba imports all of scipy.linalg, which takes 0.14 s of CPU time in every
+    process. No kernel here multiplies matrices. A kernel that used `@`, `np.dot` or `np.linalg`
+    would fail to compile with an error.
     """
     import numba
 
     if "numba.np.arraymath" not in sys.modules and _BLAS not in sys.modules:
-        sys.modules[_BLAS] = None  # type: ignore[assignment]  # an import of it fails
+        sys.modules[_BLAS] = None  # type: ignore[assignment]  # makes its import fail
         try:
             import numba.np.arraymath
         finally:
@@ -60,5 +62,5 @@ def _numba() -> Any:
 
 
 def _callees(function: Any) -> list[Any]:
-    """The Python side of every compiled function that the module of `function` has so far."""
+    """Return the Python functions behind all compiled functions in the module of `function`."""
     return [each.py_func for each in function.__globals__.values() if hasattr(each, "py_func")]

@@ -1,4 +1,4 @@
-"""TOML into frozen dataclasses: strict types, and an unknown key is an error."""
+"""Load TOML into frozen dataclasses with strict types. An unknown key is an error."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ def load_toml(path: Path, cls: type[T]) -> T:
     """Read a TOML file into the frozen dataclass `cls`.
 
     Raises:
-        ConfigError: the file cannot be read or parsed, a key is missing or has the wrong type,
-            or `cls` itself refuses a value (a ValueError from `__post_init__`); names file,
-            line and key.
-        UnknownKey: a key that `cls` does not have; names the nearest.
+        ConfigError: The file cannot be read or parsed, a key is missing or has the wrong type, or
+            `cls` rejects a value (a ValueError from `__post_init__`). Names file, line and key.
+        UnknownKey: `cls` does not have this key. Names the nearest key.
     """
     data, text = read_toml(path)
     return structure(data, cls, path=path, text=text)
 
 
 def read_toml(path: Path) -> tuple[dict[str, Any], str]:
-    """What a TOML file says, and its text, from which `structure` tells the line of an error.
+    """Parse a TOML file. Return its data and its text.
+
+    `structure` uses the text to find the line of an error.
 
     Raises:
-        ConfigError: the file cannot be read or parsed; names file and line.
+        ConfigError: The file cannot be read or parsed. Names file and line.
     """
     text = _read(path)
     try:
@@ -47,16 +48,16 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def shipped_names(folder: Path) -> list[str]:
-    """The names of the TOML files in a folder, in alphabetical order."""
+    """Return the names of the TOML files in a folder, in alphabetical order."""
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
 def shipped_path(kind: str, name_or_path: str, folder: Path) -> Path:
-    """The TOML file of a shipped `kind` by its name, or a user's own by its path.
+    """Find the TOML file of a shipped `kind` by its name, or a user's own file by its path.
 
     Raises:
-        UnknownName: nothing shipped has this name, and it is not a path to a TOML file.
-        ConfigError: it is such a path, and there is no such file.
+        UnknownName: Nothing shipped has this name, and it is not a path to a TOML file.
+        ConfigError: It is a path to a TOML file that does not exist.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":
@@ -69,17 +70,17 @@ def shipped_path(kind: str, name_or_path: str, folder: Path) -> Path:
 
 
 def load_shipped(kind: str, name_or_path: str, folder: Path, cls: type[T]) -> T:
-    """A shipped `kind` by name, or a user's own by the path of its TOML file, as `cls`.
+    """Load a shipped `kind` by its name, or a user's own TOML file by its path, as `cls`.
 
     Raises:
-        UnknownName: nothing shipped has this name, and it is not a path to a TOML file.
-        ConfigError: the file cannot be used.
+        UnknownName: Nothing shipped has this name, and it is not a path to a TOML file.
+        ConfigError: The file cannot be used.
     """
     return load_toml(shipped_path(kind, name_or_path, folder), cls)
 
 
 def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:
-    """What is wrong with a file that is no TOML, with its line where the parser tells it."""
+    """Convert a TOML syntax error, with its line if the parser reports one."""
     problem, at, place = str(error).rpartition(" (at line ")
     if not at:
         return ConfigError(str(error), path=path)
@@ -90,7 +91,7 @@ def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:
 def structure(
     data: Mapping[str, Any], cls: type[T], *, path: Path | None = None, text: str = ""
 ) -> T:
-    """The dataclass `cls` from a plain mapping, under the same rules as `load_toml`."""
+    """Build the dataclass `cls` from a plain mapping under the rules of `load_toml`."""
     _refuse_unknown(data, cls, path, text, prefix="")
     try:
         return _CONVERTER.structure(data, cls)
@@ -110,7 +111,7 @@ def _read(path: Path) -> str:
 
 def _strict(kind: type, *accepted: type) -> Any:
     def hook(value: Any, _cls: Any) -> Any:
-        """Refuse, with TypeError or ValueError, what is of another type or not finite."""
+        """Raise TypeError for a value of another type and ValueError for one that is not finite."""
         if isinstance(value, bool) is not (kind is bool) or not isinstance(
             value, (kind, *accepted)
         ):
@@ -181,7 +182,7 @@ def _shape(hint: Any) -> tuple[str, tuple[type, ...]]:
 
 
 def _items(value: Any, hint: Any) -> list[tuple[str, Any]]:
-    """The tables inside a value, each with what it adds to the key's name."""
+    """Return the tables inside a value, each with its suffix of the key's name."""
     if isinstance(value, list):
         return [("", item) for item in value]
     if get_origin(hint) is dict and isinstance(value, Mapping):
@@ -197,7 +198,7 @@ def _dataclasses_in(hint: Any) -> Sequence[Any]:
 
 
 def _first_problem(error: BaseException, key: str) -> tuple[str, str]:
-    """The key and the message of the innermost first failure of a cattrs error group."""
+    """Return key and message of the innermost first failure of a cattrs error group."""
     if isinstance(error, BaseExceptionGroup):
         inner = error.exceptions[0]
         for note in getattr(inner, "__notes__", []):
@@ -210,7 +211,7 @@ def _first_problem(error: BaseException, key: str) -> tuple[str, str]:
 
 
 def _line_of(text: str, key: str) -> int | None:
-    """The line on which the last part of a dotted key is set, as well as text alone can tell."""
+    """Find the line that sets the last part of a dotted key, by a search of the text."""
     parts = [part for part in key.replace("[", ".[").split(".") if part and part[0] != "["]
     if not text or not parts:
         return None
@@ -230,13 +231,14 @@ def _line_of(text: str, key: str) -> int | None:
 
 
 def require_distinct(names: Sequence[str], key: str) -> None:
-    """Refuse a list in which a name comes twice.
+    """Reject a list that contains a name twice.
 
     Args:
-        key: what the names are called.
+        names: Names to check.
+        key: Configuration key of the list, for the error.
 
     Raises:
-        ConfigError: says which.
+        ConfigError: A name occurs twice. Names it.
     """
     for place, name in enumerate(names):
         if name in names[:place]:

@@ -1,27 +1,27 @@
-"""The error tree. Each error takes the objects it is about and composes its own line.
+"""The error tree. Each error takes the objects it is about and composes its own message.
 
-MavfiError                      one known error, one line, exit code 1
+MavfiError                      a known error; printed in one line, exit code 1
 ├── UnknownName                 a world, planner, vehicle ... that does not exist
 ├── ConfigError                 a file or value that cannot be used
 │   └── UnknownKey              a TOML key that no setting has
-├── WorldError                  start or goal blocked or outside, boxes that make no world
-├── LinkError                   the MAVLink side
+├── WorldError                  start or goal blocked or outside, or invalid boxes
+├── LinkError                   the MAVLink connection failed
 │   ├── EndpointError           a URL that cannot be opened
-│   ├── NoAutopilot             nothing answered
-│   ├── CommandRefused          the autopilot said no, in its own words
-│   └── LinkLost                the peer fell silent or closed the connection
-├── CannotLift                  a vehicle whose rotors do not lift its compute; with the numbers
+│   ├── NoAutopilot             no autopilot heartbeat arrived
+│   ├── CommandRefused          the autopilot refused a command; quotes its messages
+│   └── LinkLost                the peer stopped sending or closed the connection
+├── CannotLift                  a vehicle whose rotors cannot lift its compute; gives the numbers
 ├── VehicleProcessError         the simulated vehicle could not start or ended early
-├── ModelError                  a detector's model or data set that cannot be used or made
-│   └── OtherStack              a model of another stack than the mission's
+├── ModelError                  a detector model or data set that cannot be used or created
+│   └── OtherStack              a detector model for another stack than the mission's
 ├── RecordError                 a run folder that cannot be written or read
-├── FaultError                  a fault that cannot be described, placed or repeated
-│   ├── FaultSpecError          a fault description that makes no sense
+├── FaultError                  a fault that cannot be described, injected or repeated
+│   ├── FaultSpecError          an inconsistent fault description
 │   ├── BitOutsideWidth         a bit that the type or register does not have
-│   ├── FieldUnavailable        a field (sign, exponent, mantissa) that the type has not
-│   ├── TracingForbidden        ptrace refused; says how to allow it
+│   ├── FieldUnavailable        a field (sign, exponent, mantissa) that the type lacks
+│   ├── TracingForbidden        ptrace is not permitted; says how to allow it
 │   ├── TargetError             a program that cannot be started, or ends before the trigger
-│   └── BuildMismatch           a fault record of another build; says what differs
+│   └── BuildMismatch           a fault record made with another build; says what differs
 └── Interrupted                 the user asked to stop
 """
 
@@ -34,11 +34,11 @@ from pathlib import Path
 
 
 class MavfiError(Exception):
-    """A known error: the command line prints it in one line and exits with 1."""
+    """A known error. The command line prints it in one line and exits with code 1."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name most like `name`, capitals and folders apart, or None if none is close."""
+    """Return the known name most similar to `name`, ignoring case and folder, or None."""
     for each in known:
         if each.endswith(f"/{name}"):
             return each
@@ -55,19 +55,19 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
 
 
 class UnknownName(MavfiError):
-    """A name that does not exist; names the nearest one that does."""
+    """A name that does not exist. Suggests the nearest known name."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         super().__init__(f"unknown {kind} {name!r}: {_suggestion(name, known)}")
 
 
 class ConfigError(MavfiError):
-    """A file or a value that cannot be used: says where (file, line, key) and why.
+    """A file or a value that cannot be used. Gives file, line, key and the problem.
 
     Attributes:
-        problem: what is wrong, without the place.
-        path: the file, or None if the value is in no file.
-        key: name of the setting, or empty.
+        problem: Description of the problem without the place.
+        path: File; None if the value is not in a file.
+        key: Name of the setting, or empty.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class ConfigError(MavfiError):
 
 
 class UnknownKey(ConfigError):
-    """A TOML key that no setting has; names the nearest known one."""
+    """A TOML key that no setting has. Suggests the nearest known key."""
 
     def __init__(
         self, key: str, known: Iterable[str], *, path: Path | None = None, line: int | None = None
@@ -96,11 +96,11 @@ class UnknownKey(ConfigError):
 
 
 class WorldError(MavfiError):
-    """Start or goal blocked or outside, or boxes that make no world."""
+    """Start or goal is blocked or outside the world, or the boxes are invalid."""
 
 
 class LinkError(MavfiError):
-    """The MAVLink side failed."""
+    """The MAVLink connection failed."""
 
 
 class EndpointError(LinkError):
@@ -118,7 +118,7 @@ class NoAutopilot(LinkError):
 
 
 class CommandRefused(LinkError):
-    """The autopilot refused a command; carries its own words."""
+    """The autopilot refused a command. Quotes the autopilot's status texts."""
 
     def __init__(self, command: str, result: str, texts: Iterable[str] = ()) -> None:
         words = "; ".join(texts)
@@ -128,11 +128,11 @@ class CommandRefused(LinkError):
 
 
 class LinkLost(LinkError):
-    """The peer fell silent or closed the connection."""
+    """The peer stopped sending or closed the connection."""
 
 
 class CannotLift(MavfiError):
-    """A vehicle whose rotors do not lift what it carries; says the numbers."""
+    """A vehicle whose rotors cannot lift its payload. Gives the numbers."""
 
     def __init__(
         self, vehicle: str, *, pull_n: float, mass_kg: float, compute_kg: float, limit_kg: float
@@ -149,14 +149,14 @@ class VehicleProcessError(MavfiError):
 
 
 class ModelError(MavfiError):
-    """A detector's model, or the data set to fit one, that cannot be used or made."""
+    """A detector model, or a data set to fit one, that cannot be used or created."""
 
     def __init__(self, problem: str, *, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
 
 
 class OtherStack(ModelError):
-    """A detector's model that was fitted to flights of another stack; says how to get one."""
+    """A detector model that was fitted to flights of another stack. Says how to fit one."""
 
     def __init__(self, detector: str, *, made_for: str, flown: str, path: Path | None) -> None:
         super().__init__(
@@ -172,11 +172,11 @@ class RecordError(MavfiError):
 
 
 class FaultError(MavfiError):
-    """A fault that cannot be described, placed or repeated."""
+    """A fault that cannot be described, injected or repeated."""
 
 
 class FaultSpecError(FaultError):
-    """A fault description that makes no sense."""
+    """An inconsistent fault description."""
 
 
 class BitOutsideWidth(FaultError):
@@ -187,28 +187,28 @@ class BitOutsideWidth(FaultError):
 
 
 class FieldUnavailable(FaultError):
-    """A field that the type has not, or that has too few bits for the fault."""
+    """A field that the type lacks, or that has too few bits for the fault."""
 
     def __init__(self, field: str, kind: str, known: Iterable[str]) -> None:
         super().__init__(f"{kind} has no field {field!r}; it has: {', '.join(known)}")
 
 
 class TracingForbidden(FaultError):
-    """The operating system refuses to trace; says how to allow it."""
+    """The operating system does not permit tracing. Says how to allow it."""
 
     def __init__(self, what: str, problem: str, remedy: str) -> None:
         super().__init__(f"{what} is not possible here ({problem}): {remedy}")
 
 
 class TargetError(FaultError):
-    """A target program that cannot be started, or that ends before the trigger."""
+    """A target program that cannot be started or that ends before the trigger."""
 
     def __init__(self, program: str, problem: str) -> None:
         super().__init__(f"{program}: {problem}")
 
 
 class BuildMismatch(FaultError):
-    """A fault record of another build; names each object that differs."""
+    """A fault record made with another build. Names each object that differs."""
 
     def __init__(self, differences: Iterable[str]) -> None:
         super().__init__(f"the record is of another build: {'; '.join(differences)}")

@@ -1,4 +1,4 @@
-"""Files that are whole at any moment: a kill leaves the old one or the new one, never half."""
+"""Write files atomically: a kill leaves the old file or the new one, never a partial one."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mavfi_cli.core.errors import RecordError
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file beside its place, make it durable, then move it there.
+    """Write to a temporary file in the same folder, sync it to disk, then rename it to `path`.
 
-    Several processes may write the same file: each writes beside it under a name of its own, and
-    the last one stays.
+    Several processes may write the same file. Each uses a temporary file of its own, and the last
+    rename wins.
 
     Raises:
-        RecordError: the file could not be written (disk full, no permission); the old one stays.
+        RecordError: The file could not be written (disk full, no permission). The old file stays.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -35,10 +35,10 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def require_svg(path: Path) -> None:
-    """Refuse a name for a picture that promises another format.
+    """Reject a picture file name with another suffix than .svg.
 
     Raises:
-        RecordError: it does not end in .svg.
+        RecordError: The name does not end in .svg.
     """
     if path.suffix.lower() != ".svg":
         raise RecordError(f"{path}: pictures are SVG: name a file that ends in .svg")
@@ -50,12 +50,15 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically: sorted keys; a number that is not finite becomes null."""
+    """Write JSON atomically with sorted keys. A number that is not finite becomes null."""
     write_text(path, json.dumps(plain(value), indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
 def plain(value: Any) -> Any:
-    """JSON-ready copy: numpy scalars and arrays become numbers and lists, non-finite null."""
+    """Return a JSON-ready copy.
+
+    numpy scalars and arrays become numbers and lists. Numbers that are not finite become null.
+    """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,10 +1,9 @@
-"""Frames: ENU and FLU inside mavfi (ROS REP-103), NED and FRD on the MAVLink wire.
+"""Coordinate frames: ENU and FLU inside mavfi (ROS REP-103), NED and FRD in MAVLink messages.
 
 World frame: x east, y north, z up (ENU). Body frame: x forward, y left, z up (FLU).
-Yaw is measured from east, counter-clockwise; the wire's heading from north, clockwise.
+Yaw is measured counter-clockwise from east. A MAVLink heading is measured clockwise from north.
 Quaternions are Hamilton, scalar first (w, x, y, z), and rotate body into world.
-
-The conversions are involutions: applying one twice gives the input back.
+Each conversion is its own inverse.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ Vector = NDArray[np.float64]
 
 
 def enu_from_ned(vector: Vector) -> Vector:
-    """ENU components (..., 3) of NED components (..., 3), any unit; its own inverse."""
+    """Convert NED components (..., 3), in any unit, to ENU components (..., 3), or back."""
     swapped = vector[..., [1, 0, 2]].copy()
     swapped[..., 2] *= -1.0
     return swapped
@@ -29,14 +28,14 @@ ned_from_enu = enu_from_ned
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """The same angle in [-pi, pi), rad; NaN and infinities give NaN."""
+    """Wrap an angle into [-pi, pi), rad. NaN and infinities give NaN."""
     if not math.isfinite(angle_rad):
         return math.nan
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def enu_yaw_from_ned(heading_rad: float) -> float:
-    """ENU yaw in [-pi, pi) of an NED heading, rad; its own inverse."""
+    """Convert an NED heading, rad, to an ENU yaw in [-pi, pi), rad, or back."""
     return wrap_angle(math.pi / 2.0 - heading_rad)
 
 
@@ -49,7 +48,7 @@ def flu_enu_from_frd_ned(quaternion: Vector | Sequence[float]) -> Vector:
     """Body-FLU-to-ENU quaternion (4,) of a body-FRD-to-NED quaternion (4,), and back.
 
     q_enu = q(ENU<-NED) * q_ned * q(FRD<-FLU), with q(ENU<-NED) = (0, s, s, 0), s = sqrt(1/2),
-    and q(FRD<-FLU) = (0, 1, 0, 0). Unit quaternions, sign normalised to w >= 0.
+    and q(FRD<-FLU) = (0, 1, 0, 0). The result is a unit quaternion with w >= 0.
     """
     w, x, y, z = (float(c) for c in quaternion)
     # (0, s, s, 0) * (w, x, y, z)
@@ -61,7 +60,7 @@ def flu_enu_from_frd_ned(quaternion: Vector | Sequence[float]) -> Vector:
 
 
 def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Vector:
-    """Quaternion (4,) of the z-y-x rotation yaw, pitch, roll, rad."""
+    """Return the quaternion (4,) of the z-y-x rotation by yaw, pitch, roll, rad."""
     cr, sr = math.cos(roll_rad / 2.0), math.sin(roll_rad / 2.0)
     cp, sp = math.cos(pitch_rad / 2.0), math.sin(pitch_rad / 2.0)
     cy, sy = math.cos(yaw_rad / 2.0), math.sin(yaw_rad / 2.0)
@@ -82,7 +81,7 @@ def yaw_from_quaternion(quaternion: Vector | Sequence[float]) -> float:
 
 
 def rotation_matrix(quaternion: Vector) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) of a unit quaternion (4,): world = R @ body."""
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,): world = R @ body."""
     w, x, y, z = (float(c) for c in quaternion)
     return np.array(
         [

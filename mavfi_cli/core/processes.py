@@ -16,30 +16,30 @@ ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "JE_ARROW_MALLOC_CONF": "background_thread:false",
 }
-"""Environment of a process that forks itself: the libraries that it loads start no threads."""
+"""Environment of a process that forks itself. Its libraries then start no threads."""
 
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 
 
 def become_reaper() -> None:
-    """From now on orphans among the descendants of this process become its children."""
+    """Make orphaned descendants of this process its children from now on."""
     _request(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def die_with(parent: int) -> None:
-    """Have this process killed when its parent ends; end now where that has happened already."""
+    """Have the kernel kill this process when its parent ends. Exit now if it has already ended."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
 
 def threads() -> int:
-    """How many threads this process has. A fork has only one of them, and the others' locks."""
+    """Count the threads of this process. A fork copies one thread, but the locks of all."""
     return len(os.listdir("/proc/self/task"))
 
 
 def call_this_process(name: str) -> None:
-    """Have ps and top call this process so; at most 15 bytes."""
+    """Set the name of this process in ps and top, at most 15 bytes."""
     _request(_PR_SET_NAME, ctypes.c_char_p(name.encode()))
 
 

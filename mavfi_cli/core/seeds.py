@@ -1,7 +1,7 @@
-"""One root seed, separate streams: golden and faulty runs stay paired.
+"""Named random streams from one root seed, so that golden and faulty runs stay paired.
 
-A stream is named, not numbered by order of use, so that adding a consumer never shifts
-another's numbers. Uses numpy's SeedSequence with the stream's name as spawn key.
+A stream is identified by its name, not by its order of use. A new consumer therefore never
+changes the numbers of another. The stream's name is the spawn key of numpy's SeedSequence.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ def _spawn_key(name: str) -> tuple[int, ...]:
 
 
 def seed_sequence(root_seed: int, stream: Stream, *detail: str | int) -> np.random.SeedSequence:
-    """The seed sequence of one stream; `detail` names a sub-stream (kernel, invocation)."""
+    """Return the seed sequence of a stream. `detail` names a sub-stream (kernel, invocation)."""
     name = "/".join([stream.value, *(str(part) for part in detail)])
     return np.random.SeedSequence(root_seed, spawn_key=_spawn_key(name))
 
 
 def generator(root_seed: int, stream: Stream, *detail: str | int) -> np.random.Generator:
-    """A fresh PCG64 generator of one stream."""
+    """Return a new PCG64 generator of one stream."""
     return np.random.Generator(np.random.PCG64(seed_sequence(root_seed, stream, *detail)))
 
 
 def derive(root_seed: int, stream: Stream, *detail: str | int) -> int:
-    """A 31-bit positive seed for a library that takes an int (OMPL, a child process)."""
+    """Return a positive 31-bit seed for a consumer that takes an int (OMPL, a child process)."""
     state = seed_sequence(root_seed, stream, *detail).generate_state(1, np.uint32)
     return int(state[0] & 0x7FFF_FFFF) or 1

@@ -1,4 +1,4 @@
-"""Digests of source code: what must not be mixed with what another version has left behind."""
+"""Digests of source code, to keep results of different versions apart."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ PACKAGE = Path(__file__).parents[1]
 
 @cache
 def folder_digest(folder: Path, *, deep: bool = False) -> str:
-    """SHA-256 of all Python sources of a folder, by name and content; `deep`: and below it."""
+    """Return the SHA-256 of names and contents of all Python sources in a folder.
+
+    `deep` includes its subfolders.
+    """
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py") if deep else folder.glob("*.py")):
         digest.update(str(path.relative_to(folder)).encode())
@@ -20,6 +23,6 @@ def folder_digest(folder: Path, *, deep: bool = False) -> str:
 
 
 def own_digest() -> str:
-    """Of all of our own code, the vehicle's side included."""
+    """Return the SHA-256 of all sources of mavfi, including the simulated vehicle."""
     parts = [folder_digest(each, deep=True) for each in (PACKAGE, PACKAGE.parent / "sitl")]
     return hashlib.sha256("".join(parts).encode()).hexdigest()

@@ -1,7 +1,7 @@
-"""The one table of monitored states: fi, detect and report iterate over it.
+"""The table of monitored states, which fi, detect and report iterate over.
 
-A state is a scalar (or one component of a vector) that one kernel hands to the next. Reading
-and writing it goes through this table, so nobody else needs to know where it lives.
+A state is a scalar, or one component of a vector, that one kernel passes to the next. All reads
+and writes of a state go through this table, so that no other module knows its place.
 Source of the list: paper, section IV-C and V-A; reference facts, sections 1.3 and 1.4.
 """
 
@@ -21,7 +21,7 @@ Scalar = float | int | bool
 
 
 class DType(Enum):
-    """Storage type of a state, as a fault sees its bits."""
+    """Storage type of a state, whose bits a fault flips."""
 
     FLOAT64 = "float64"
     INT32 = "int32"
@@ -30,27 +30,27 @@ class DType(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """One monitored, injectable inter-kernel state."""
+    """A monitored inter-kernel state and injection site."""
 
     name: str
     stage: Stage
     dtype: DType
     unit: str
-    group: str  # states that the paper corrupts together, e.g. the three components of a velocity
+    group: str  # states that the paper corrupts together, e.g. components of a velocity
     message: type[Message]
     read: Callable[[Message, int], Scalar]  # (message, waypoint index)
     write: Callable[[Message, int, Scalar], Message]  # returns a changed copy
-    detected: bool = False  # one of the 13 inputs of the autoencoder
+    detected: bool = False  # True for the 13 inputs of the autoencoder
 
 
 def _field(name: str) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
     def read(message: Message, _index: int) -> Scalar:
-        """The field's value."""
+        """Return the field's value."""
         value: Scalar = getattr(message, name)
         return value
 
     def write(message: Message, _index: int, value: Scalar) -> Message:
-        """A copy of the message with another value."""
+        """Return a copy of the message with another value."""
         return replace(message, **{name: value})  # type: ignore[arg-type]
 
     return read, write
@@ -59,18 +59,18 @@ def _field(name: str) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
 def _element(
     array: str, column: int | None
 ) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
-    """Row `index` of an array, or of one of its columns."""
+    """Return reader and writer of row `index` of an array or of one of its columns."""
 
     def place(index: int) -> int | tuple[int, int]:
-        """Where in the array."""
+        """Return the index into the array."""
         return index if column is None else (index, column)
 
     def read(message: Message, index: int) -> Scalar:
-        """The element's value."""
+        """Return the element's value."""
         return float(getattr(message, array)[place(index)])
 
     def write(message: Message, index: int, value: Scalar) -> Message:
-        """A copy of the message with another value; its array is a copy, too."""
+        """Return a copy of the message, and of its array, with another value."""
         changed = np.array(getattr(message, array))
         changed[place(index)] = value
         return replace(message, **{array: changed})  # type: ignore[arg-type]
@@ -79,7 +79,7 @@ def _element(
 
 
 def _component(array: str, column: int) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
-    """One component of a vector that has no rows."""
+    """Return reader and writer of one component of a vector."""
     read, write = _element(array, None)
     return (
         lambda message, _index: read(message, column),
@@ -158,7 +158,11 @@ BY_NAME: dict[str, State] = {state.name: state for state in STATES}
 
 
 def find(name: str) -> State:
-    """The state of that name; UnknownName, with the nearest, where there is none."""
+    """Return the state of that name.
+
+    Raises:
+        UnknownName: No state has this name. Suggests the nearest.
+    """
     try:
         return BY_NAME[name]
     except KeyError:
@@ -166,5 +170,5 @@ def find(name: str) -> State:
 
 
 def of_stage(stage: Stage) -> tuple[State, ...]:
-    """The states that one stage puts out, in table order."""
+    """Return the states that a stage outputs, in table order."""
     return tuple(state for state in STATES if state.stage is stage)

@@ -1,4 +1,4 @@
-"""What travels between kernels: frozen records in SI units, ENU world and FLU body frames."""
+"""Messages between kernels: frozen records in SI units, ENU world frame and FLU body frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Stage(Enum):
 
 
 class Outcome(Enum):
-    """How a mission ends."""
+    """Outcome of a mission."""
 
     SUCCESS = "success"
     COLLISION = "collision"
@@ -35,7 +35,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """The vehicle as its MAVLink messages tell it, at one stamp."""
+    """State of the vehicle at one stamp, from its MAVLink messages."""
 
     stamp_s: float  # vehicle boot clock
     position_enu_m: FloatArray  # (3,)
@@ -51,13 +51,13 @@ class DepthFrame:
     stamp_s: float
     depth_m: FloatArray  # (rows, columns) along the optical axis; inf where nothing was in range
     hfov_rad: float
-    position_enu_m: FloatArray  # (3,) of the optical centre
+    position_enu_m: FloatArray  # (3,) optical centre
     quaternion: FloatArray  # (4,) camera FLU -> ENU
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointCloud:
-    """Points that a sensor saw, in the world frame."""
+    """Points that a sensor measured, in the world frame."""
 
     stamp_s: float
     points_enu_m: FloatArray  # (n, 3)
@@ -66,12 +66,12 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionReport:
-    """The verdict of the collision check on the whole remaining trajectory."""
+    """Result of the collision check of the whole remaining trajectory."""
 
     stamp_s: float
     collision: bool
-    time_to_collision_s: float  # inf where the trajectory is free
-    future_collision_seq: int  # counts the collisions foreseen so far
+    time_to_collision_s: float  # inf if the trajectory is free
+    future_collision_seq: int  # number of collisions predicted so far
 
 
 WAYPOINT_FIELDS = ("x", "y", "z", "yaw", "vx", "vy", "vz", "ax", "ay", "az")
@@ -79,27 +79,27 @@ WAYPOINT_FIELDS = ("x", "y", "z", "yaw", "vx", "vy", "vz", "ax", "ay", "az")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
-    """A time-parametrised path, sampled at equal or unequal durations."""
+    """A time-parametrised path of waypoints with equal or unequal durations."""
 
-    stamp_s: float  # when its first waypoint is due
+    stamp_s: float  # start of the first waypoint
     waypoints: FloatArray  # (n, 10) in the order of WAYPOINT_FIELDS; m, rad, m/s, m/s^2, ENU
-    durations_s: FloatArray  # (n,) how long each waypoint is followed
+    durations_s: FloatArray  # (n,) duration of each waypoint
     trajectory_seq: int
-    future_collision_seq: int  # the newest foreseen collision that this plan knows of
+    future_collision_seq: int  # the newest predicted collision that the planner knew of
 
     @property
     def duration_s(self) -> float:
-        """Time from the first waypoint to the end of the last, s."""
+        """Return the time from the start of the first waypoint to the end of the last, s."""
         return float(self.durations_s.sum())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """What the control stage asks of the flight controller."""
+    """Command of the control stage to the flight controller."""
 
     stamp_s: float
     velocity_enu_mps: FloatArray  # (3,)
     yaw_rad: float
     acceleration_enu_mps2: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,)
-    pace: float = 1.0  # how fast the trajectory's clock runs while it is in force, 0..1
-    skips_waypoint: bool = False  # the waypoint that it is of is over
+    pace: float = 1.0  # rate of the trajectory's clock while this command holds, 0..1
+    skips_waypoint: bool = False  # True ends the current waypoint

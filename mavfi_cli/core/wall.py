@@ -1,4 +1,4 @@
-"""Where the host's time goes. Never part of the mission: only the record's `host` section."""
+"""Wall-clock time of the host. It enters only the record's `host` section, never the mission."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from time import perf_counter
 
 
 class WallClock:
-    """Host seconds by name: all together, and of the newest time."""
+    """Host seconds by name: the total and the newest measurement."""
 
     def __init__(self) -> None:
         self.totals: dict[str, float] = {}

@@ -1,1 +1,1 @@
-"""Anomaly detection on the states between kernels (paper, section V); imports core only."""
+"""Anomaly detection on inter-kernel states (paper, section V). Imports core only."""

@@ -1,9 +1,9 @@
-"""AAD: one autoencoder over all stages (paper, section V-D), run without torch.
+"""AAD: one autoencoder over all stages (paper, section V-D). Inference does not need torch.
 
     13 inputs -> 6 tanh -> 3 tanh -> 13 linear outputs,    error = mean (out - in)^2.
 
-Deltas are divided by their scale on the way in, so the net sees and can put out numbers of either
-sign around 1. A score above the largest error of error-free runs is an alarm.
+Each delta is divided by its scale, so inputs and outputs of the net are about -1 to 1. A score
+above the largest error of error-free runs raises an alarm.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WEIGHTS: Shapes = {
     "output_biases": (COUNT,),
 }
 
-# Places in the flat array.
+# Offsets in the flat array.
 _SCALE = 1
 _W1 = _SCALE + COUNT
 _B1 = _W1 + HIDDEN * COUNT
@@ -39,7 +39,7 @@ _WORK = _B3 + COUNT
 
 @compiled
 def reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
-    """Mean square of what the net fails to put out; from `_WORK` on is scratch."""
+    """Return the mean squared reconstruction error. Memory from `_WORK` on is scratch space."""
     work = memory[_WORK:]
     for place in range(COUNT):
         work[place] = deltas[place] / memory[_SCALE + place]
@@ -72,7 +72,7 @@ def judge_tick(
     yaw_rad: float,
     keep_report: bool,
 ) -> tuple[float, int]:
-    """Deltas of a tick and their score; see `FittedDetector.tick_judge`."""
+    """Compute the deltas of a tick and their score; see `FittedDetector.tick_judge`."""
     take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
     error = reconstruction_error(memory, work[DELTA])
     return error, PASSED if error <= memory[0] else OF_CONTROL
@@ -88,7 +88,7 @@ def judge_plan(
     changes: Codes,
     scores: FloatArray,
 ) -> int:
-    """Steps of a plan and their scores; see `FittedDetector.plan_judge`."""
+    """Compute the steps of a plan and their scores; see `FittedDetector.plan_judge`."""
     count = plan_deltas(waypoints, first, work, steps, changes)
     for number in range(count):
         scores[number] = reconstruction_error(memory, changes[number])
@@ -110,9 +110,9 @@ class AutoencoderDetector(FittedDetector):
     plan_judge = staticmethod(judge_plan)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Reconstruction error: mean square over the 13 scaled deltas."""
+        """Return the reconstruction error: the mean square over the 13 scaled deltas."""
         error: float = reconstruction_error(self._flat, deltas)
         return error
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Nothing: the net is trained beforehand."""
+        """Do nothing, because the net is trained beforehand."""

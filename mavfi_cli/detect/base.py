@@ -1,4 +1,4 @@
-"""What a detector is. Ours and those of other packages fulfil the same small protocol."""
+"""Interface of a detector, which our detectors and those of other packages implement."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mavfi_cli.detect.preprocess import Codes
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StackMark:
-    """The companion's stack, as far as detection knows one: flights of another may look otherwise.
+    """Identity of the companion's stack. Error-free flights differ between stacks.
 
     Attributes:
-        name: what people call it.
-        digest: SHA-256 of its settings; equal digests mean equal stacks.
+        name: Name of the stack.
+        digest: SHA-256 of its settings. Equal digests mean equal stacks.
     """
 
     name: str
@@ -27,12 +27,12 @@ class StackMark:
 
 
 class Detector(Protocol):
-    """Judges deltas (COUNT,) int16 in the order of `preprocess.NAMES`; 0 is "no change".
+    """Scores deltas (COUNT,) int16 in the order of `preprocess.NAMES`; 0 means no change.
 
     Attributes:
-        name: what it is registered as.
-        per_stage: True where each stage is judged alone, and an alarm recomputes that stage.
-            False where one score is taken over the whole vector; an alarm recomputes control.
+        name: Registered name.
+        per_stage: True if each stage is scored alone and an alarm recomputes that stage. False if
+            one score covers the whole vector and an alarm recomputes control.
     """
 
     name: str
@@ -40,35 +40,35 @@ class Detector(Protocol):
 
     @property
     def threshold(self) -> float:
-        """A score above it, or one that is NaN, is an alarm."""
+        """Threshold. A score above it, or a NaN score, raises an alarm."""
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
-        """All that decides, the threshold included, as arrays whose change takes effect."""
+        """All state of the detector, including the threshold, as writable arrays."""
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """How anomalous a sample is.
+        """Return the anomaly score of a sample.
 
         Args:
-            deltas: changes of all states; those of states without a new sample are 0.
-            stage: whose states are judged (per stage), or whose message it is (over all).
+            deltas: Deltas of all states; 0 for states without a new sample.
+            stage: Stage to score (per stage), or stage of the message (one score over all).
         """
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Take an accepted sample into the model; nothing to do for a fixed one."""
+        """Update the model with an accepted sample. A fixed model does nothing."""
 
 
 class Factory(Protocol):
-    """Makes a detector: what an entry point in the group `mavfi.detectors` names."""
+    """Creates a detector. An entry point in the group `mavfi.detectors` names a factory."""
 
     def __call__(self, *, model: Path | None = None, threshold: float | None = None) -> Detector:
-        """A fresh detector.
+        """Create a new detector.
 
         Args:
-            model: its artefact; None takes the default, shipped with the package.
-            threshold: replaces the model's own; the number of sigmas, for a Gaussian one.
+            model: Model file; None selects the model shipped with the package.
+            threshold: Replaces the model's threshold; a number of sigmas for a Gaussian model.
 
         Raises:
-            ModelError: an artefact that cannot be used.
-            ConfigError: a threshold out of range.
+            ModelError: The model file cannot be used.
+            ConfigError: The threshold is out of range.
         """

@@ -1,7 +1,7 @@
-"""Samples as the gate sees them, grouped by flight: what models are fitted to.
+"""Data set to fit models to: the samples that the gate sees, grouped by flight.
 
 One row is one judged message: a collision report, a control tick, or one step of a published plan
-from waypoint to waypoint. Its deltas are those that a detector is shown.
+from waypoint to waypoint. Its deltas are the detector's input.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ _STACK = (b"mavfi_stack", b"mavfi_stack_digest")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Flight:
-    """The samples of one error-free flight, oldest first."""
+class FlightSamples:
+    """Samples of one error-free flight, oldest first."""
 
     world: str
     seed: int
     stamps_s: FloatArray  # (n,)
-    reports: NDArray[np.bool_]  # (n,) a collision report
-    plan_steps: NDArray[np.bool_]  # (n,) a step of a plan; what is neither is a control tick
-    new_waypoint: NDArray[np.bool_]  # (n,) a control tick with a new sample of planning's states
+    reports: NDArray[np.bool_]  # (n,) True for a collision report
+    plan_steps: NDArray[np.bool_]  # (n,) True for a step of a plan; otherwise a control tick
+    new_waypoint: NDArray[np.bool_]  # (n,) True for a control tick with new planning states
     deltas: Codes  # (n, COUNT)
-    extended: Codes  # (n, 3) of the extended states; a plan's are in the row of its first step
+    extended: Codes  # (n, 3) extended states; those of a plan are in the row of its first step
 
     def of_stage(self, stage: Stage) -> Codes:
-        """Deltas (m, COUNT) of the samples that bring something new of a stage."""
+        """Return the deltas (m, COUNT) of the samples with new states of a stage."""
         if stage is Stage.PERCEPTION:
             return self.deltas[self.reports]
         if stage is Stage.PLANNING:
@@ -51,11 +51,11 @@ class Flight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """Flights, each of another world or seed."""
+    """Flights with distinct combinations of world and seed."""
 
-    flights: tuple[Flight, ...]
+    flights: tuple[FlightSamples, ...]
     preprocess: PreprocessParams
-    stack: StackMark  # of all flights
+    stack: StackMark  # stack of all flights
 
     def __post_init__(self) -> None:
         keys = [(flight.world, flight.seed) for flight in self.flights]
@@ -66,7 +66,7 @@ class Dataset:
         return len(self.flights)
 
     def save(self, path: Path) -> None:
-        """Write it as Parquet, atomically; equal data sets give equal bytes."""
+        """Write the data set as Parquet, atomically. Equal data sets give equal bytes."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -95,14 +95,14 @@ class Dataset:
 
     @classmethod
     def load(cls, path: Path, preprocess: PreprocessParams | None = None) -> Dataset:
-        """Read one back.
+        """Read a data set.
 
         Args:
-            preprocess: what it must have been made with.
+            preprocess: Parameters that the data set must have been made with.
 
         Raises:
-            ModelError: unreadable, no data set, or one of another table of states or
-                preprocessing.
+            ModelError: The file is unreadable, is not a data set, or was made with another state
+                table or other preprocessing.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -137,7 +137,7 @@ def _joined(arrays: list[NDArray[np.generic]]) -> NDArray[np.generic]:
     return np.concatenate(arrays) if arrays else np.zeros(0)
 
 
-def _flights(table: object) -> Iterable[Flight]:
+def _flights(table: object) -> Iterable[FlightSamples]:
     columns = {name: table[name].to_numpy() for name in table.column_names}  # type: ignore[attr-defined,index]
     worlds, seeds = columns["world"], columns["seed"]
     rows = len(worlds)
@@ -148,7 +148,7 @@ def _flights(table: object) -> Iterable[Flight]:
     deltas = np.column_stack([columns[name] for name in NAMES]).astype(np.int16)
     extended = np.column_stack([columns[state.name] for state in EXTENDED]).astype(np.int16)
     for start, end in itertools.pairwise(edges):
-        yield Flight(
+        yield FlightSamples(
             world=str(worlds[start]),
             seed=int(seeds[start]),
             stamps_s=columns["stamp_s"][start:end],

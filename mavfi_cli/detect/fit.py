@@ -1,7 +1,7 @@
-"""Models from a data set of error-free flights.
+"""Fits models to a data set of error-free flights.
 
-Flights are split by seed into three parts: `train` fits weights, means and scales, `validation`
-says when the autoencoder has learned enough, `threshold` sets the thresholds. No flight is in two.
+Flights are split by seed into three disjoint parts: `train` fits weights, means and scales,
+`validation` selects the epoch of the autoencoder, and `threshold` sets the thresholds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.detect import gaussian, span, train_autoencoder
 from mavfi_cli.detect.autoencoder import AutoencoderDetector
 from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.dataset import Dataset, Flight
+from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.model import Model, checked_threshold
 from mavfi_cli.detect.norm import NormDetector
@@ -31,9 +31,9 @@ from mavfi_cli.detect.span import RangeDetector
 from mavfi_cli.detect.watch import ranges_of
 
 FLIGHTS_MIN = 10
-# Whose turn it is, over and over: of ten flights five train, one validates, four set thresholds.
+# Cycle of the split: of ten flights, five train, one validates and four set thresholds.
 _TURNS = ("train", "threshold") * 4 + ("train", "validation")
-# Two reports can come between two ticks, so a sequence number may step by two.
+# Two reports can arrive between two ticks, so a sequence number may increase by two.
 _LEAST_SCALE = np.array([2 if s.dtype is DType.INT32 else 1 for s in DETECTED])
 _X, _Y = ([NAMES.index(f"{prefix}{axis}") for prefix in ("waypoint_", "waypoint_v", "command_v")]
           for axis in "xy")  # fmt: skip
@@ -43,7 +43,7 @@ KINDS = ("gad", "aad", "range", "l2")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Split:
-    """Places of the flights of a data set, by what they are for."""
+    """Indices of the flights of a data set by their use."""
 
     train: tuple[int, ...]
     validation: tuple[int, ...]
@@ -51,10 +51,10 @@ class Split:
 
 
 def split(dataset: Dataset, seed: int) -> Split:
-    """Split by flight, alike in each world.
+    """Split by flight, in the same way for each world.
 
     Raises:
-        ModelError: fewer than FLIGHTS_MIN flights.
+        ModelError: There are fewer than FLIGHTS_MIN flights.
     """
     _refuse_few(len(dataset))
     drawn = generator(seed, Stream.MISSION, "detector-split").permutation(len(dataset))
@@ -67,15 +67,17 @@ def split(dataset: Dataset, seed: int) -> Split:
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
-    """Say before the flights what would keep `fit` from fitting to them.
+    """Check before the flights that `fit` will be able to use them.
 
     Args:
-        flights: how many there will be at most.
+        kinds: Kinds of detector to fit.
+        flights: Maximum number of flights.
+        n_sigma: Threshold of the Gaussian model.
 
     Raises:
-        UnknownName: an unknown kind.
-        ModelError: too few flights, or torch is missing for aad.
-        ConfigError: n sigma out of range.
+        UnknownName: A kind is unknown.
+        ModelError: There are too few flights, or torch is missing for aad.
+        ConfigError: n sigma is out of range.
     """
     for kind in kinds:
         if kind not in KINDS:
@@ -100,22 +102,23 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     """Fit one kind of detector.
 
     Args:
-        kind: gad, aad, range or l2.
-        seed: of the split and of the autoencoder's first weights.
-        n_sigma: threshold of the Gaussian model; None takes the least whole number that error-free
+        kind: Kind of detector: gad, aad, range or l2.
+        dataset: Error-free flights.
+        seed: Seed of the autoencoder's initial weights and of the split.
+        n_sigma: Threshold of the Gaussian model. None selects the smallest integer that the
             flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
 
     Raises:
-        UnknownName: an unknown kind.
-        ModelError: too few flights, or torch is missing for aad.
-        ConfigError: n sigma out of range.
+        UnknownName: The kind is unknown.
+        ModelError: There are too few flights, or torch is missing for aad.
+        ConfigError: n sigma is out of range.
     """
     parts = split(dataset, seed)
     flights = dataset.flights
     train = [flights[place] for place in parts.train]
     validation = [flights[place] for place in parts.validation]
     held_out = [flights[place] for place in parts.threshold]
-    told: dict[str, Any] = {}
+    details: dict[str, Any] = {}
     detector: Any
     if kind == "gad":
         cold = (
@@ -125,7 +128,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         )
         detector = warmed(cold, [*train, *validation])
         largest = _largest(detector, held_out)
-        told["largest_distance_sigma"] = largest
+        details["largest_distance_sigma"] = largest
         if n_sigma is None:
             detector.memory["n_sigma"][0] = max(gaussian.N_SIGMA, math.ceil(largest))
     elif kind == "range":
@@ -147,7 +150,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         )
         detector = AutoencoderDetector({"threshold": np.ones(1), "scale": scale, **trained.weights})
         detector.memory["threshold"][0] = _largest(detector, held_out)
-        told.update(trained.told)
+        details.update(trained.provenance)
     else:
         raise _unknown(kind)
     arrays = {name: np.array(array) for name, array in detector.memory.items()}
@@ -157,12 +160,12 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         stack=dataset.stack,
         extended=ranges_of(np.concatenate([flight.extended for flight in flights])),
         preprocess=dataset.preprocess,
-        provenance=_provenance(dataset, parts, seed, detector.threshold, told),
+        provenance=_provenance(dataset, parts, seed, detector.threshold, details),
     )
 
 
-def warmed(detector: GaussianDetector, flights: list[Flight]) -> GaussianDetector:
-    """The detector after it has learned from all samples of the flights."""
+def warmed(detector: GaussianDetector, flights: list[FlightSamples]) -> GaussianDetector:
+    """Return the detector after it has learned all samples of the flights."""
     for flight in flights:
         for stage in Stage:
             for deltas in flight.of_stage(stage):
@@ -170,10 +173,11 @@ def warmed(detector: GaussianDetector, flights: list[Flight]) -> GaussianDetecto
     return detector
 
 
-def scale_of(flights: list[Flight]) -> FloatArray:
-    """Largest |delta| in each state's group (COUNT,), at least 1: inputs lie within about +-1.
+def scale_of(flights: list[FlightSamples]) -> FloatArray:
+    """Return the largest |delta| in each state's group (COUNT,), at least 1.
 
-    The components of a vector share their scale: what one of them shows, another may.
+    The scaled inputs lie within about +-1. The components of a vector share one scale, because each
+    component may take the values of the others.
     """
     rows = mirrored(_all(flights))
     largest = np.maximum(np.abs(rows).max(axis=0), _LEAST_SCALE)
@@ -182,12 +186,12 @@ def scale_of(flights: list[Flight]) -> FloatArray:
 
 
 def mirrored(deltas: Codes) -> NDArray[np.int64]:
-    """All distinct rows (m, COUNT) of the deltas (n, COUNT) and of their mirror images.
+    """Return the distinct rows (m, COUNT) of the deltas (n, COUNT) and their mirror images.
 
-    The training worlds have their goals north-east of the start, but no direction is better than
-    another: east may be west, north may be south, and the two may be swapped. A mirrored velocity
-    or position has the negated code. Yaw is negated with north; under the other two its delta is
-    left as it is, an approximation.
+    The training worlds have their goals north-east of the start, but no direction is special. The
+    images mirror east, mirror north, and swap the two. A mirrored velocity or position has the
+    negated code. Yaw is negated with north. Its delta stays unchanged under the other two, which is
+    an approximation.
     """
     rows = np.unique(deltas.astype(np.int64), axis=0)
     images = []
@@ -204,8 +208,8 @@ def mirrored(deltas: Codes) -> NDArray[np.int64]:
     return np.unique(np.concatenate(images), axis=0)
 
 
-def scores(detector: Detector, flight: Flight) -> FloatArray:
-    """Score of every judged message (n,): the highest of the stages that it brings."""
+def scores(detector: Detector, flight: FlightSamples) -> FloatArray:
+    """Return the score of every judged message (n,): the highest score of its stages."""
     found = np.zeros(len(flight.deltas))
     rows = zip(flight.deltas, *(_flags(flight)), strict=True)
     for row, (deltas, report, step, new) in enumerate(rows):
@@ -219,17 +223,20 @@ def scores(detector: Detector, flight: Flight) -> FloatArray:
     return found
 
 
-def _flags(flight: Flight) -> tuple[list[bool], list[bool], list[bool]]:
+def _flags(flight: FlightSamples) -> tuple[list[bool], list[bool], list[bool]]:
     return flight.reports.tolist(), flight.plan_steps.tolist(), flight.new_waypoint.tolist()
 
 
-def _all(flights: list[Flight]) -> Codes:
-    """Deltas (n, COUNT) of all samples of some flights."""
+def _all(flights: list[FlightSamples]) -> Codes:
+    """Return the deltas (n, COUNT) of all samples of some flights."""
     return np.concatenate([flight.deltas for flight in flights])
 
 
-def _largest(detector: Detector, flights: list[Flight]) -> float:
-    """Largest score of the flights; for one over all states also of their mirror images."""
+def _largest(detector: Detector, flights: list[FlightSamples]) -> float:
+    """Return the largest score of the flights.
+
+    For a detector with one score over all states it includes the mirror images.
+    """
     if detector.per_stage:
         return max(float(scores(detector, flight).max(initial=0.0)) for flight in flights)
     rows = mirrored(_all(flights)).astype(np.int16)
@@ -237,10 +244,10 @@ def _largest(detector: Detector, flights: list[Flight]) -> float:
 
 
 def _provenance(
-    dataset: Dataset, parts: Split, seed: int, threshold: float, told: Mapping[str, Any]
+    dataset: Dataset, parts: Split, seed: int, threshold: float, details: Mapping[str, Any]
 ) -> dict[str, Any]:
     def named(places: tuple[int, ...]) -> list[str]:
-        """Flights as world/seed."""
+        """Return the names of flights as world/seed."""
         return [f"{dataset.flights[p].world}/{dataset.flights[p].seed}" for p in places]
 
     return {
@@ -257,7 +264,7 @@ def _provenance(
         "versions": {
             "python": platform.python_version(),
             "numpy": np.__version__,
-            **told.get("versions", {}),
+            **details.get("versions", {}),
         },
-        **{name: value for name, value in told.items() if name != "versions"},
+        **{name: value for name, value in details.items() if name != "versions"},
     }

@@ -1,7 +1,7 @@
-"""What our own detectors share: they come from a model file, and remember in one flat array.
+"""Base of our own detectors, which load a model file and keep their state in one flat array.
 
-One that is to be cheap judges a whole tick in one compiled call, and so a whole plan. A call costs
-more than the arithmetic in it: in flight, where the caches hold other things, several times more.
+A cheap detector scores a whole tick, or a whole plan, in one compiled call. The call overhead is
+larger than the arithmetic, and several times larger in flight, where caches hold other data.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from mavfi_cli.detect.base import StackMark
 from mavfi_cli.detect.watch import Ranges
 
 Shapes = dict[str, tuple[int, ...]]
-# (memory, work, waypoints, row, velocity, yaw, keep_report) -> score, and whose it is.
+# (memory, work, waypoints, row, velocity, yaw, keep_report) -> score and its stage.
 TickJudge = Callable[..., tuple[float, int]]
-# (memory, work, waypoints, first, steps, changes, scores) -> how many steps there are.
+# (memory, work, waypoints, first, steps, changes, scores) -> number of steps.
 PlanJudge = Callable[..., int]
-PASSED, OF_PLANNING, OF_CONTROL = range(3)  # which stage's score is above the threshold
+PASSED, OF_PLANNING, OF_CONTROL = range(3)  # stage with a score above the threshold
 
 
 class FittedDetector:
-    """A detector whose memory is one flat array, so that compiled code takes a single argument.
+    """A detector with its state in one flat array, which compiled code takes as one argument.
 
     Attributes:
-        shapes: names and shapes of the pieces of the memory, in their order; the first one, a
-            single number, is the threshold.
-        divisors: pieces besides the threshold of which every number must be above 0.
-        scratch: numbers that compiled code wants for itself, after the pieces.
-        stack: that of the flights which the model was fitted to; None without a model file.
-        extended: ranges of the extended states in these flights; None without a model file.
-        tick_judge: `preprocess.take_tick`, then score and learn as the gate does, in one call.
-        plan_judge: `preprocess.plan_deltas`, and the score of each step that it finds.
+        shapes: Names and shapes of the parts of the memory, in their order. The first part is the
+            threshold, a single number.
+        divisors: Parts, besides the threshold, whose numbers must all be above 0.
+        scratch: Number of scratch elements for compiled code after the parts.
+        stack: Stack of the flights that the model was fitted to; None without a model file.
+        extended: Ranges of the extended states in these flights; None without a model file.
+        tick_judge: `preprocess.take_tick` followed by scoring and learning as in the gate.
+        plan_judge: `preprocess.plan_deltas` and the score of each step that it finds.
     """
 
     name: ClassVar[str]
@@ -64,23 +64,23 @@ class FittedDetector:
 
     @property
     def memory(self) -> Mapping[str, FloatArray]:
-        """Views of all that decides; a change takes effect with the next sample."""
+        """Writable views of the detector's state. A change takes effect at the next sample."""
         return self._memory
 
     @property
     def flat(self) -> FloatArray:
-        """All of the memory in one array, as compiled code takes it."""
+        """All of the memory as one array, the argument of compiled code."""
         return self._flat
 
     @property
     def threshold(self) -> float:
-        """A score above it is an alarm."""
+        """Threshold. A score above it raises an alarm."""
         threshold: float = self._flat.item(0)
         return threshold
 
     @classmethod
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
-        """The detector of a model file; None takes that shipped for the default stack.
+        """Create the detector of a model file; None selects the one for the default stack.
 
         See `base.Factory`.
         """

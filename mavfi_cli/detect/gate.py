@@ -1,18 +1,17 @@
-"""The gate: every message passes it before it takes effect, and the detector may raise an alarm.
+"""The gate: every message passes it before it takes effect, and may raise an alarm.
 
-The gate knows messages and deltas, no clock and no mission. A message that raised an alarm is
-neither the next reference nor learned from: the caller withholds it and has the stage recompute.
-Where the caller lets it pass nevertheless, because recomputing confirmed it, it says so with
-`accept_report` or `accept_tick`: then the message becomes the reference.
+The gate knows messages and deltas, but no clock and no mission. A message that raises an alarm does
+not become the reference, and the detector does not learn it. The caller withholds the message and
+recomputes the stage. If recomputation confirms the message, the caller accepts it with
+`accept_report`, `accept_plan` or `accept_tick`, and the message becomes the reference.
 
-Per stage (`Detector.per_stage`) the alarm names the stage whose states were anomalous. A detector
-over all stages sees one vector: of a report on its arrival, and of each tick together with the
-report that arrived since the tick before. Its alarm always names control (paper, section V-D).
+The alarm of a per-stage detector (`Detector.per_stage`) names the stage with anomalous states. A
+detector over all stages scores one vector: of a report on its arrival, and of each tick together
+with the report that arrived since the last tick. Its alarm always names control (paper, section
+V-D). The gate also checks a plan as a whole. Such an alarm names the waypoint to drop.
 
-A plan is looked through as a whole, too; an alarm then also names the waypoint to drop.
-
-An extended watch judges further states of reports and plans one by one, before the detector judges
-the message. Its alarm names the stage of the message, whatever the detector.
+An extended watch checks further states of reports and plans one by one before the detector scores
+the message. Its alarm names the stage of the message for every detector.
 """
 
 from __future__ import annotations
@@ -53,28 +52,28 @@ ALL_STAGES = frozenset(Stage)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alarm:
-    """A message that looks wrong."""
+    """Alarm about an anomalous message."""
 
-    stage: Stage  # that is to be recomputed
+    stage: Stage  # stage to recompute
     detector: str
     score: float
     threshold: float
-    states: tuple[str, ...]  # what looks wrong, worst first
-    waypoint: int | None = None  # of a plan that was looked through: the one to drop
-    mended: Trajectory | None = None  # of an extended watch: the flown plan as it was accepted
+    states: tuple[str, ...]  # anomalous states, worst first
+    waypoint: int | None = None  # waypoint to drop, for the alarm of a plan
+    mended: Trajectory | None = None  # active plan with the accepted extended states
 
 
 class Gate:
-    """One mission's gate.
+    """The gate of one mission.
 
     Args:
-        detector: fresh, for this mission alone: it learns.
-        protect: the stages whose states are watched; others are as if they never changed.
-        params: how states become deltas; must be those the detector's model was made with.
-        watch: judges the extended states; None: they are not watched.
+        detector: New detector for this mission only, because it learns.
+        protect: Stages to watch. The deltas of the others stay 0.
+        params: Preprocessing parameters; must be those of the detector's model.
+        watch: Watch of the extended states; None for no watch.
 
     Attributes:
-        fresh: stages of which the last judged message brought a new sample.
+        fresh: Stages with a new sample in the last judged message.
     """
 
     def __init__(
@@ -86,7 +85,7 @@ class Gate:
     ) -> None:
         self.detector = detector
         self._watch = watch
-        self._report: CollisionReport | None = None  # judged last
+        self._report: CollisionReport | None = None  # last judged report
         self.protect = protect
         self.fresh: tuple[Stage, ...] = ()
         self._per_stage = detector.per_stage
@@ -95,9 +94,9 @@ class Gate:
         self._trajectory: Trajectory | None = None  # last accepted waypoint
         self._index = -1
         self._judged: tuple[Trajectory | None, int] = (None, -1)
-        self._pending = False  # a report's deltas wait for the next tick
+        self._pending = False  # True if a report's deltas wait for the next tick
         self._ignored = [slice(*SPANS[stage]) for stage in Stage if stage not in protect]
-        self._steps = np.empty(0, np.int64)  # room for the steps of a plan, see `_look`
+        self._steps = np.empty(0, np.int64)  # buffer for the steps of a plan, see `_look`
         self._changes = np.empty((0, COUNT), np.int16)
         self._scores = np.empty(0)
         fitted = detector if isinstance(detector, FittedDetector) else None
@@ -107,18 +106,18 @@ class Gate:
 
     @property
     def deltas(self) -> Codes:
-        """Copy of what the detector was shown last, (COUNT,)."""
+        """Copy of the detector's last input (COUNT,)."""
         deltas: Codes = self._deltas.copy()
         return deltas
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
-        """All that decides, the gate's own part included: a fault in there takes effect."""
+        """All state of detector and gate as writable arrays, so that a fault takes effect."""
         own = {"gate": self._work} | ({} if self._watch is None else {"watch": self._watch.memory})
         return {**own, **self.detector.memory}
 
     def judge_report(self, report: CollisionReport) -> Alarm | None:
-        """Perception's message has arrived."""
+        """Judge a collision report on its arrival."""
         take_report(report.time_to_collision_s, report.future_collision_seq, self._work)
         self.fresh = (Stage.PERCEPTION,)
         self._pending = False
@@ -143,10 +142,10 @@ class Gate:
         return None
 
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
-        """A plan was published: all its steps from waypoint to waypoint, and its extended states.
+        """Judge a published plan: all steps from waypoint to waypoint, and the extended states.
 
-        The steps are for detectors that judge each stage alone; for one over all stages control is
-        what an alarm recomputes, and there is nothing to recompute yet: see `judge_ahead`.
+        Only per-stage detectors judge the steps. An alarm of a detector over all stages recomputes
+        control, and there is no command to recompute yet; see `judge_ahead`.
         """
         if self._watch is None or Stage.PLANNING not in self.protect:
             return self._judge_steps(trajectory, 0) if self._per_stage else None
@@ -162,23 +161,24 @@ class Gate:
         return alarm
 
     def lose_plan(self) -> None:
-        """The planner has failed, or its plan comes for nothing: there is nothing to judge."""
+        """Note that the planner has failed or its plan is not used."""
         if self._watch is not None:
             self._watch.lose(Trajectory)
 
     def judge_ahead(self, trajectory: Trajectory, first: int) -> Alarm | None:
-        """Look through the steps of the plan that is flown, from the present waypoint on.
+        """Judge the steps of the active plan from the present waypoint on.
 
-        For every detector, each time the plan is handed to a node that looks ahead: the collision
-        check meets a corrupted waypoint long before it is flown. Changes nothing in the gate, and
-        the detector learns nothing.
+        The caller does this for every detector each time a node that looks ahead gets the plan,
+        because the collision check uses a corrupted waypoint long before it is flown. The call does
+        not change the gate, and the detector does not learn.
 
         Args:
-            first: the waypoint that is followed now.
+            trajectory: Active plan.
+            first: Index of the present waypoint.
 
         Returns:
-            The alarm of the first bad step, which names the waypoint to drop; or that of extended
-            states that are not those of the plan as it was accepted.
+            Alarm of the first bad step, which names the waypoint to drop, or alarm about extended
+            states that differ from the accepted plan's.
         """
         if self._watch is not None and Stage.PLANNING in self.protect:
             finding = self._watch.judge_flown(trajectory)
@@ -199,7 +199,7 @@ class Gate:
                 continue
             if bad is None:
                 bad = number, score
-            elif steps[number] == steps[bad[0]] + 1:  # away from the bad waypoint again
+            elif steps[number] == steps[bad[0]] + 1:  # the step away from the bad waypoint
                 return self._plan_alarm(changes[bad[0]], bad[1], int(steps[number]))
             else:
                 break
@@ -210,7 +210,7 @@ class Gate:
         return self._plan_alarm(changes[bad[0]], bad[1], step if only_first else step + 1)
 
     def _look(self, trajectory: Trajectory, first: int) -> list[float]:
-        """Scores of the steps in which a code changes; `_steps` and `_changes` say which."""
+        """Return the scores of the steps with a changed code; `_steps` and `_changes` hold them."""
         waypoints = trajectory.waypoints
         if len(waypoints) > len(self._steps):
             self._steps = np.empty(len(waypoints), np.int64)
@@ -233,10 +233,10 @@ class Gate:
     def judge_tick(
         self, trajectory: Trajectory | None, index: int, command: Command
     ) -> Alarm | None:
-        """The waypoint that is followed now, and the command about to go out.
+        """Judge the present waypoint and the command before it is sent.
 
-        A waypoint is a new sample where trajectory or index differ from the last accepted one's.
-        Where its stage raises an alarm, the command that came of it is not judged.
+        A waypoint is a new sample if its trajectory or index differs from the last accepted one. If
+        its stage raises an alarm, the command computed from it is not judged.
         """
         if trajectory is None or (trajectory is self._trajectory and index == self._index):
             waypoints, row = _NO_WAYPOINTS, -1
@@ -274,7 +274,7 @@ class Gate:
         return None
 
     def _tick_alarm(self, score: float, verdict: int) -> Alarm:
-        """Of a tick that was judged in one call."""
+        """Return the alarm of a tick that was scored in one compiled call."""
         of_control = self._per_stage and verdict != OF_PLANNING
         for stage in _TICK if of_control else self.fresh:
             self._reject(stage)
@@ -301,18 +301,18 @@ class Gate:
         return None
 
     def accept_report(self) -> None:
-        """The report judged last passes in spite of its alarm: it becomes the reference."""
+        """Accept the last judged report in spite of its alarm. It becomes the reference."""
         self._confirm(Stage.PERCEPTION)
         if self._watch is not None and self._report is not None:
             self._watch.accept(self._report)
 
     def accept_plan(self, trajectory: Trajectory) -> None:
-        """A published plan passes in spite of its alarm."""
+        """Accept a published plan in spite of its alarm."""
         if self._watch is not None:
             self._watch.accept(trajectory)
 
     def accept_tick(self) -> None:
-        """The waypoint and command judged last pass in spite of an alarm."""
+        """Accept the last judged waypoint and command in spite of an alarm."""
         for stage in self.fresh:
             if stage is not Stage.PERCEPTION:
                 self._confirm(stage)
@@ -320,7 +320,7 @@ class Gate:
             self._trajectory, self._index = self._judged
 
     def forget(self, stage: Stage) -> None:
-        """There is no last sample of that stage any more; the next one is taken unjudged."""
+        """Forget the last sample of a stage. The next one is accepted without judgement."""
         first, end = SPANS[stage]
         self._work[REFERENCE, first:end] = UNKNOWN
         if stage is Stage.PLANNING:
@@ -328,7 +328,7 @@ class Gate:
 
     @property
     def threshold(self) -> float:
-        """The detector's, as it is in its memory."""
+        """The detector's present threshold."""
         return self.detector.threshold
 
     def _reject(self, stage: Stage) -> None:
@@ -358,7 +358,7 @@ class Gate:
         )
 
     def _blame(self, stage: Stage, threshold: float, deltas: Codes) -> tuple[str, ...]:
-        """States that are anomalous on their own, worst first; all that changed, if none is."""
+        """Return the states that are anomalous alone, worst first, or else all that changed."""
         first, end = SPANS[stage] if self._per_stage else (0, COUNT)
         alone: list[tuple[float, int]] = []
         for place in range(first, end):

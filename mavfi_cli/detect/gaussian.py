@@ -1,13 +1,13 @@
-"""GAD: one online Gaussian model a state; alarms are gathered per stage (paper, section V-C).
+"""GAD: one online Gaussian model per state, with alarms per stage (paper, section V-C).
 
 Mean and sum of squares follow equations 1 and 2, with M_1 = x_1 and S_1 = 0:
 
     M_k = M_{k-1} + (x_k - M_{k-1}) / k
     S_k = S_{k-1} + (x_k - M_{k-1}) (x_k - M_k),        sigma = sqrt(S_k / (k - 1)).
 
-The score of a stage is the largest |x - M| / sigma of its states; the threshold is n. Codes are
-integers, and a state that hardly ever changes has a sigma next to nothing, so sigma counts as no
-less than `sigma_floor` of its stage. With fewer than two samples sigma is that floor.
+The score of a stage is the largest |x - M| / sigma of its states. The threshold is n. Codes are
+integers, and a state that rarely changes has a sigma close to 0, so `sigma_floor` of the stage is a
+lower limit of sigma. With fewer than two samples sigma is this floor.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from mavfi_cli.detect.preprocess import (
 )
 
 N_SIGMA = 5.0
-# In codes. Commands come 25 times as often as waypoints and change the less from one to the next.
+# In codes. Commands are 25 times as frequent as waypoints and change less between samples.
 SIGMA_FLOORS = {Stage.PERCEPTION: 0.3, Stage.PLANNING: 0.3, Stage.CONTROL: 0.5}
-_FLOOR = 1  # places in the flat array
+_FLOOR = 1  # offset in the flat array
 _COUNT = _FLOOR + COUNT
 _MEAN = _COUNT + COUNT
 _SUM = _MEAN + COUNT
@@ -43,7 +43,7 @@ _PLANNING, _CONTROL = SPANS[Stage.PLANNING]
 
 @compiled
 def farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
-    """Largest distance from the mean in sigmas; NaN where a model is broken."""
+    """Return the largest distance from the mean in sigmas; NaN if a model is corrupted."""
     worst = 0.0
     for place in range(first, end):
         count = memory[_COUNT + place]
@@ -62,7 +62,7 @@ def farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
 
 @compiled
 def welford(memory: FloatArray, deltas: Codes, first: int, end: int) -> None:
-    """One sample more for each state from `first` to before `end`."""
+    """Add one sample to the model of each state from `first` up to, not including, `end`."""
     for place in range(first, end):
         value = float(deltas[place])
         count = memory[_COUNT + place] + 1.0
@@ -84,7 +84,7 @@ def judge_tick(
     yaw_rad: float,
     keep_report: bool,
 ) -> tuple[float, int]:
-    """Deltas of a tick, judged and learned stage by stage; see `FittedDetector.tick_judge`."""
+    """Score and learn the deltas of a tick per stage; see `FittedDetector.tick_judge`."""
     take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
     deltas = work[DELTA]
     if row >= 0:
@@ -109,7 +109,7 @@ def judge_plan(
     changes: Codes,
     scores: FloatArray,
 ) -> int:
-    """Steps of a plan and their scores; see `FittedDetector.plan_judge`."""
+    """Compute the steps of a plan and their scores; see `FittedDetector.plan_judge`."""
     count = plan_deltas(waypoints, first, work, steps, changes)
     for number in range(count):
         scores[number] = farthest(memory, changes[number], _PLANNING, _CONTROL)
@@ -134,7 +134,7 @@ class GaussianDetector(FittedDetector):
 
     @classmethod
     def cold(cls, n_sigma: float = N_SIGMA) -> GaussianDetector:
-        """One that has not seen any sample."""
+        """Create a detector that has not learned any sample."""
         arrays = {name: np.zeros(shape) for name, shape in cls.shapes.items()}
         arrays["n_sigma"][0] = n_sigma
         for stage, floor in SIGMA_FLOORS.items():
@@ -142,12 +142,12 @@ class GaussianDetector(FittedDetector):
         return cls(arrays)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Sigmas between the stage's most anomalous delta and its mean."""
+        """Return the distance of the stage's most anomalous delta from its mean, in sigmas."""
         first, end = span(stage)
         distance: float = farthest(self._flat, deltas, first, end)
         return distance
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Equations 1 and 2, for each state of the stage."""
+        """Apply equations 1 and 2 to each state of the stage."""
         first, end = span(stage)
         welford(self._flat, deltas, first, end)

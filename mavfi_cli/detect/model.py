@@ -1,9 +1,9 @@
-"""Artefacts: what was fitted, in one JSON file, with where it came from.
+"""Model files: a fitted detector with its provenance in one JSON file.
 
-A file holds the schema's and mavfi's version, digests of the states table and of the
-preprocessing parameters, the stack that was flown, the detector's kind, its arrays, the ranges of
-the extended states, and the provenance: worlds, seeds, split, versions, threshold, loss curve. It
-is read strictly: what does not fit is refused in one line, and nothing is guessed.
+A file holds the versions of schema and mavfi, digests of the state table and of the preprocessing
+parameters, the flown stack, the detector's kind, its arrays, the ranges of the extended states, and
+the provenance: worlds, seeds, split, versions, threshold, loss curve. Reading is strict: any
+mismatch is an error of one line.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ _KEYS = frozenset(
     {"schema", "mavfi", "states", "preprocess", "preprocess_digest", "stack", "detector", "arrays",
      "extended", "provenance"}
 )  # fmt: skip
-SHIPPED = Path(__file__).parent / "models"  # a folder a stack
-DEFAULT_STACK = "mavbench"  # whose models are taken where no stack is named
+SHIPPED = Path(__file__).parent / "models"  # one folder per stack
+DEFAULT_STACK = "mavbench"  # stack of the default models
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
     """A fitted detector."""
 
-    detector: str  # kind: gad, aad, range, l2
+    detector: str  # kind: gad, aad, range or l2
     arrays: Mapping[str, FloatArray]
-    stack: StackMark  # of the flights it was fitted to
-    extended: Ranges  # what these flights have shown of the extended states
+    stack: StackMark  # stack of the flights it was fitted to
+    extended: Ranges  # ranges of the extended states in these flights
     preprocess: PreprocessParams = field(default_factory=PreprocessParams)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     mavfi: str = field(default_factory=lambda: version("mavfi"))
 
 
 def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
-    """Where the shipped model of one of our detectors for one of `shipped_stacks` lies."""
+    """Return the path of the shipped model of our detector for one of `shipped_stacks`."""
     return SHIPPED / stack / f"{detector}.json"
 
 
 def shipped_stacks() -> list[str]:
-    """The stacks that models are shipped for, in alphabetical order."""
+    """Return the stacks with shipped models, in alphabetical order."""
     return sorted(folder.name for folder in SHIPPED.iterdir() if folder.is_dir())
 
 
@@ -63,8 +63,8 @@ def save(path: Path, model: Model) -> None:
     """Write a model atomically.
 
     Raises:
-        ModelError: a number that is not finite; nothing is written.
-        RecordError: the file could not be written.
+        ModelError: A number is not finite. Nothing is written.
+        RecordError: The file could not be written.
     """
     for name, array in model.arrays.items():
         if not np.isfinite(array).all():
@@ -92,18 +92,18 @@ def load(
     shapes: Mapping[str, tuple[int, ...]],
     positive: Collection[str] = (),
 ) -> Model:
-    """Read a model of that kind, whose arrays have these shapes.
+    """Read a model of a kind with arrays of the given shapes.
 
     Args:
-        positive: arrays of which every number must be above 0.
+        positive: Names of arrays whose numbers must all be above 0.
 
     Returns:
-        The model, whatever its stack: who flies it compares that with the mission's.
+        The model of any stack. The caller compares its stack with the mission's.
 
     Raises:
-        ModelError: the file cannot be read or is corrupt; it is of another schema or mavfi
-            version, states table, preprocessing or kind; an array is missing, unknown, of another
-            shape, not finite, or out of range.
+        ModelError: The file cannot be read or is corrupt; it has another schema, mavfi version,
+            state table, preprocessing or kind; an array is missing, unknown, of another shape, not
+            finite, or out of range.
     """
     data = _read(path)
     _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
@@ -135,29 +135,29 @@ def load(
 
 
 def preprocessing(path: Path) -> PreprocessParams:
-    """The preprocessing parameters of a model file, for the gate that its detector serves."""
+    """Read the preprocessing parameters of a model file, for the gate of its detector."""
     return _preprocess(path, _read(path))
 
 
 def provenance(path: Path) -> dict[str, Any]:
-    """Where a model file came from, whatever its kind; its header as well.
+    """Read provenance and header of a model file of any kind.
 
     Raises:
-        ModelError: the file cannot be read or says nothing about it.
+        ModelError: The file cannot be read or has no provenance.
     """
     data = _read(path)
-    told = data.get("provenance")
-    if not isinstance(told, dict):
+    recorded = data.get("provenance")
+    if not isinstance(recorded, dict):
         raise ModelError("corrupt model file: provenance is no object", path=path)
     header = {key: data.get(key) for key in ("mavfi", "detector", "stack")}
-    return {**header, **told}
+    return {**header, **recorded}
 
 
 def checked_threshold(value: float, key: str = "threshold") -> float:
-    """A threshold that makes sense: a finite number above 0.
+    """Return a threshold that is a finite number above 0.
 
     Raises:
-        ConfigError: any other.
+        ConfigError: The threshold is not finite or not above 0.
     """
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigError(f"must be a finite number above 0, got {value!r}", key=key)

@@ -1,4 +1,4 @@
-"""Baseline `l2`: the norm of all deltas, each in units of its scale."""
+"""Baseline detector `l2`: the norm of all deltas, each in units of its scale."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mavfi_cli.detect.preprocess import COUNT, Codes
 
 
 class NormDetector(FittedDetector):
-    """The score is the root of the sum of squares of the scaled deltas."""
+    """Detector whose score is the Euclidean norm of the scaled deltas."""
 
     name: ClassVar[str] = "l2"
     per_stage = False
@@ -20,17 +20,17 @@ class NormDetector(FittedDetector):
     divisors: ClassVar[tuple[str, ...]] = ("scale",)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Norm of the scaled deltas."""
+        """Return the norm of the scaled deltas."""
         length: float = norm(self._flat, deltas)
         return length
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Nothing: the scales are fixed."""
+        """Do nothing, because the scales are fixed."""
 
 
 @compiled
 def norm(memory: FloatArray, deltas: Codes) -> float:
-    """Root of the sum of squares of the scaled deltas (COUNT,)."""
+    """Return the Euclidean norm of the scaled deltas (COUNT,)."""
     total = 0.0
     for place in range(COUNT):
         scaled = deltas[place] / memory[1 + place]

@@ -1,12 +1,12 @@
-"""A flight's trace once more through the gate: samples to fit to, and scores of a detector.
+"""Replays a flight's trace through the gate to get samples for a fit and scores of a detector.
 
-A trace is a mapping of column names to arrays, one row a control tick: `stamp_s`, every monitored
-state by its name (NaN or masked while no message has carried it), and, where the trace has them,
-`report_stamp_s`, `waypoint_index` and `trajectory_stamp_s`, by which a new message with old values
-is known. Without them a message is new where one of its values is.
+A trace maps column names to arrays with one row per control tick. It has `stamp_s` and every
+monitored state by its name (NaN or masked before the first message with the state). Optional
+columns `report_stamp_s`, `waypoint_index` and `trajectory_stamp_s` identify a new message with
+unchanged values. Without them a message counts as new if one of its values changes.
 
-A trace knows the waypoint that is followed; the gate also looks through the plan that is flown.
-Where the published plans, and what a fault did to the flown one, are given too, so does this.
+A trace holds the present waypoint only, but the gate also judges the active plan. The replay does
+this, too, if it gets the published plans and the changes that a fault made to the active one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.states import BY_NAME, STATES, DType
 from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Trajectory
 from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.dataset import Flight
+from mavfi_cli.detect.dataset import FlightSamples
 from mavfi_cli.detect.gate import ALL_STAGES, Alarm, Gate
 from mavfi_cli.detect.preprocess import (
     COUNT,
@@ -43,7 +43,7 @@ _COMMAND = list(NAMES[slice(*SPANS[Stage.CONTROL])])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanStrike:
-    """A value that a fault changed in the memory of a plan."""
+    """A value that a fault changed in the active plan."""
 
     stamp_s: float
     state: str
@@ -54,18 +54,18 @@ class PlanStrike:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """What the gate said of one message."""
+    """The gate's judgement of one message."""
 
     stamp_s: float
-    report: bool  # a collision report, else a control tick
+    report: bool  # True for a collision report, False for a control tick
     new_waypoint: bool
     deltas: Codes  # (COUNT,)
-    score: float  # the highest of what was judged: stages, and steps of the plan ahead
+    score: float  # highest score of the stages and of the plan's steps ahead
     alarm: Alarm | None
 
 
 class _Probe:
-    """Passes everything on to a detector, and remembers the highest score since the last look."""
+    """Wraps a detector and keeps the highest score since the last `look`."""
 
     def __init__(self, detector: Detector | None) -> None:
         self.name = "none" if detector is None else detector.name
@@ -75,28 +75,28 @@ class _Probe:
 
     @property
     def threshold(self) -> float:
-        """The detector's; infinite without one."""
+        """Threshold of the detector; infinite without one."""
         return np.inf if self._detector is None else self._detector.threshold
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
-        """The detector's."""
+        """Memory of the detector."""
         return {} if self._detector is None else self._detector.memory
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """The detector's, remembered if it is the highest or NaN; 0 without one."""
+        """Return the detector's score, or 0 without one. Keep it if it is the highest or NaN."""
         score = 0.0 if self._detector is None else self._detector.score(deltas, stage)
         if not score <= self.highest:
             self.highest = score
         return score
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Handed on."""
+        """Pass the sample to the detector."""
         if self._detector is not None:
             self._detector.learn(deltas, stage)
 
     def look(self) -> float:
-        """The highest score since the last look; minus infinity where there was none."""
+        """Return the highest score since the last look; minus infinity if there was none."""
         highest, self.highest = self.highest, -np.inf
         return highest
 
@@ -111,21 +111,22 @@ def replay(
     plans: Sequence[Trajectory] = (),
     strikes: Sequence[PlanStrike] = (),
 ) -> Iterator[Judgement]:
-    """Judge every message of a trace, in the order in which they came.
+    """Judge every message of a trace in the order of arrival.
 
-    Nothing is recomputed: the messages are those that were flown.
+    Nothing is recomputed; the messages are those of the flight.
 
     Args:
-        detector: fresh; None only takes the deltas.
-        patience: alarms in a row, of one kind of message, that are obeyed; the message after
-            them is accepted. 0: every message becomes the reference, so that scores do not
-            depend on the threshold.
-        plans: those that were published. The one that is flown is looked through when it is new,
-            when a waypoint is begun and when it is struck; the score is part of the tick's.
-        strikes: what a fault did to plans after they had been published.
+        trace: Trace of the flight.
+        detector: New detector; None computes the deltas only.
+        patience: Maximum number of consecutive alarms for one kind of message. The next message is
+            accepted. With 0 every message becomes the reference, so that scores do not depend on
+            the threshold.
+        plans: Published plans. The active plan is judged when it is new, when a waypoint begins,
+            and when a fault strikes it. The score is part of the tick's.
+        strikes: Changes that a fault made to plans after their publication.
 
     Raises:
-        ModelError: a column is missing.
+        ModelError: A column is missing.
     """
     messages = _Messages(trace)
     flown = _FlownPlans(trace, plans, strikes)
@@ -168,11 +169,11 @@ def flight_of(
     seed: int,
     params: PreprocessParams | None = None,
     plans: Sequence[Trajectory] = (),
-) -> Flight:
-    """The samples of one error-free flight, for a data set.
+) -> FlightSamples:
+    """Extract the samples of one error-free flight for a data set.
 
     Args:
-        plans: all that were published; a trace only knows the waypoints that were flown.
+        plans: All published plans. The trace holds the flown waypoints only.
     """
     params = params or PreprocessParams()
     judged = list(replay(trace, None, params))
@@ -185,7 +186,7 @@ def flight_of(
     for first, plan, row in zip(firsts.tolist(), plans, changes(plans), strict=True):
         if len(plan.waypoints) > 1:
             extended[first] = row
-    return Flight(
+    return FlightSamples(
         world=world,
         seed=seed,
         stamps_s=np.array([each.stamp_s for each in judged] + stamps, np.float64),
@@ -200,7 +201,7 @@ def flight_of(
 
 
 def plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
-    """Deltas (n - 1, COUNT) of a plan's steps from waypoint to waypoint, as the gate sees them."""
+    """Return the deltas (n - 1, COUNT) of a plan's steps, computed as in the gate."""
     rows = len(plan.waypoints)
     steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
     count = plan_deltas(plan.waypoints, 0, working_array(params), steps, changes)
@@ -210,7 +211,7 @@ def plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
 
 
 class _FlownPlans:
-    """The plan that is flown in each row of a trace, as far as it was published."""
+    """The active plan in each row of a trace."""
 
     def __init__(
         self, trace: Columns, plans: Sequence[Trajectory], strikes: Sequence[PlanStrike]
@@ -225,7 +226,7 @@ class _FlownPlans:
             self._waypoints = _reals(trace["waypoint_index"])
 
     def ahead(self, row: int, stamp_s: float) -> tuple[Trajectory, int] | None:
-        """The plan and the waypoint from which on the gate looks through it; None: no look."""
+        """Return the plan to judge and its present waypoint; None if the gate does not judge."""
         if not self._plans:
             return None
         while self._strikes and self._strikes[0].stamp_s <= stamp_s + 1e-9:
@@ -238,7 +239,7 @@ class _FlownPlans:
         return None if plan is seen[0] and waypoint == seen[1] else (plan, waypoint)
 
     def _strike(self, strike: PlanStrike, plan_stamp_s: float) -> None:
-        """The flown plan as it is from now on; a value that was published so is left alone."""
+        """Apply a strike to the active plan, unless the value was published so."""
         plan, state = self._plans.get(plan_stamp_s), BY_NAME[strike.state]
         if plan is None or strike.waypoint >= len(plan.waypoints):
             return
@@ -249,7 +250,7 @@ class _FlownPlans:
 
 
 class _Messages:
-    """The messages that the rows of a trace stand for."""
+    """Reconstructs the messages of a trace from its rows."""
 
     def __init__(self, trace: Columns) -> None:
         names = ["stamp_s", *_REPORT, *_WAYPOINT, *_COMMAND]
@@ -273,17 +274,17 @@ class _Messages:
             | ~np.concatenate([[False], self._has_waypoint[:-1]])
         )
         self._trajectory: Trajectory | None = None
-        told = trace.get("collision")  # else a collision is what has a time
-        self._collisions = np.isfinite(self._reports[:, 0]) if told is None else told
+        collision = trace.get("collision")  # without it, a finite time means a collision
+        self._collisions = np.isfinite(self._reports[:, 0]) if collision is None else collision
 
     @property
     def reports(self) -> list[CollisionReport]:
-        """All reports, oldest first."""
+        """Return all reports, oldest first."""
         found = (self.report(row) for row in range(len(self.stamps_s)))
         return [report for report in found if report is not None]
 
     def report(self, row: int) -> CollisionReport | None:
-        """The report that took effect in this tick, if any did."""
+        """Return the report that took effect in this tick, or None."""
         if not self._new_report[row]:
             return None
         time_s, seq = self._reports[row].tolist()
@@ -295,7 +296,7 @@ class _Messages:
         )
 
     def waypoint(self, row: int) -> Trajectory | None:
-        """A trajectory of the present waypoint alone; the same object while it stays the same."""
+        """Return a trajectory of the present waypoint only, the same object until it changes."""
         if self._new_waypoint[row]:
             self._trajectory = Trajectory(
                 stamp_s=self.stamps_s[row],
@@ -307,7 +308,7 @@ class _Messages:
         return self._trajectory if self._has_waypoint[row] else None
 
     def command(self, row: int) -> Command | None:
-        """The command of this tick."""
+        """Return the command of this tick."""
         if not self._has_command[row]:
             return None
         return Command(
@@ -323,23 +324,23 @@ def _reals(column: NDArray[Any]) -> FloatArray:
 
 
 def _present(column: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where a message has carried the state: not masked, and for plain arrays not NaN."""
+    """Return True for rows with a value: not masked, and not NaN in a plain array."""
     if isinstance(column, np.ma.MaskedArray):
         return ~np.ma.getmaskarray(column)
     return ~np.isnan(_reals(column))
 
 
-def _changes(values: FloatArray, trace: Columns, telling: tuple[str, ...]) -> NDArray[np.bool_]:
-    """Rows (n,) whose values, or one of the telling columns, are not those of the row before."""
-    told = [_reals(trace[name]) for name in telling if name in trace]
-    patterns = np.column_stack([values, *told]).view(np.int64)  # NaN equals itself
+def _changes(values: FloatArray, trace: Columns, markers: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Return True for rows (n,) whose values or marker columns differ from the last row."""
+    marked = [_reals(trace[name]) for name in markers if name in trace]
+    patterns = np.column_stack([values, *marked]).view(np.int64)  # NaN equals itself
     changed = np.ones(len(patterns), np.bool_)
     changed[1:] = (patterns[1:] != patterns[:-1]).any(axis=1)
     return changed
 
 
 def columns_of(table: Any) -> dict[str, NDArray[Any]]:
-    """The columns of an Arrow table as masked arrays, so that a NaN is not taken for a null."""
+    """Return the columns of an Arrow table as masked arrays, which tell NaN from null."""
     columns: dict[str, NDArray[Any]] = {}
     kinds = {state.name: state.dtype for state in STATES}
     for name in table.column_names:

@@ -1,21 +1,20 @@
-"""From states to what a detector sees: sign and exponent as an integer, then its delta in time.
+"""Preprocessing of states: sign and exponent as an integer code, then its change over time.
 
 Paper, section V-B. The code of a float64 with sign s and binary exponent e (of 1.5 it is 0, of 2.0
 it is 1) is its signed log-magnitude above a floor,
 
     code = (-1)^s max(0, min(e, ceiling) - floor),
 
-so that everything below 2^(floor + 1) has the code 0 and a value that passes through zero does not
-look like a fault. Only sign and exponent decide; the mantissa is not read. An integer is its own
-code, saturated. A NaN has a code of its own, far from all others. An infinity has the exponent
-1024, and that of the ceiling where there is one: a `time_to_collision` that is endless and one
-that is merely long are the same news.
+so that every magnitude below 2^(floor + 1) has the code 0, and a zero crossing does not look like a
+fault. The mantissa is ignored. The code of an integer is the integer itself, saturated. NaN has a
+code of its own, far from all others. An infinity has the exponent 1024, or the ceiling if there is
+one, so that an infinite `time_to_collision` and a merely long one have the same code.
 
-The delta is the difference between a sample's code and that of the last accepted sample of the
-same state, saturated to 16 bits; 0 where there is no such sample. Yaw wraps: from beyond 2 rad to
-below -2 rad, or back, counts as no change.
+The delta is the difference between the codes of a sample and of the last accepted sample of the
+same state, saturated to 16 bits. It is 0 if there is no such sample. Yaw wraps: a change from above
+2 rad to below -2 rad, or back, counts as no change.
 
-Why this and not another way to join sign and exponent: docs/detect.md, with measurements.
+docs/detect.md compares this code with other combinations of sign and exponent.
 """
 
 from __future__ import annotations
@@ -40,11 +39,11 @@ DETECTED: tuple[State, ...] = tuple(state for state in STATES if state.detected)
 NAMES: tuple[str, ...] = tuple(state.name for state in DETECTED)
 COUNT = len(DETECTED)
 
-LIMIT = 32767  # of a code and of a delta
-UNKNOWN = -32768  # reference of a state of which no sample was accepted yet
+LIMIT = 32767  # maximum of a code and of a delta
+UNKNOWN = -32768  # reference of a state without an accepted sample
 NAN_CODE = 16384
 
-_MANTISSA_BITS, _EXPONENT_MASK, _BIAS = 52, 0x7FF, 1023  # of a float64
+_MANTISSA_BITS, _EXPONENT_MASK, _BIAS = 52, 0x7FF, 1023  # layout of a float64
 
 # Rows of the working array.
 REFERENCE, PREVIOUS, CODE, DELTA, FLOOR, CEILING, KIND = range(7)
@@ -58,14 +57,14 @@ def _span(stage: Stage) -> tuple[int, int]:
     return places[0], places[-1] + 1
 
 
-# First and one past last place of each stage among the detected states.
+# First index, and index after the last, of each stage among the detected states.
 SPANS: dict[Stage, tuple[int, int]] = {stage: _span(stage) for stage in Stage}
 _PERCEPTION_STAGE, _PLANNING_STAGE = Stage.PERCEPTION, Stage.PLANNING
 _PLANNING, _CONTROL = SPANS[Stage.PLANNING][0], SPANS[Stage.CONTROL][0]
 
 
 def span(stage: Stage) -> tuple[int, int]:
-    """First and one past last place of a stage; quicker than the table, for use in every tick."""
+    """Return the first index of a stage and the index after its last; faster than the table."""
     if stage is _PLANNING_STAGE:
         return _PLANNING, _CONTROL
     return (0, _PLANNING) if stage is _PERCEPTION_STAGE else (_CONTROL, COUNT)
@@ -73,11 +72,11 @@ def span(stage: Stage) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreprocessParams:
-    """Exponents that count as zero, by group of states, and the ceiling of the only endless one.
+    """Floor exponent of each group of states, and the ceiling of `time_to_collision`.
 
-    A floor is about the largest change between two samples of the group in fault-free flight: a
-    waypoint is at most 1.5 m from the next, a command 0.1 m/s from the one 20 ms before. A command
-    changes by more only where a plan begins or ends.
+    A floor is about the largest change between two samples in error-free flight: 1.5 m between
+    waypoints, 0.1 m/s between commands 20 ms apart. A command changes by more only at the start or
+    end of a plan.
     """
 
     time_to_collision_floor: int = 0
@@ -97,7 +96,7 @@ class PreprocessParams:
             raise ConfigError("must be above the floor", key="time_to_collision_ceiling")
 
     def table(self) -> Codes:
-        """Floor, ceiling and kind of each detected state, (3, COUNT)."""
+        """Return floor, ceiling and kind of each detected state, (3, COUNT)."""
         floors = {
             "time_to_collision": self.time_to_collision_floor,
             "waypoint_position": self.position_floor,
@@ -118,12 +117,12 @@ class PreprocessParams:
         return np.array(columns, np.int16).T.copy()
 
     def digest(self) -> str:
-        """SHA-256 of the parameters and of the way they are used."""
+        """Return the SHA-256 of the parameters and of the coding."""
         return _digest({"coding": "signed log-magnitude", **asdict(self)})
 
 
 def states_digest() -> str:
-    """SHA-256 of the detected states: names, stages, types, units, in their order."""
+    """Return the SHA-256 of names, stages, types and units of the detected states in order."""
     return _digest([[s.name, s.stage.value, s.dtype.value, s.unit] for s in DETECTED])
 
 
@@ -132,10 +131,10 @@ def _digest(value: object) -> str:
 
 
 def working_array(params: PreprocessParams) -> Codes:
-    """The array (ROWS, COUNT) that the functions below work on; no reference is known yet.
+    """Create the working array (ROWS, COUNT) of the functions below, without references.
 
-    REFERENCE holds the codes that deltas are taken against, PREVIOUS those before the last
-    sample, CODE and DELTA the last sample's own; FLOOR, CEILING and KIND say how to encode.
+    Row REFERENCE holds the reference codes of the deltas, PREVIOUS the codes before the last
+    sample, CODE and DELTA those of the last sample. FLOOR, CEILING and KIND define the encoding.
     """
     work = np.zeros((ROWS, COUNT), np.int16)
     work[REFERENCE : PREVIOUS + 1] = UNKNOWN
@@ -145,20 +144,20 @@ def working_array(params: PreprocessParams) -> Codes:
 
 @compiled
 def encode(value: float, floor: int, ceiling: int, kind: int) -> int:
-    """Code of one value."""
+    """Return the code of one value."""
     if math.isnan(value):
         return NAN_CODE
     if kind == _INTEGER:
         return int(min(max(value, -LIMIT), LIMIT))
     pattern = np.float64(value).view(np.int64)
-    exponent = int(pattern >> _MANTISSA_BITS & _EXPONENT_MASK) - _BIAS  # 1024 for an infinity
-    magnitude = max(0, min(exponent, ceiling) - floor)  # of 0 and subnormals 0, under any floor
+    exponent = int(pattern >> _MANTISSA_BITS & _EXPONENT_MASK) - _BIAS  # 1024 for infinity
+    magnitude = max(0, min(exponent, ceiling) - floor)  # 0 for zero and subnormals
     return -magnitude if value < 0.0 else magnitude
 
 
 @compiled
 def take(work: Codes, place: int, value: float) -> None:
-    """Encode a new sample of the state at that place, and let it be the reference."""
+    """Encode a new sample of a state and make it the reference."""
     floor, kind = work[FLOOR, place], work[KIND, place]
     code = encode(value, floor, work[CEILING, place], kind)
     before = work[REFERENCE, place]
@@ -170,7 +169,7 @@ def take(work: Codes, place: int, value: float) -> None:
 
 @compiled
 def difference(before: int, code: int, floor: int, kind: int) -> int:
-    """Delta between two codes, saturated; 0 where there is no reference or yaw has wrapped."""
+    """Return the saturated delta of two codes; 0 without a reference or if yaw has wrapped."""
     if before == UNKNOWN:
         return 0
     if kind == _ANGLE:
@@ -182,7 +181,7 @@ def difference(before: int, code: int, floor: int, kind: int) -> int:
 
 @compiled
 def take_report(time_to_collision_s: float, future_collision_seq: float, work: Codes) -> None:
-    """Deltas of a collision report; those of the other stages become 0."""
+    """Compute the deltas of a collision report. Those of the other stages become 0."""
     take(work, 0, time_to_collision_s)
     take(work, 1, future_collision_seq)
     work[DELTA, _PLANNING:] = 0
@@ -197,9 +196,10 @@ def take_tick(
     keep_report: bool,
     work: Codes,
 ) -> None:
-    """Deltas of a control tick: waypoint `index` of (n, 10), none where negative, and a command.
+    """Compute the deltas of a control tick: waypoint `index` of (n, 10), and a command.
 
-    Those of the last report stay where `keep_report`, else they become 0.
+    A negative `index` means no waypoint. The deltas of the last report stay if `keep_report` is set
+    and become 0 otherwise.
     """
     if not keep_report:
         work[DELTA, :_PLANNING] = 0
@@ -215,13 +215,13 @@ def take_tick(
 
 @compiled
 def plan_deltas(waypoints: FloatArray, first: int, work: Codes, steps: IntArray, out: Codes) -> int:
-    """Deltas between consecutive waypoints (n, 10) from `first` on, where there are any.
+    """Compute the nonzero deltas between consecutive waypoints (n, 10) from `first` on.
 
-    Writes the steps k, from waypoint k to k + 1, in which a code changes to `steps` (n,), and
-    their deltas to `out` (n, COUNT). `work` stays as it is.
+    Step k leads from waypoint k to k + 1. Steps with a changed code are written to `steps` (n,) and
+    their deltas to `out` (n, COUNT). `work` does not change.
 
     Returns:
-        How many there are.
+        Number of these steps.
     """
     count = 0
     columns = _CONTROL - _PLANNING

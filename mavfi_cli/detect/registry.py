@@ -1,4 +1,4 @@
-"""Detectors by name: every one is found by its entry point in the group `mavfi.detectors`."""
+"""Registry of detectors, found by their entry points in the group `mavfi.detectors`."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ ENTRY_POINT_GROUP = "mavfi.detectors"
 
 
 def names() -> list[str]:
-    """Names of all detectors that are there, sorted."""
+    """Return the names of all installed detectors, sorted."""
     return sorted({entry.name for entry in entry_points(group=ENTRY_POINT_GROUP)})
 
 
 def find(name: str, *, model: Path | None = None, threshold: float | None = None) -> Detector:
-    """A fresh detector of that name.
+    """Create a new detector of that name.
 
     Args:
-        model: its artefact; None takes the shipped one.
-        threshold: replaces the model's own; the number of sigmas for `gad`.
+        model: Model file; None selects the shipped one.
+        threshold: Replaces the model's threshold; a number of sigmas for `gad`.
 
     Raises:
-        UnknownName: there is none; names the nearest.
-        ModelError: an artefact that cannot be used.
-        ConfigError: a threshold out of range.
+        UnknownName: No detector has this name. Suggests the nearest.
+        ModelError: The model file cannot be used.
+        ConfigError: The threshold is out of range.
     """
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         if entry.name == name:

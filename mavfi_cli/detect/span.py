@@ -1,4 +1,4 @@
-"""Baseline `range`: each state's delta must lie within what error-free flights have shown."""
+"""Baseline detector `range`: each delta must lie within its range in error-free flights."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.detect.fitted import FittedDetector, Shapes
 from mavfi_cli.detect.preprocess import COUNT, Codes, span
 
-MARGIN = 0.5  # codes are integers: the first one outside counts, rounding does not
+MARGIN = 0.5  # codes are integers, so the first code outside the range exceeds this
 
 
 class RangeDetector(FittedDetector):
-    """The score is how far outside its range the stage's worst delta is, in codes; 0 inside."""
+    """Detector whose score is the largest distance of a delta from its range, in codes."""
 
     name: ClassVar[str] = "range"
     per_stage = True
     shapes: ClassVar[Shapes] = {"margin": (1,), "lowest": (COUNT,), "highest": (COUNT,)}
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Distance from the range, in codes."""
+        """Return the largest distance of the stage's deltas from their ranges, in codes."""
         first, end = span(stage)
         distance: float = outside(self._flat, deltas, first, end)
         return distance
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Nothing: the ranges are fixed."""
+        """Do nothing, because the ranges are fixed."""
 
 
 @compiled
 def outside(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
-    """Largest distance of a delta from its range; NaN where a range is broken."""
+    """Return the largest distance of a delta from its range, 0 inside; NaN if one is corrupted."""
     worst = 0.0
     for place in range(first, end):
         below = memory[1 + place] - deltas[place]

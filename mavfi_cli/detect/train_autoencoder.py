@@ -1,9 +1,10 @@
-"""Trains the autoencoder with torch, which only this module needs: `pip install mavfi[train]`.
+"""Trains the autoencoder. Only this module needs torch: `pip install mavfi[train]`.
 
-Adam on the mean squared reconstruction error of all distinct error-free vectors at once, from
-several first weights. The threshold will be a largest error, so the weights kept are those, of all
-epochs and starts, whose largest error on the validation vectors is lowest. One thread, double
-precision, seeded: the same data and the same torch give the same weights.
+Adam minimises the mean squared reconstruction error of all distinct error-free vectors in one
+batch, from several initial weights. The threshold will be a largest error, so the training keeps
+the weights, over all epochs and starts, with the lowest largest error on the validation vectors. It
+runs on one thread in double precision with a fixed seed, so the same data and the same version of
+torch give the same weights.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ CURVE_EVERY = 20  # epochs between two points of the recorded loss curve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trained:
-    """Weights as `autoencoder.WEIGHTS` names them, and what provenance tells of the training."""
+class TrainedWeights:
+    """Weights, named as in `autoencoder.WEIGHTS`, and the provenance of the training."""
 
     weights: Mapping[str, FloatArray]
-    told: Mapping[str, Any]
+    provenance: Mapping[str, Any]
 
 
 def require_torch() -> None:
-    """Say whether training can begin, without the seconds that the import takes.
+    """Check that torch is installed, without the seconds that its import takes.
 
     Raises:
         ModelError: torch is not installed.
@@ -44,12 +45,12 @@ def require_torch() -> None:
         raise ModelError("training the autoencoder needs torch: pip install 'mavfi[train]'")
 
 
-def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> Trained:
-    """Train on scaled vectors (n, 13), keep what meets those for validation (m, 13) best.
+def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> TrainedWeights:
+    """Train on scaled vectors (n, 13) and keep the best weights for the validation (m, 13).
 
     Args:
-        inputs, validation: deltas over their scales, each vector once.
-        seed: of the first start; each further one takes the next.
+        inputs, validation: Scaled deltas, each vector once.
+        seed: Seed of the first start; each further start uses the next.
 
     Raises:
         ModelError: torch is not installed.
@@ -63,11 +64,11 @@ def train(inputs: FloatArray, validation: FloatArray, *, seed: int) -> Trained:
         starts = [_train(torch, inputs, validation, seed + number) for number in range(STARTS)]
     finally:
         torch.set_num_threads(threads)
-    return min(starts, key=lambda start: float(start.told["validation_error"]))
+    return min(starts, key=lambda start: float(start.provenance["validation_error"]))
 
 
-def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
-    """One start."""
+def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) -> TrainedWeights:
+    """Train from one set of initial weights."""
     source = torch.Generator().manual_seed(seed)
     sizes = ((COUNT, HIDDEN), (HIDDEN, CODED), (CODED, COUNT))
     names = ("hidden", "coded", "output")
@@ -79,11 +80,11 @@ def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) ->
         weights[f"{name}_biases"] = torch.zeros(after, dtype=torch.float64).requires_grad_()
 
     def loss_of(rows: Any) -> Any:
-        """Mean squared error (n,) of each of the vectors (n, COUNT)."""
+        """Return the mean squared error (n,) of each of the vectors (n, COUNT)."""
         hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
         coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
         output = coded @ weights["output_weights"].T + weights["output_biases"]
-        return ((output - rows) ** 2).mean(dim=1)  # of each vector
+        return ((output - rows) ** 2).mean(dim=1)  # one error per vector
 
     rows, checked = torch.tensor(inputs), torch.tensor(validation)
     optimiser = torch.optim.Adam(list(weights.values()), lr=LEARNING_RATE)
@@ -101,9 +102,9 @@ def _train(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) ->
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return Trained(
+    return TrainedWeights(
         weights=kept,
-        told={
+        provenance={
             "epochs": EPOCHS,
             "learning_rate": LEARNING_RATE,
             "best_epoch": best_epoch,

@@ -1,11 +1,11 @@
-"""States beyond the 13: each is judged alone, by how far error-free flights have changed it.
+"""Watch of the extended states, each judged alone by its range of changes in error-free flights.
 
-The states are `collision` of a report, and `plan_trajectory_seq` and `plan_future_collision_seq`
-of a plan. They are integers, and an integer is its own code: see `preprocess`. The change since the
-last accepted message must lie between the smallest and the largest that training flights showed.
-All counters begin at 0, and no collision is foreseen then, so the first message is judged as well.
-A planner that counts its plans by itself counts those that never took effect, too: after n messages
-that were not accepted n + 1 changes may have come together.
+The extended states are `collision` of a report, and `plan_trajectory_seq` and
+`plan_future_collision_seq` of a plan. They are integers, which are their own codes; see
+`preprocess`. The change since the last accepted message must lie between the smallest and the
+largest change in the training flights. All counters begin at 0 without a predicted collision, so
+the first message is judged, too. A planner with its own counter also counts plans that never took
+effect. After n messages that were not accepted, n + 1 changes may therefore add up.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mavfi_cli.detect.preprocess import LIMIT, Codes
 EXTENDED = tuple(
     BY_NAME[name] for name in ("collision", "plan_trajectory_seq", "plan_future_collision_seq")
 )
-# Smallest and largest change of each extended state, by its name.
+# Smallest and largest change of each extended state by name.
 Ranges = Mapping[str, tuple[int, int]]
 _PLACES = {
     kind: [place for place, state in enumerate(EXTENDED) if state.message is kind]
@@ -33,11 +33,11 @@ _REFERENCE, _LOWEST = 0, 1  # rows of the array; the third is the largest change
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Extended states of a message that have changed too far.
+    """Extended states of a message with changes outside their ranges.
 
     Attributes:
-        distance: how far the worst of them is outside its range, in codes.
-        states: their names, worst first.
+        distance: Distance of the worst change from its range, in codes.
+        states: Names of the states, worst first.
     """
 
     distance: float
@@ -45,14 +45,14 @@ class Finding:
 
 
 class ExtendedWatch:
-    """Watches the extended states of one mission's messages.
+    """Watch of the extended states of one mission's messages.
 
     Args:
-        ranges: what error-free flights have shown.
+        ranges: Ranges of the changes in error-free flights.
 
     Attributes:
-        memory: (3, 3) int16: the last accepted codes, smallest and largest changes; a column a
-            state. A change takes effect at once.
+        memory: Last accepted codes, smallest and largest changes, (3, 3) int16 with one column per
+            state. A modification takes effect at once.
     """
 
     def __init__(self, ranges: Ranges) -> None:
@@ -61,15 +61,15 @@ class ExtendedWatch:
             np.int16,
         )
         self._lost = dict.fromkeys(_PLACES, 0)  # messages since the last accepted one
-        self._accepted: dict[float, dict[str, Scalar]] = {}  # of each plan, by its stamp
+        self._accepted: dict[float, dict[str, Scalar]] = {}  # states of each plan by its stamp
 
     def judge(self, message: CollisionReport | Trajectory) -> Finding | None:
-        """A message has arrived; `accept` or `lose` says what became of it."""
+        """Judge a message on its arrival. `accept` or `lose` must follow."""
         references = self.memory[_REFERENCE].tolist()
         return self._find(message, references, self._lost[type(message)] + 1)
 
     def accept(self, message: CollisionReport | Trajectory) -> None:
-        """The message takes effect: changes are taken against it from now on."""
+        """Accept a message, which takes effect and becomes the reference."""
         kind = type(message)
         for place in _PLACES[kind]:
             self.memory[_REFERENCE, place] = _code(EXTENDED[place].read(message, 0))
@@ -80,11 +80,11 @@ class ExtendedWatch:
             }
 
     def lose(self, kind: type[CollisionReport | Trajectory]) -> None:
-        """A message of that kind did not take effect."""
+        """Note that a message of that kind did not take effect."""
         self._lost[kind] += 1
 
     def judge_flown(self, plan: Trajectory) -> Finding | None:
-        """Look at the plan that is flown: its states may have changed since it was accepted."""
+        """Judge the active plan, whose states may have changed since it was accepted."""
         accepted = self._accepted.get(plan.stamp_s)
         if accepted is None:
             return None
@@ -92,7 +92,7 @@ class ExtendedWatch:
         return self._find(plan, references, 1)
 
     def mended(self, plan: Trajectory) -> Trajectory:
-        """The plan that is flown with the extended states that were accepted."""
+        """Return the active plan with its accepted extended states."""
         mended: Message = plan
         for name, value in self._accepted[plan.stamp_s].items():
             mended = BY_NAME[name].write(mended, 0, value)
@@ -118,7 +118,7 @@ class ExtendedWatch:
 
 
 def changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes:
-    """Changes (n, 3) of the extended states from message to message, of one kind."""
+    """Return the changes (n, 3) of the extended states between messages of one kind."""
     found = np.zeros((len(messages), len(EXTENDED)), np.int16)
     before = [0] * len(EXTENDED)
     for row, message in enumerate(messages):
@@ -129,7 +129,7 @@ def changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes:
 
 
 def ranges_of(deltas: Codes) -> Ranges:
-    """Smallest and largest of the changes (n, 3) of each extended state; both reach 0."""
+    """Return the smallest and largest change of each extended state (n, 3); ranges include 0."""
     return {
         state.name: (min(0, *column), max(0, *column))
         for state, column in zip(EXTENDED, deltas.T.tolist(), strict=True)

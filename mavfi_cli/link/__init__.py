@@ -1,1 +1,1 @@
-"""The MAVLink side: transports, codec, signing, the offboard session, images and the .tlog."""
+"""MAVLink: transports, codec, signing, the offboard session, images and the .tlog."""

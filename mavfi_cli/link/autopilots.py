@@ -1,7 +1,7 @@
-"""What differs between autopilots: mode numbers, and what take-off wants.
+"""Differences between autopilots: mode numbers and take-off procedure.
 
 Sources: PX4 px4_custom_mode.h (main mode in bits 16..23, sub mode in bits 24..31) and ArduCopter's
-mode numbers; both as observed on the wire with PX4 1.17 and ArduCopter 4.5.
+mode numbers; both confirmed with messages of PX4 1.17 and ArduCopter 4.5.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from mavfi_cli.link.codec import dialect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Autopilot:
-    """One autopilot's dialect of modes and commands."""
+class AutopilotProfile:
+    """Modes and command conventions of one autopilot."""
 
     name: str
     modes: dict[str, int]  # mode name -> HEARTBEAT.custom_mode
-    offboard_mode: str  # where it follows our setpoints
+    offboard_mode: str  # mode in which it follows our setpoints
     land_mode: str
-    arming_modes: tuple[str, ...]  # modes to arm in; the first is the one to ask for
-    takeoff_amsl: bool  # NAV_TAKEOFF takes an altitude above sea level, not above home
-    unused: float  # what a command parameter without meaning holds
-    early_setpoints: bool  # wants setpoints before the mode; otherwise they break its take-off
+    arming_modes: tuple[str, ...]  # modes that allow arming; the session requests the first
+    takeoff_amsl: bool  # NAV_TAKEOFF altitude is above sea level instead of above home
+    unused: float  # value of an unused command parameter
+    early_setpoints: bool  # requires setpoints before the mode; False: they would abort take-off
 
     def mode_name(self, custom_mode: int) -> str:
-        """The name of a HEARTBEAT.custom_mode, or its number in words."""
+        """Return the name of a HEARTBEAT.custom_mode, or "mode N" if it is unknown."""
         for name, number in self.modes.items():
             if number == custom_mode:
                 return name
         return f"mode {custom_mode}"
 
     def mode_parameters(self, name: str) -> tuple[float, float]:
-        """Parameters 2 and 3 of MAV_CMD_DO_SET_MODE for a mode of `modes`."""
+        """Return parameters 2 and 3 of MAV_CMD_DO_SET_MODE for a mode of `modes`."""
         number = self.modes[name]
         if self is PX4:
             return float(number >> 16 & 0xFF), float(number >> 24)
@@ -44,7 +44,7 @@ def _px4(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
-PX4 = Autopilot(
+PX4 = AutopilotProfile(
     name="PX4",
     modes={
         "MANUAL": _px4(1),
@@ -68,7 +68,7 @@ PX4 = Autopilot(
     early_setpoints=True,
 )
 
-ARDUCOPTER = Autopilot(
+ARDUCOPTER = AutopilotProfile(
     name="ArduCopter",
     modes={
         "STABILIZE": 0,
@@ -92,6 +92,6 @@ ARDUCOPTER = Autopilot(
 )
 
 
-def autopilot_of(mav_autopilot: int) -> Autopilot:
-    """By HEARTBEAT.autopilot; one that we do not know is spoken to as PX4."""
+def autopilot_of(mav_autopilot: int) -> AutopilotProfile:
+    """Return the entry for a HEARTBEAT.autopilot. An unknown autopilot is treated as PX4."""
     return ARDUCOPTER if mav_autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA else PX4

@@ -1,4 +1,4 @@
-"""The companion's side of the MAVLink camera protocol: find it, start it, learn its view."""
+"""Client of the MAVLink camera protocol: finds the camera, starts it, reads its field of view."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _CAMERA = dialect.MAV_COMP_ID_CAMERA
 
 
 class CameraClient:
-    """Talks to the camera component (MAV_COMP_ID_CAMERA) of one system.
+    """Client of the camera component (MAV_COMP_ID_CAMERA) of one system.
 
     Args:
-        commands: the channel of that system.
+        commands: Command channel of that system.
 
     Attributes:
-        heard: whether it sent a HEARTBEAT.
-        hfov_rad: its horizontal field of view, None when unknown.
+        heard: True once the camera has sent a HEARTBEAT.
+        hfov_rad: Horizontal field of view; None if unknown.
     """
 
     def __init__(self, commands: CommandChannel) -> None:
@@ -27,7 +27,7 @@ class CameraClient:
         self.hfov_rad: float | None = None
 
     def handle(self, message: Message) -> None:
-        """Take a message of the component; its first HEARTBEAT makes us ask what it is."""
+        """Handle a message of the camera and request its information at the first HEARTBEAT."""
         if isinstance(message, dialect.MAVLink_heartbeat_message) and not self.heard:
             self.heard = True
             self._commands.submit(
@@ -40,23 +40,23 @@ class CameraClient:
             self.hfov_rad = hfov_rad
 
     def start(self, interval_s: float) -> Ticket:
-        """Ask for a frame every `interval_s`, without end; the ticket tells the answer."""
+        """Request a frame every `interval_s` without end. The ticket holds the answer."""
         return self._commands.submit(
             dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
             component=_CAMERA, unused=math.nan, refusals=3,
         )  # fmt: skip
 
     def stop(self) -> Ticket:
-        """Ask for no more frames."""
+        """Request the end of the frames."""
         return self._commands.submit(
             dialect.MAV_CMD_IMAGE_STOP_CAPTURE, 0.0, component=_CAMERA, unused=math.nan
         )
 
 
 def hfov_of(message: Message) -> float | None:
-    """The horizontal field of view that a camera's message tells, rad; None where it does not.
+    """Return the horizontal field of view in a camera's message, rad; None if there is none.
 
-    CAMERA_INFORMATION: 2 atan(sensor width / 2 focal length); CAMERA_FOV_STATUS: in degrees.
+    CAMERA_INFORMATION gives 2 atan(sensor width / 2 focal length), CAMERA_FOV_STATUS degrees.
     """
     if isinstance(message, dialect.MAVLink_camera_information_message):
         if message.focal_length > 0.0 and 0.0 < message.sensor_size_h < math.inf:

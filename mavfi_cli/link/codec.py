@@ -1,8 +1,8 @@
-"""MAVLink frames to messages and back, on pymavlink's `common` dialect.
+"""Encodes and decodes MAVLink frames, on pymavlink's `common` dialect.
 
-The frame layer (markers, lengths, checksum, signature) is done here, because pymavlink's generic
-parser is slower and, after a false marker in noise, swallows the whole frames behind it. What a
-field means is pymavlink's: its message classes, layouts and constructors.
+This module implements the frame layer (markers, lengths, checksum, signature), because pymavlink's
+generic parser is slower and loses the frames after a false marker in noise. Message classes,
+layouts and constructors are pymavlink's.
 Source of the frame layout: https://mavlink.io/en/guide/serialization.html.
 """
 
@@ -39,10 +39,10 @@ def _slow_crc(data: bytes, initial: int = 0xFFFF) -> int:
     return int(crc.crc)
 
 
-# CRC-16/MCRF4XX; pymavlink depends on the compiled one, but can do without.
+# CRC-16/MCRF4XX. pymavlink prefers the compiled implementation, but does not need it.
 _crc: Callable[..., int] = dialect.mcrf4xx or _slow_crc
 
-# One more byte x changes a checksum c to (c >> 8) ^ table[(c ^ x) & 0xFF]; these are the entries.
+# A further byte x changes a checksum c to (c >> 8) ^ table[(c ^ x) & 0xFF]. This is the table.
 _CRC_TABLE = frozenset(_crc(bytes([x]), 0) for x in range(256))
 
 
@@ -85,7 +85,7 @@ def _reader(cls: Any) -> Callable[[tuple[Any, ...]], Sequence[Any]]:
         return getter
 
     def read(values: tuple[Any, ...]) -> Sequence[Any]:
-        """Arrays as lists, texts without their padding."""
+        """Return arrays as lists and texts without padding."""
         fields = [
             values[start]
             if length == 1
@@ -100,7 +100,7 @@ def _reader(cls: Any) -> Callable[[tuple[Any, ...]], Sequence[Any]]:
 
 
 def _writer(cls: Any) -> Callable[[Message], Sequence[Any]]:
-    """Turns a message into the values of its wire layout."""
+    """Return a function that converts a message to the values of its wire layout."""
     texts = {n for n, t in zip(cls.fieldnames, cls.fieldtypes, strict=True) if t == "char"}
     names = [f"_{name}_raw" if name in texts else name for name in cls.ordered_fieldnames]
     if len(names) > 1 and all(length == 1 for length in cls.lengths):
@@ -110,7 +110,7 @@ def _writer(cls: Any) -> Callable[[Message], Sequence[Any]]:
     fields = [(n, length, n in of_bytes) for n, length in zip(names, cls.lengths, strict=True)]
 
     def values(message: Message) -> Sequence[Any]:
-        """Arrays laid out flat."""
+        """Return the values with arrays flattened."""
         flat: list[Any] = []
         for name, length, whole in fields:
             value = getattr(message, name)
@@ -136,18 +136,19 @@ def _kind(message_id: int) -> _Kind | None:
 
 
 class Codec:
-    """One end of one link: numbers what it sends, finds the messages in what it receives.
+    """Codec of one end of a link. It numbers the frames that it encodes.
 
     Args:
-        system: own system id, written into every frame.
-        component: own component id.
-        signing: sign what goes out and refuse what is not genuine; None for neither.
+        system: Own system id, written into every frame.
+        component: Own component id.
+        signing: Signs outgoing frames and rejects incoming ones with a bad signature; None for
+            neither.
 
     Attributes:
-        decoded: messages delivered so far.
-        bad_bytes: received bytes that belong to no frame.
-        unknown: whole frames with an id that the dialect lacks; skipped.
-        refused: whole frames that signing turned away.
+        decoded: Number of decoded messages.
+        bad_bytes: Number of received bytes that belong to no frame.
+        unknown: Number of skipped frames with an id that the dialect lacks.
+        refused: Number of frames that signing rejected.
     """
 
     __slots__ = (
@@ -167,10 +168,11 @@ class Codec:
         self.refused = 0
 
     def encode(self, message: Message) -> bytes:
-        """The MAVLink 2 frame of a message; the message itself is left as it was.
+        """Encode a message as a MAVLink 2 frame. The message itself does not change.
 
         Raises:
-            struct.error, OverflowError: a field does not fit its type.
+            struct.error, OverflowError: A field does not fit its type.
+            ValueError: The message is not one of the dialect.
         """
         kind = _KINDS.get(type(message).id) or _kind(type(message).id)
         if kind is None:
@@ -188,10 +190,10 @@ class Codec:
         return frame if self._signing is None else frame + self._signing.sign(frame)
 
     def decode(self, data: bytes, *, datagram: bool = False) -> list[Message]:
-        """The messages that `data` completes, oldest first; never raises, whatever the bytes.
+        """Return the messages that `data` completes, oldest first. Never raises.
 
-        A false marker costs one byte, not the frames behind it. A frame may continue in the next
-        call, unless `datagram` says that frames end where the data ends.
+        A false marker costs one byte, but not the frames after it. A frame may continue in the next
+        call unless `datagram` is set, which means that frames end at the end of the data.
         """
         buffer = self._rest + data if self._rest else bytes(data)
         messages: list[Message] = []
@@ -218,10 +220,11 @@ class Codec:
         return messages
 
     def _take(self, frame: bytes, messages: list[Message], bounded: bool) -> bool:
-        """Append the message of a candidate frame; False where the checksum says it is none.
+        """Append the message of a candidate frame. Return False if its checksum is wrong.
 
-        For an id that the dialect lacks the checksum can be told only up to one byte, so noise
-        passes once in 256 times; such a frame must be `bounded` by another one or the end, too.
+        The checksum includes a byte that is unknown for an id that the dialect lacks, so noise
+        passes the check once in 256 times. Such a frame must also be `bounded` by another frame or
+        the end.
         """
         header = 10 if frame[0] == _V2 else 6
         signed = header == 10 and bool(frame[2] & _SIGNED)
@@ -230,7 +233,7 @@ class Codec:
         number = frame[5] if header == 6 else frame[7] | frame[8] << 8 | frame[9] << 16
         kind = _KINDS.get(number) or _kind(number)
         if kind is None:
-            # Is there any extra byte that makes the checksum right?
+            # Test whether any extra byte makes the checksum right.
             if not bounded or crc ^ (_crc(frame[1:crc_at]) >> 8) not in _CRC_TABLE:
                 return False
             self.unknown += 1
@@ -255,7 +258,7 @@ class Codec:
 
 
 def _frame_length(buffer: bytes, position: int, end: int) -> int:
-    """Bytes of the frame that would start here; _INCOMPLETE, or 0 where none can."""
+    """Return the length of a frame that starts here, _INCOMPLETE, or 0 if none can start here."""
     if end - position < 3:
         return _INCOMPLETE
     length = buffer[position + 1] + 8

@@ -1,7 +1,7 @@
-"""MAVLink's command protocol: send, await the acknowledgement, repeat; no clock of its own.
+"""MAVLink's command protocol: sends a command, awaits its acknowledgement, repeats it.
 
-Source: https://mavlink.io/en/services/command.html. An acknowledgement names the command only, so
-two of the same command never are under way to one component at once.
+The caller supplies the time. An acknowledgement names the command only, so the same command is
+never pending twice for one component. Source: https://mavlink.io/en/services/command.html.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _RESULTS = {
     dialect.MAV_RESULT_COMMAND_LONG_ONLY: "only as COMMAND_LONG",
     dialect.MAV_RESULT_COMMAND_INT_ONLY: "only as COMMAND_INT",
 }
-# Refusals that time may cure.
+# Refusals that may be temporary.
 _PASSING = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_FAILED)
 
 
-class Verdict(Enum):
-    """Where a command stands."""
+class CommandState(Enum):
+    """State of a command."""
 
     PENDING = "pending"
     ACCEPTED = "accepted"
@@ -41,7 +41,7 @@ class Verdict(Enum):
 
 
 class Ticket:
-    """One command on its way; `verdict` tells where it stands, `result` the peer's word for it."""
+    """A submitted command. `verdict` is its state, `result` the peer's answer in words."""
 
     __slots__ = (
         "command", "component", "due_s", "parameters", "refusals_left", "result", "sent",
@@ -55,24 +55,24 @@ class Ticket:
         self.component = component
         self.parameters = parameters
         self.refusals_left = refusals
-        self.verdict = Verdict.PENDING
-        self.result = Verdict.UNANSWERED.value
+        self.verdict = CommandState.PENDING
+        self.result = CommandState.UNANSWERED.value
         self.sent = 0
         self.sent_since_answer = 0
         self.due_s = -1.0
 
     @property
     def pending(self) -> bool:
-        """Whether the outcome is still open."""
-        return self.verdict is Verdict.PENDING
+        """True until the command is accepted, refused or given up."""
+        return self.verdict is CommandState.PENDING
 
 
 class CommandChannel:
     """Commands to the components of one system.
 
     Args:
-        system: own system id.
-        component: own component id; acknowledgements to somebody else are not ours.
+        system: Own system id.
+        component: Own component id. Acknowledgements for other components are ignored.
     """
 
     def __init__(self, system: int, component: int) -> None:
@@ -91,23 +91,23 @@ class CommandChannel:
         """Queue a COMMAND_LONG.
 
         Args:
-            command: a MAV_CMD number.
-            parameters: the first of its seven parameters; the others become `unused`.
-            component: whom it is for.
-            unused: value of a parameter without meaning.
-            refusals: how many passing refusals are answered with another try, a second later.
+            command: MAV_CMD number.
+            parameters: First of its seven parameters; the others are set to `unused`.
+            component: Component id of the receiver.
+            unused: Value of an unused parameter.
+            refusals: Number of temporary refusals after which the command is repeated, 1 s later.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
         ticket = Ticket(command, padded, component, refusals)
         lane = self._lanes.setdefault((component, command), deque())
         if len(lane) >= _MAX_WAITING:
-            ticket.verdict = Verdict.UNANSWERED
+            ticket.verdict = CommandState.UNANSWERED
         else:
             lane.append(ticket)
         return ticket
 
     def acknowledge(self, message: Message) -> None:
-        """Take a COMMAND_ACK; one that answers nothing of ours is ignored."""
+        """Handle a COMMAND_ACK. It is ignored if it answers none of our commands."""
         if message.target_system not in (0, self._own[0]):
             return
         if message.target_component not in (0, self._own[1]):
@@ -121,15 +121,15 @@ class CommandChannel:
         if message.result == dialect.MAV_RESULT_IN_PROGRESS:
             ticket.due_s = self._now_s + PROGRESS_TIMEOUT_S
         elif message.result == dialect.MAV_RESULT_ACCEPTED:
-            self._close(lane, Verdict.ACCEPTED)
+            self._close(lane, CommandState.ACCEPTED)
         elif message.result in _PASSING and ticket.refusals_left > 0:
             ticket.refusals_left -= 1
             ticket.due_s = self._now_s + REFUSAL_PAUSE_S
         else:
-            self._close(lane, Verdict.REFUSED)
+            self._close(lane, CommandState.REFUSED)
 
     def poll(self, stamp_s: float, system: int) -> list[Message]:
-        """The commands that are due at `stamp_s`, addressed to `system`."""
+        """Return the commands that are due at `stamp_s`, addressed to `system`."""
         self._now_s = stamp_s
         due = []
         for lane in self._lanes.values():
@@ -138,7 +138,7 @@ class CommandChannel:
                 if ticket.sent_since_answer < TRIES:
                     due.append(self._send(ticket, system))
                     break
-                self._close(lane, Verdict.UNANSWERED)
+                self._close(lane, CommandState.UNANSWERED)
         return due
 
     def _send(self, ticket: Ticket, system: int) -> Message:
@@ -151,5 +151,5 @@ class CommandChannel:
         )
 
     @staticmethod
-    def _close(lane: deque[Ticket], verdict: Verdict) -> None:
+    def _close(lane: deque[Ticket], verdict: CommandState) -> None:
         lane.popleft().verdict = verdict

@@ -1,4 +1,4 @@
-"""UDP: one peer at a known address, the newest caller of a port, or every caller of a port."""
+"""UDP transports: a peer at a known address, the newest sender to a port, or all its senders."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mavfi_cli.link.streams import bind
 from mavfi_cli.link.waiting import readable
 
 MAX_PEERS = 64
-MAX_WAITING = 4096  # datagrams a peer may leave unread before the oldest go
-_MTU_PAYLOAD = 1400  # whole frames are gathered up to this many bytes a datagram
+MAX_WAITING = 4096  # maximum unread datagrams per peer; the oldest are dropped first
+_MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 _CHUNK = 1 << 16
 _MARKERS = (0xFD, 0xFE)
 
 
 def split_frames(data: bytes) -> list[bytes]:
-    """Well-formed frames, gathered into datagrams that fit an Ethernet packet."""
+    """Combine well-formed frames into datagrams that fit an Ethernet packet."""
     if len(data) <= _MTU_PAYLOAD:
         return [data]
     datagrams, start, position = [], 0, 0
@@ -39,8 +39,8 @@ def split_frames(data: bytes) -> list[bytes]:
 class UdpTransport:
     """A UDP socket with one peer.
 
-    Connected, it hears that peer only. Bound, it answers whoever sent MAVLink last, and until
-    somebody did, what it sends is lost.
+    A connected socket receives from that peer only. A bound socket sends to the last sender of
+    MAVLink. Before the first one, everything it sends is lost.
     """
 
     datagram = True
@@ -54,7 +54,7 @@ class UdpTransport:
 
     @property
     def port(self) -> int:
-        """The local port, chosen by the system when the URL says 0."""
+        """Local port. The system chooses it if the URL says 0."""
         return int(self._socket.getsockname()[1])
 
     def send(self, data: bytes) -> None:
@@ -63,14 +63,14 @@ class UdpTransport:
             _send(self._socket, data, self._peer if self._follow else None)
 
     def receive(self, timeout_s: float) -> bytes:
-        """The next bytes, or b"" after `timeout_s`; see `Transport`."""
+        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         data = self._pull()
         if not data and timeout_s > 0 and readable(self._socket.fileno(), timeout_s):
             data = self._pull()
         return data
 
     def _pull(self) -> bytes:
-        """The next datagram; empty when none waits."""
+        """Return the next datagram, or b"" if none is waiting."""
         received = _receive(self._socket)
         if received is None:
             return b""
@@ -80,19 +80,19 @@ class UdpTransport:
         return data
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         self._socket.close()
 
 
 def _receive(opened: socket.socket) -> tuple[bytes, Any] | None:
-    """A datagram and its sender; None when there is none.
+    """Return a datagram and its sender, or None if there is none.
 
-    A connected socket hears that nobody listens at the other end (ECONNREFUSED): for UDP this is
-    no loss, the peer may start later.
+    ECONNREFUSED means that nobody listens at the other end of a connected socket. It is not an
+    error for UDP, because the peer may start later.
     """
     try:
         return opened.recvfrom(_CHUNK)
@@ -101,9 +101,9 @@ def _receive(opened: socket.socket) -> tuple[bytes, Any] | None:
 
 
 def _send(opened: socket.socket, data: bytes, peer: Any) -> None:
-    """Send to `peer`, or where the socket is connected to; what does not go is lost, as UDP is."""
+    """Send to `peer`, or to the connected address. Data that cannot be sent is lost."""
     for datagram in split_frames(data):
-        for _attempt in range(2):  # the first may only report an earlier datagram's refusal
+        for _attempt in range(2):  # the first may report the refusal of an earlier datagram
             try:
                 if peer is None:
                     opened.send(datagram)
@@ -115,12 +115,16 @@ def _send(opened: socket.socket, data: bytes, peer: Any) -> None:
 
 
 def bound(endpoint: Endpoint, where: tuple[int, str]) -> UdpTransport:
-    """A transport that waits for its peer on a port; EndpointError where the port is taken."""
+    """Open a transport that waits for its peer on a port.
+
+    Raises:
+        EndpointError: The port is in use.
+    """
     return UdpTransport(_bound_socket(endpoint, where), endpoint.url)
 
 
 def connected(endpoint: Endpoint, where: tuple[int, str]) -> UdpTransport:
-    """A transport that calls the endpoint, resolved to family and address `where`."""
+    """Open a transport to the endpoint, resolved to family and address `where`."""
     family, address = where
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.connect((address, endpoint.port))
@@ -136,33 +140,33 @@ def _bound_socket(endpoint: Endpoint, where: tuple[int, str]) -> socket.socket:
 
 
 class UdpListener:
-    """Every address that sends MAVLink to a port becomes a peer, all on one socket.
+    """A port on which every sender of MAVLink becomes a peer. All peers share one socket.
 
-    At most MAX_PEERS are kept; one more pushes out the one heard longest ago.
+    There are at most MAX_PEERS. A further peer replaces the one that has been silent longest.
 
     Raises:
-        EndpointError: the port is in use, or the address is not this machine's.
+        EndpointError: The port is in use, or the address is not this machine's.
     """
 
     def __init__(self, endpoint: Endpoint, where: tuple[int, str]) -> None:
         self.url = endpoint.url
         self._socket = _bound_socket(endpoint, where)
-        self._peers: dict[Any, UdpPeer] = {}  # the one heard longest ago comes first
+        self._peers: dict[Any, UdpPeer] = {}  # the one silent longest comes first
         self._fresh: list[UdpPeer] = []
 
     @property
     def port(self) -> int:
-        """The bound port, chosen by the system when the URL says 0."""
+        """Bound port. The system chooses it if the URL says 0."""
         return int(self._socket.getsockname()[1])
 
     def accept_ready(self) -> list[UdpPeer]:
-        """The peers that appeared since the last call."""
+        """Return the peers that appeared since the last call."""
         self.pump()
         fresh, self._fresh = [peer for peer in self._fresh if not peer.lost], []
         return fresh
 
     def pump(self) -> None:
-        """Hand every waiting datagram to its peer."""
+        """Distribute all waiting datagrams to their peers."""
         for _ in range(MAX_WAITING):
             received = _receive(self._socket)
             if received is None:
@@ -189,22 +193,22 @@ class UdpListener:
         _send(self._socket, data, address)
 
     def forget(self, address: Any) -> None:
-        """Drop a peer; it is new again when it sends again."""
+        """Drop a peer. It counts as a new peer if it sends again."""
         self._peers.pop(address, None)
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         for peer in self._peers.values():
             peer.lost = True
         self._socket.close()
 
 
 class UdpPeer:
-    """One caller of a UDP listener."""
+    """One peer of a UDP listener."""
 
     datagram = True
 
@@ -222,7 +226,7 @@ class UdpPeer:
         self._listener.send_to(data, self._address)
 
     def receive(self, timeout_s: float) -> bytes:
-        """The next bytes, or b"" after `timeout_s`; see `Transport`."""
+        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         deadline_s = time.monotonic() + timeout_s if timeout_s > 0 else 0.0
         while not self.waiting:
             if self.lost:
@@ -234,10 +238,10 @@ class UdpPeer:
         return self.waiting.popleft() if self.waiting else b""
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._listener.fileno()
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         self.lost = True
         self._listener.forget(self._address)

@@ -1,4 +1,4 @@
-"""Endpoint URLs: what they say, and which of them need signing."""
+"""Parses endpoint URLs and checks which of them need signing."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ LOOPBACK = "127.0.0.1"
 DEFAULT_BAUD = 57_600
 
 
-class Scheme(Enum):
-    """The kinds of endpoint, by the word before the first colon."""
+class UrlScheme(Enum):
+    """Scheme of an endpoint URL: the word before the first colon."""
 
     UDP_IN = "udpin"
     UDP_OUT = "udpout"
@@ -26,25 +26,25 @@ class Scheme(Enum):
 
 
 _FORMS = {
-    Scheme.UDP_IN: "udpin:[host]:port",
-    Scheme.UDP_OUT: "udpout:host:port",
-    Scheme.TCP: "tcp:host:port",
-    Scheme.TCP_IN: "tcpin:[host]:port",
-    Scheme.SERIAL: "serial:device[:baud]",
-    Scheme.FD: "fd:number",
+    UrlScheme.UDP_IN: "udpin:[host]:port",
+    UrlScheme.UDP_OUT: "udpout:host:port",
+    UrlScheme.TCP: "tcp:host:port",
+    UrlScheme.TCP_IN: "tcpin:[host]:port",
+    UrlScheme.SERIAL: "serial:device[:baud]",
+    UrlScheme.FD: "fd:number",
 }
-# `udp` listens, as in pymavlink and MAVSDK; `tcpout` is MAVSDK's word for tcp.
-_ALIASES = {"udp": Scheme.UDP_IN, "tcpout": Scheme.TCP}
-_LISTENING = (Scheme.UDP_IN, Scheme.TCP_IN)
+# `udp` listens, as in pymavlink and MAVSDK. `tcpout` is MAVSDK's name for tcp.
+_ALIASES = {"udp": UrlScheme.UDP_IN, "tcpout": UrlScheme.TCP}
+_LISTENING = (UrlScheme.UDP_IN, UrlScheme.TCP_IN)
 _HOST_PORT = re.compile(r"(?:(?P<host>\[[^\]]*\]|[^:\[\]]*):)?(?P<port>[0-9]+)", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoint:
-    """A parsed endpoint URL; only the fields of its scheme mean something."""
+    """A parsed endpoint URL. Fields that its scheme does not use have no meaning."""
 
     url: str
-    scheme: Scheme
+    scheme: UrlScheme
     host: str = ""
     port: int = 0
     device: str = ""
@@ -53,19 +53,19 @@ class Endpoint:
 
 
 def parse_endpoint(url: str) -> Endpoint:
-    """The endpoint of a URL, in the form `scheme:rest` or `scheme://rest`.
+    """Parse a URL of the form `scheme:rest` or `scheme://rest`.
 
     Raises:
-        EndpointError: unknown scheme (names the known ones), or a rest that does not fit it.
+        EndpointError: The scheme is unknown (lists the known ones), or the rest does not fit it.
     """
     word, _, rest = url.partition(":")
     rest = rest.removeprefix("//")
-    scheme = _ALIASES.get(word) or next((s for s in Scheme if s.value == word), None)
+    scheme = _ALIASES.get(word) or next((s for s in UrlScheme if s.value == word), None)
     if scheme is None:
         raise EndpointError(url, f"unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
-    if scheme is Scheme.FD:
+    if scheme is UrlScheme.FD:
         return Endpoint(url=url, scheme=scheme, fd=_number(url, scheme, rest, 2**31 - 1))
-    if scheme is Scheme.SERIAL:
+    if scheme is UrlScheme.SERIAL:
         return _serial(url, rest)
     match = _HOST_PORT.fullmatch(rest)
     host = (match["host"] or "").strip("[]") if match else ""
@@ -77,7 +77,7 @@ def parse_endpoint(url: str) -> Endpoint:
     return Endpoint(url=url, scheme=scheme, host=host or LOOPBACK, port=port)
 
 
-def _number(url: str, scheme: Scheme, text: str, largest: int) -> int:
+def _number(url: str, scheme: UrlScheme, text: str, largest: int) -> int:
     if not re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
         raise EndpointError(url, f"not of the form {_FORMS[scheme]}")
     if int(text) > largest:
@@ -90,16 +90,16 @@ def _serial(url: str, rest: str) -> Endpoint:
     if not colon:
         device, baud = rest, str(DEFAULT_BAUD)
     if not device:
-        raise EndpointError(url, f"not of the form {_FORMS[Scheme.SERIAL]}")
-    number = _number(url, Scheme.SERIAL, baud, 12_500_000)
-    return Endpoint(url=url, scheme=Scheme.SERIAL, device=device, baud=number)
+        raise EndpointError(url, f"not of the form {_FORMS[UrlScheme.SERIAL]}")
+    number = _number(url, UrlScheme.SERIAL, baud, 12_500_000)
+    return Endpoint(url=url, scheme=UrlScheme.SERIAL, device=device, baud=number)
 
 
 def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> tuple[socket.AddressFamily, str]:
-    """Address family and numeric address of the endpoint's host, IPv4 first.
+    """Resolve the endpoint's host to address family and numeric address, IPv4 first.
 
     Raises:
-        EndpointError: no such host.
+        EndpointError: The host does not exist.
     """
     try:
         found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)
@@ -111,10 +111,10 @@ def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> tuple[socket.Address
 
 
 def check_reach(endpoint: Endpoint, address: str, *, signed: bool, allow_unsigned: bool) -> None:
-    """Refuse an unsigned link that reaches beyond this machine.
+    """Reject an unsigned link that reaches beyond this machine.
 
     Raises:
-        EndpointError: `address` is not a loopback one, and neither flag is set.
+        EndpointError: `address` is not a loopback address, and neither flag is set.
     """
     if signed or allow_unsigned or ipaddress.ip_address(address.partition("%")[0]).is_loopback:
         return

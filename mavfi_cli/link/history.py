@@ -1,4 +1,4 @@
-"""The vehicle's recent states, found again by stamp."""
+"""Recent states of the vehicle, looked up by stamp."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from mavfi_cli.core.frames import yaw_from_quaternion
 from mavfi_cli.core.types import VehicleState
 
-_REORDERED_MS = 1000  # older by less than this is a late packet, by more a restarted clock
+_REORDERED_MS = 1000  # older by less: a late packet; older by more: a restarted clock
 
 
 class StateHistory:
     """The newest states in order of their stamps.
 
     Args:
-        capacity: how many are kept at least.
+        capacity: Minimum number of states to keep.
     """
 
     def __init__(self, capacity: int = 512) -> None:
@@ -25,7 +25,7 @@ class StateHistory:
         self._states: list[VehicleState] = []
 
     def add(self, state: VehicleState) -> bool:
-        """Append a state; False for one that is not newer than the newest."""
+        """Append a state. Return False if it is not newer than the newest."""
         stamp_ms = round(state.stamp_s * 1e3)
         if self._stamps_ms and stamp_ms <= self._stamps_ms[-1]:
             if stamp_ms > self._stamps_ms[-1] - _REORDERED_MS:
@@ -40,7 +40,7 @@ class StateHistory:
         return True
 
     def at(self, stamp_s: float) -> VehicleState | None:
-        """The state at a stamp, interpolated between neighbours; None outside what is kept."""
+        """Return the state at a stamp, interpolated if needed; None outside the history."""
         stamp_ms = round(stamp_s * 1e3)
         index = bisect_left(self._stamps_ms, stamp_ms)
         if index == len(self._stamps_ms):
@@ -53,7 +53,7 @@ class StateHistory:
 
 
 def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> VehicleState:
-    """Linear in position and velocity; normalised linear in the quaternion, the short way."""
+    """Interpolate position and velocity linearly, the quaternion by normalised shortest lerp."""
     share = (stamp_s - before.stamp_s) / (after.stamp_s - before.stamp_s)
     sign = -1.0 if float(np.dot(before.quaternion, after.quaternion)) < 0.0 else 1.0
     quaternion = (1.0 - share) * before.quaternion + share * sign * after.quaternion

@@ -1,8 +1,8 @@
-"""Depth frames out of MAVLink's image transmission protocol, through loss and reordering.
+"""Receives depth frames over MAVLink's image transmission protocol with loss and reordering.
 
-One frame on the wire: CAMERA_IMAGE_CAPTURED (stamp, index, and `depth8:crc32=%08x` of the pixels
-in `file_url`), DATA_TRANSMISSION_HANDSHAKE (size), then ENCAPSULATED_DATA packets. A packet says
-where it belongs in a frame, but not in which; the checksum of the pixels decides that.
+A frame consists of CAMERA_IMAGE_CAPTURED (stamp, index, and `depth8:crc32=%08x` of the pixels in
+`file_url`), DATA_TRANSMISSION_HANDSHAKE (size), and ENCAPSULATED_DATA packets. A packet gives its
+place in a frame, but not the frame. The checksum of the pixels identifies the frame.
 Source of the protocol: https://mavlink.io/en/services/image_transmission.html.
 """
 
@@ -38,12 +38,12 @@ _CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageFrame:
-    """One whole image, as the camera sent it."""
+    """A complete image from the camera."""
 
-    stamp_s: float  # when it was taken, on the vehicle's boot clock
+    stamp_s: float  # time of capture on the vehicle's boot clock
     index: int
     pixels: NDArray[np.uint8]  # (rows, columns), read-only
-    hfov_rad: float | None  # None while the camera has not told
+    hfov_rad: float | None  # None until the camera reports it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,12 +55,12 @@ class _Shape:
 
     @property
     def size(self) -> int:
-        """Bytes of the whole image, one a pixel."""
+        """Size of the image in bytes, one per pixel."""
         return self.columns * self.rows
 
 
 class _Assembly:
-    """A frame that was announced and is not whole yet."""
+    """A frame that was announced but is not complete yet."""
 
     __slots__ = (
         "announced", "checksum", "improved", "index", "near", "stamp_s", "strays", "trials_left",
@@ -98,18 +98,19 @@ class _Assembly:
 
 
 class ImageReceiver:
-    """Feed it every message; it returns the frames that become whole.
+    """Assembles frames from messages. Pass every message to `feed`.
 
-    A lost packet loses its frame and no other; a frame whose checksum never fits is dropped.
-    Memory is bounded by a few frames of MAX_PIXELS, whatever comes in.
+    A lost packet loses only its own frame. A frame whose checksum never matches is dropped.
+    Memory is bounded by a few frames of MAX_PIXELS for any input.
 
-    Two guesses are tried against the checksum: of each place the packet that came nearest to when
-    it was due after the announcement (right when neighbouring frames interleave a little), and
-    the newest packet of each place (right when one frame is shuffled as it likes).
+    The receiver checks two candidates against the checksum. The first takes for each place the
+    packet nearest to its due time after the announcement, which is right if neighbouring frames
+    interleave slightly. The second takes the newest packet of each place, which is right if one
+    frame is reordered in any way.
 
     Attributes:
-        hfov_rad: the camera's horizontal field of view, None until it told.
-        received: frames returned.
+        hfov_rad: Horizontal field of view of the camera; None until the camera reports it.
+        received: Number of complete frames.
     """
 
     def __init__(self) -> None:
@@ -120,16 +121,16 @@ class ImageReceiver:
         self._count = 0  # messages of the protocol so far
         self._recent: deque[tuple[int, int, bytes]] = deque(maxlen=_RECENT_PACKETS)
         self._latest: dict[int, bytes] = {}  # place -> newest packet
-        self._fresh: set[int] = set()  # places that got a packet since a frame became whole
+        self._fresh: set[int] = set()  # places with a packet since the last complete frame
         self._closed: deque[int] = deque(maxlen=_REMEMBERED)
-        self._first: int | None = None  # first and newest index since the camera started
+        self._first: int | None = None  # first and newest index since the camera's start
         self._newest = 0
         self._received_before = 0
         self._lost_before = 0
 
     @property
     def lost(self) -> int:
-        """Frames announced, or skipped by the index, that did not and will not become whole."""
+        """Number of frames, announced or skipped by the index, that can no longer be completed."""
         if self._first is None:
             return self._lost_before
         counted = self._newest - self._first + 1
@@ -148,7 +149,7 @@ class ImageReceiver:
         return []
 
     def _captured(self, message: Message) -> list[ImageFrame]:
-        """Open a frame; packets that came just before may belong to it."""
+        """Open a frame. Packets that arrived shortly before may belong to it."""
         self._count += 1
         if not self._follow(message.image_index):
             return []
@@ -166,7 +167,7 @@ class ImageReceiver:
         return self._finish(self._open)
 
     def _follow(self, index: int) -> bool:
-        """Follow the index; False for a frame that is known or too old."""
+        """Track the index. Return False for a frame that is known or too old."""
         if self._first is None or abs(index - self._newest) > _LARGEST_GAP:
             self._open.clear()
             self._lost_before = self.lost
@@ -197,11 +198,11 @@ class ImageReceiver:
         return self._finish(self._open)
 
     def _fits(self, place: int) -> bool:
-        """Whether a frame has such a place, as far as is known."""
+        """Return True if the place exists in a frame of the known size, or the size is unknown."""
         return place < (_RECENT_PACKETS if self._shape is None else self._shape.packets)
 
     def _reach(self) -> int:
-        """How far off its due time a packet may come, in messages: about one frame."""
+        """Return a packet's maximum distance from its due time, in messages: about one frame."""
         return _RECENT_PACKETS if self._shape is None else self._shape.packets + 2
 
     def _packet(self, message: Message) -> list[ImageFrame]:
@@ -225,7 +226,7 @@ class ImageReceiver:
         )
 
     def _finish(self, frames: list[_Assembly]) -> list[ImageFrame]:
-        """Close and return those of some open frames that are whole."""
+        """Close and return the complete ones of some open frames."""
         shape = self._shape
         if shape is None:
             return []
@@ -246,7 +247,7 @@ class ImageReceiver:
         return done
 
     def _solve(self, frame: _Assembly, shape: _Shape) -> bytes | None:
-        """The pixels of the nearest, or else of the newest packets, whichever fits."""
+        """Return the pixels of the nearest or else the newest packets that match the checksum."""
         places = range(shape.packets)
         image = None
         if len(frame.near) == shape.packets:
@@ -278,7 +279,7 @@ def _data(message: Message) -> bytes:
 
 
 def _shape_of(message: Message) -> _Shape | None:
-    """The announced size, if it is one that adds up and is no larger than we take."""
+    """Return the announced size, or None if it is inconsistent or too large."""
     columns, rows, payload = message.width, message.height, message.payload
     if message.type != dialect.MAVLINK_DATA_STREAM_IMG_RAW8U or not 1 <= payload <= 253:
         return None
@@ -296,14 +297,14 @@ _DEPTH_M[NOTHING] = np.inf
 def depth_frame(
     image: ImageFrame, state: VehicleState, *, hfov_rad: float, mount_offset_flu_m: FloatArray
 ) -> DepthFrame:
-    """An image in metres, with the pose of the camera when it was taken.
+    """Convert an image to metres and add the pose of the camera at its capture.
 
     Args:
-        image: 0.1 m a pixel step, 255 for nothing in range.
-        state: the vehicle at the image's stamp.
-        hfov_rad: horizontal field of view, where the image does not know it.
-        mount_offset_flu_m: (3,) of the optical centre from the vehicle's centre; the camera looks
-            along the vehicle's x axis.
+        image: Image in steps of 0.1 m; 255 means that nothing was in range.
+        state: Vehicle state at the image's stamp.
+        hfov_rad: Horizontal field of view to use if the image has none.
+        mount_offset_flu_m: Offset (3,) of the optical centre from the vehicle's centre. The camera
+            looks along the vehicle's x axis.
     """
     offset_enu_m = rotation_matrix(state.quaternion) @ np.asarray(mount_offset_flu_m, np.float64)
     return DepthFrame(

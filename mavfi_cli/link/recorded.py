@@ -1,4 +1,4 @@
-"""A link of which every packet of both directions goes into the tlog."""
+"""A link that records every frame of both directions in a tlog."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from mavfi_cli.link.transport import Transport
 
 
 class RecordedLink:
-    """One end of a link, and the record of what went through it.
+    """One end of a link with a tlog of its traffic.
 
-    What passes before `recording` begins is kept and comes first in the file.
+    Traffic before `recording` is buffered and written first.
 
     Args:
-        transport: already open; whoever opened it closes it.
-        system, component: MAVLink's ids of this end.
+        transport: Open transport. Its opener closes it.
+        system, component: MAVLink ids of this end.
     """
 
     def __init__(self, transport: Transport, system: int, component: int) -> None:
@@ -29,10 +29,10 @@ class RecordedLink:
 
     @contextlib.contextmanager
     def recording(self, path: Path) -> Iterator[None]:
-        """Write the tlog meanwhile.
+        """Write the tlog during the context.
 
         Raises:
-            RecordError: the file cannot be written (here, or when a message comes or goes).
+            RecordError: The file cannot be written, now or at any later message.
         """
         with TlogWriter(path) as self._tlog:
             for stamp_s, frame in self._early:
@@ -41,24 +41,24 @@ class RecordedLink:
             yield
 
     def receive(self, timeout_s: float) -> bytes:
-        """Wait for bytes; none where none came in time.
+        """Return the next bytes, or b"" after `timeout_s`.
 
         Raises:
-            LinkLost: the other end closed the connection.
+            LinkLost: The other end closed the connection.
         """
         return self._transport.receive(timeout_s)
 
     def messages(self, data: bytes, stamp_s: float) -> Iterator[Message]:
-        """The messages in received bytes, each recorded at the stamp after it was taken."""
+        """Yield the messages in received bytes. Each is recorded at the stamp after its use."""
         for message in self._codec.decode(data, datagram=self._transport.datagram):
             yield message
             self._record(stamp_s, message.get_msgbuf())
 
     def send(self, messages: Sequence[Message], stamp_s: float) -> None:
-        """Send them in this order, recorded at the stamp.
+        """Send the messages in this order and record them at the stamp.
 
         Raises:
-            LinkLost: the other end closed the connection.
+            LinkLost: The other end closed the connection.
         """
         frames = [self._codec.encode(message) for message in messages]
         for frame in frames:

@@ -1,4 +1,4 @@
-"""What a MAVLink node tells the others: HEARTBEAT, answers to TIMESYNC and PING, STATUSTEXT."""
+"""Standard messages of a MAVLink node: HEARTBEAT, replies to TIMESYNC and PING, STATUSTEXT."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.texts import text_messages
 
 HEARTBEAT_INTERVAL_S = 1.0
-_MAX_ANSWERS = 64  # to requests of one tick; more are not answered
+_MAX_ANSWERS = 64  # maximum replies per tick; further requests are ignored
 
 
 class Replies:
-    """Collects the answers; `take` hands them out at the next tick."""
+    """Collects replies until `take` returns them at the next tick."""
 
     def __init__(self) -> None:
         self._answers: list[Message] = []
@@ -20,7 +20,7 @@ class Replies:
         self._texts = 0
 
     def handle(self, message: Message, now_s: float) -> None:
-        """Take a message; an answer to one of ours is not answered again."""
+        """Handle a message. Replies to our own requests need no reply."""
         if len(self._answers) >= _MAX_ANSWERS:
             return
         if _asks_time(message):
@@ -33,12 +33,12 @@ class Replies:
             )
 
     def announce(self, severity: int, text: str) -> None:
-        """Tell everybody who listens, people at ground stations above all."""
+        """Broadcast a STATUSTEXT, mainly for ground stations."""
         self._texts = self._texts % 0xFFFF + 1
         self._answers += text_messages(severity, text.encode("ascii", "replace"), self._texts)
 
     def take(self, stamp_s: float) -> list[Message]:
-        """The answers and texts so far, and our own HEARTBEAT once a second."""
+        """Return the collected replies and texts, and our own HEARTBEAT once a second."""
         out, self._answers = self._answers, []
         if stamp_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = stamp_s + HEARTBEAT_INTERVAL_S

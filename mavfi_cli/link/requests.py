@@ -1,4 +1,4 @@
-"""What a session asks of the autopilot, again and again until HEARTBEAT or the ground shows it."""
+"""Requests of a session to the autopilot, repeated until telemetry shows their effect."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from typing import NoReturn
 
 from mavfi_cli.core.errors import CommandRefused
 from mavfi_cli.link.codec import dialect
-from mavfi_cli.link.commands import CommandChannel, Ticket, Verdict
+from mavfi_cli.link.commands import CommandChannel, CommandState, Ticket
 from mavfi_cli.link.telemetry import Telemetry
 
-_SETTLE_S = 0.5  # an autopilot's words may follow its refusal
-_EFFECT_S = 3.0  # what was accepted shows an effect within this
+_SETTLE_S = 0.5  # wait for status texts after a refusal
+_EFFECT_S = 3.0  # wait for the effect of an accepted command
 _MODE_TRIES = 5
-_MODE_PATIENCE_S = 1.5  # HEARTBEAT comes once a second
+_MODE_PATIENCE_S = 1.5  # wait for a mode change; HEARTBEAT arrives once a second
 _LOOK_INTERVAL_S = 0.2
 _HOME_INTERVAL_S = 1.0
 _WARNING = dialect.MAV_SEVERITY_WARNING
 
 
 class Requests:
-    """Asks in the name of one phase of the session at a time.
+    """Requests of one phase of the session at a time.
 
     Args:
-        commands: takes the commands to the link.
-        telemetry: where their effect shows.
+        commands: Channel to the autopilot.
+        telemetry: Telemetry that shows the effect of commands.
 
     Attributes:
-        now_s: the stamp; set it before anything is asked.
+        now_s: Present stamp. Set it before any request.
     """
 
     def __init__(self, commands: CommandChannel, telemetry: Telemetry) -> None:
@@ -41,22 +41,22 @@ class Requests:
         self.begin()
 
     def begin(self) -> None:
-        """A phase begins: nothing was asked in it yet."""
-        self._ticket: Ticket | None = None  # the one command that the phase hangs on
+        """Begin a phase and forget the requests of the last one."""
+        self._ticket: Ticket | None = None  # the command that the phase depends on
         self._decided_s: float | None = None
         self._mode_since_s, self._mode_tries = -math.inf, 0
         self._texts_before = self._telemetry.texts.total
 
     @property
     def asked(self) -> bool:
-        """Whether a command of this phase is under way or was decided."""
+        """True once this phase has sent a command."""
         return self._ticket is not None
 
     def refuse(self, command: str, result: str) -> NoReturn:
-        """Give up what was asked for, with what the autopilot has said since the phase began.
+        """Give up a request and quote the autopilot's texts since the start of the phase.
 
         Raises:
-            CommandRefused: always.
+            CommandRefused: Always.
         """
         texts = self._telemetry.texts
         texts.expire(self.now_s, 0.0)
@@ -64,12 +64,12 @@ class Requests:
         raise CommandRefused(command, result, dict.fromkeys(text.text for text in said))
 
     def insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
-        """Bring one command home; True once it is accepted.
+        """Send a command until it is accepted. Return True from then on.
 
-        An accepted one that shows no effect is sent again, for as long as this is called.
+        If an accepted command shows no effect, further calls send it again.
 
         Raises:
-            CommandRefused: it was refused for good.
+            CommandRefused: The command was refused permanently.
         """
         if self._ticket is None:
             self._ticket = self._commands.submit(command, *parameters, unused=unused, refusals=2)
@@ -80,7 +80,7 @@ class Requests:
         if self._decided_s is None:
             self._decided_s = self.now_s
         waited_s = self.now_s - self._decided_s
-        if ticket.verdict is Verdict.ACCEPTED:
+        if ticket.verdict is CommandState.ACCEPTED:
             if waited_s >= _EFFECT_S:
                 self._ticket = None
             return True
@@ -89,10 +89,10 @@ class Requests:
         return False
 
     def mode(self, mode: str) -> bool:
-        """Ask for a mode until HEARTBEAT shows it; an acknowledgement alone is not believed.
+        """Request a mode until HEARTBEAT shows it. An acknowledgement alone does not count.
 
         Raises:
-            CommandRefused: it was asked for in vain too often.
+            CommandRefused: The mode did not change after the maximum number of requests.
         """
         if self._telemetry.mode == mode:
             return True
@@ -115,7 +115,7 @@ class Requests:
         return False
 
     def look_at_heartbeat(self) -> None:
-        """Ask for a HEARTBEAT now, to see a change sooner than once a second shows it."""
+        """Request a HEARTBEAT now instead of waiting up to a second for the next."""
         if self.now_s >= self._next_look_s and not (self._look and self._look.pending):
             self._next_look_s = self.now_s + _LOOK_INTERVAL_S
             self._look = self._commands.submit(
@@ -123,7 +123,7 @@ class Requests:
             )
 
     def home(self) -> None:
-        """Ask for HOME_POSITION, once a second."""
+        """Request HOME_POSITION once a second."""
         if self.now_s >= self._next_home_s and not (self._home and self._home.pending):
             self._next_home_s = self.now_s + _HOME_INTERVAL_S
             self._home = self._commands.submit(
@@ -131,7 +131,7 @@ class Requests:
             )
 
     def streams(self, state_rate_hz: float) -> None:
-        """Ask for what a flight needs to hear: the state at this rate, the rest slower."""
+        """Request the message streams of a flight: the state at this rate, the others slower."""
         state_us = 1e6 / state_rate_hz
         for message_id, interval_us in (
             (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, state_us),

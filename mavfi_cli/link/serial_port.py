@@ -1,4 +1,4 @@
-"""A serial device, by pyserial."""
+"""Serial transport, with pyserial."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class SerialPort:
     """A serial line to one peer, 8N1 without flow control.
 
     Raises:
-        EndpointError: no such device, no right to open it, or in use by another program.
+        EndpointError: The device does not exist, may not be opened, or is in use.
     """
 
     datagram = False
@@ -46,7 +46,7 @@ class SerialPort:
             self._lost(error)
 
     def receive(self, timeout_s: float) -> bytes:
-        """The next bytes, or b"" after `timeout_s`; see `Transport`."""
+        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         try:
             if not readable(self._port.fileno(), timeout_s):
                 return b""
@@ -58,11 +58,11 @@ class SerialPort:
         raise LinkLost(f"{self.url}: the serial device failed: {error}") from None
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return int(self._port.fileno())
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         self._port.close()
 
 

@@ -1,7 +1,7 @@
-"""The companion's side of a MAVLink flight, as a state machine without sockets or clock.
+"""The companion's MAVLink session as a state machine without sockets or clock.
 
-Lockstep, real time and tests drive it alike: `handle` every message that came, then `tick` with
-the stamp; send what `tick` returns, in that order.
+Lockstep, real time and tests drive it the same way. Call `handle` with every received message, then
+`tick` with the stamp, and send the messages that `tick` returns in their order.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from mavfi_cli.link.setpoint import Target
 from mavfi_cli.link.telemetry import LandedState, Telemetry
 from mavfi_cli.link.texts import Text
 
-_HEIGHT_REACHED_M = 0.3  # so close below the wanted height counts as there
-_DISARM_AFTER_S = 5.0  # on the ground, where the autopilot should have done so by itself
+_HEIGHT_REACHED_M = 0.3  # tolerance below the take-off height
+_DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the vehicle itself
 _WARNING = dialect.MAV_SEVERITY_WARNING
 
 
 class Phase(Enum):
-    """How far the flight is."""
+    """Phase of the flight."""
 
     CONNECTING = "connecting"
     WAITING_READY = "waiting until ready"
@@ -41,12 +41,12 @@ class Phase(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionSettings:
-    """What the session asks for, and how long it waits, in simulated seconds."""
+    """Settings and time-outs of the session, in simulated seconds."""
 
-    system: int = 1  # own system id: that of the vehicle we ride on
+    system: int = 1  # own system id, which is that of the vehicle
     component: int = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
-    takeoff_height_m: float = 2.5  # above where it stands
-    request_streams: bool = True  # ask for the streams we need (lockstep has them anyway)
+    takeoff_height_m: float = 2.5  # above the ground at take-off
+    request_streams: bool = True  # request message streams; lockstep sends them anyway
     state_rate_hz: float = 50.0
     connect_timeout_s: float = 10.0
     ready_timeout_s: float = 60.0
@@ -56,20 +56,20 @@ class SessionSettings:
 
 
 class OffboardSession:
-    """Connects, arms, takes off, streams setpoints, lands.
+    """Connects, arms, takes off, streams setpoints and lands.
 
     Args:
-        settings: what to ask for and how long to wait.
-        url: the link, for messages to people.
-        telemetry: what was heard before, where this session is not the first on its link.
+        settings: Settings and time-outs.
+        url: URL of the link, for error messages.
+        telemetry: Telemetry so far, if this session is not the first on its link.
 
     Attributes:
-        phase: how far the flight is.
-        failure: why the phase became FAILED; None while it never did.
-        failsafe_text: why the autopilot no longer follows (its mode changed unasked, or it
-            disarmed); None while it does. Never taken back.
-        telemetry: everything else that the autopilot told.
-        camera: the camera component of the same system.
+        phase: Present phase of the flight.
+        failure: Cause of the phase FAILED; None before that.
+        failsafe_text: Reason why the autopilot no longer follows (it changed its mode or disarmed);
+            None while it follows. Never reset.
+        telemetry: Newest telemetry of the autopilot.
+        camera: Camera component of the same system.
     """
 
     def __init__(
@@ -96,53 +96,53 @@ class OffboardSession:
         self._was_up = False
         self._down_since_s: float | None = None
 
-    # What the mission looks at ------------------------------------------------------------------
+    # State for the mission ----------------------------------------------------------------------
 
     @property
     def state(self) -> VehicleState | None:
-        """The vehicle's newest state in ENU; None before position and attitude are known."""
+        """Newest vehicle state in ENU; None before position and attitude are known."""
         return self.telemetry.state
 
     @property
     def armed(self) -> bool:
-        """HEARTBEAT's word."""
+        """True if HEARTBEAT says armed."""
         return self.telemetry.armed
 
     @property
     def mode(self) -> str:
-        """Name of the flight mode by HEARTBEAT, "" before the first."""
+        """Name of the flight mode in HEARTBEAT; "" before the first."""
         return self.telemetry.mode
 
     @property
     def landed_state(self) -> LandedState:
-        """EXTENDED_SYS_STATE's word."""
+        """Landed state in EXTENDED_SYS_STATE."""
         return self.telemetry.landed_state
 
     @property
     def failsafe(self) -> bool:
-        """Whether the autopilot stopped following us without being asked to."""
+        """True once the autopilot has stopped following us without a request."""
         return self.failsafe_text is not None
 
     @property
     def collision_text(self) -> str | None:
-        """The text in which a collision was reported."""
+        """Text that reported a collision; None without one."""
         return self.telemetry.collision_text
 
     @property
     def link_lost(self) -> bool:
-        """Whether the autopilot's HEARTBEAT has been missing for three seconds."""
+        """True if no HEARTBEAT of the autopilot has arrived for three seconds."""
         return self.telemetry.link_lost
 
     @property
     def texts(self) -> Sequence[Text]:
-        """The autopilot's newest STATUSTEXTs, oldest first."""
+        """Newest STATUSTEXTs of the autopilot, oldest first."""
         return self.telemetry.texts.texts
 
     def state_at(self, stamp_s: float) -> VehicleState | None:
-        """The state at a stamp, exact or interpolated; None outside the last ten seconds."""
+        """Return the state at a stamp, exact or interpolated; None outside the last ten seconds."""
         return self.telemetry.history.at(stamp_s)
 
-    # What the mission asks for ------------------------------------------------------------------
+    # Requests of the mission --------------------------------------------------------------------
 
     def set_target(
         self,
@@ -150,12 +150,12 @@ class OffboardSession:
         yaw_enu_rad: float | None = None,
         acceleration_enu_mps2: Sequence[float] | None = None,
     ) -> None:
-        """Fly this from the next tick on.
+        """Set the target from the next tick on.
 
         Args:
-            velocity_enu_mps: (3,), m/s.
-            yaw_enu_rad: from east, counter-clockwise; None keeps the heading.
-            acceleration_enu_mps2: (3,) feed-forward, m/s^2; None for none.
+            velocity_enu_mps: Velocity (3,), m/s.
+            yaw_enu_rad: Yaw, counter-clockwise from east; None keeps the heading.
+            acceleration_enu_mps2: Feed-forward acceleration (3,), m/s^2; None for none.
         """
         vx, vy, vz = velocity_enu_mps
         acceleration = None
@@ -169,22 +169,22 @@ class OffboardSession:
         )
 
     def hold(self) -> None:
-        """Stand still and keep the heading from the next tick on."""
+        """Hold position and heading from the next tick on."""
         self._target = Target()
 
     def announce(self, text: str) -> None:
-        """Tell ground stations, as a STATUSTEXT of the severity of a warning."""
+        """Send a STATUSTEXT with severity WARNING to ground stations."""
         self._replies.announce(_WARNING, text)
 
     def request_land(self) -> None:
-        """Land where it is and disarm; before arming, end at once."""
+        """Land at the present position and disarm. Before arming, end the session at once."""
         if self.phase not in (Phase.LANDING, Phase.DONE):
             self._enter(Phase.LANDING)
 
-    # Messages in --------------------------------------------------------------------------------
+    # Received messages --------------------------------------------------------------------------
 
     def handle(self, message: Message) -> None:
-        """Take one received message; anything that is not for us is ignored."""
+        """Handle a received message. Messages for other receivers are ignored."""
         telemetry = self.telemetry
         telemetry.handle(message)
         if telemetry.heard and message.get_srcSystem() == telemetry.system:
@@ -194,14 +194,14 @@ class OffboardSession:
                 self.camera.handle(message)
         self._replies.handle(message, self._now_s)
 
-    # Messages out -------------------------------------------------------------------------------
+    # Sent messages ------------------------------------------------------------------------------
 
     def tick(self, stamp_s: float) -> list[Message]:
-        """Go on to a stamp; the messages to send, the setpoint of this stamp being the last.
+        """Advance to a stamp. Return the messages to send; the setpoint of this stamp is the last.
 
-        There is a setpoint in every tick, because OFFBOARD wants them before it is entered and a
-        lockstep peer waits for them. Only ArduCopter, which knows no such handshake and breaks
-        off a take-off when a setpoint comes, gets them in the OFFBOARD phase alone.
+        Every tick has a setpoint, because OFFBOARD requires setpoints before its entry and a
+        lockstep peer waits for them. ArduCopter is the exception: it has no such handshake and
+        aborts a take-off at a setpoint, so it gets setpoints in the OFFBOARD phase only.
         """
         self._now_s = self.telemetry.now_s = self._requests.now_s = stamp_s
         if self._phase_since_s is None:
@@ -221,7 +221,7 @@ class OffboardSession:
             out.append(self._target.message(stamp_s, system, component))
         return out
 
-    # The phases ---------------------------------------------------------------------------------
+    # Phases -------------------------------------------------------------------------------------
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
@@ -337,7 +337,7 @@ class OffboardSession:
             self._commands.submit(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0.0)
 
     def _ended(self) -> None:
-        """Nothing more to ask for; the setpoints go on, for the other end may wait for them."""
+        """Do nothing. Setpoints continue, because the other end may wait for them."""
 
 
 _STEPS = {

@@ -1,4 +1,4 @@
-"""SET_POSITION_TARGET_LOCAL_NED from a velocity, a yaw and an acceleration in ENU."""
+"""Builds SET_POSITION_TARGET_LOCAL_NED from velocity, yaw and acceleration in ENU."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
-    """What the autopilot is asked to fly; the default is to stand still and keep its heading."""
+    """A setpoint for the autopilot. The default holds position and heading."""
 
     velocity_enu_mps: Triple = (0.0, 0.0, 0.0)
     yaw_enu_rad: float | None = None  # None: keep the heading
@@ -36,7 +36,7 @@ class Target:
 
     @property
     def type_mask(self) -> int:
-        """The ignored fields of the message, 2503 without and 2055 with feed-forward."""
+        """Mask of the ignored fields: 2503 without feed-forward, 2055 with it."""
         mask: int = _MASK_VELOCITY_YAW
         if self.acceleration_enu_mps2 is None:
             mask |= _NO_ACCELERATION
@@ -45,10 +45,10 @@ class Target:
         return mask
 
     def message(self, stamp_s: float, system: int, component: int) -> Message:
-        """The message for one stamp.
+        """Return the message for one stamp.
 
-        A value beyond float32 goes out as infinity, as a C++ companion would convert it, and NaN
-        as NaN: what a corrupted command does is for the autopilot to show.
+        A value beyond float32 becomes infinity, as in a C++ companion, and NaN stays NaN. The
+        autopilot decides how to handle a corrupted command.
         """
         east, north, up = (_float32(v) for v in self.velocity_enu_mps)
         ax, ay, az = 0.0, 0.0, 0.0
@@ -62,7 +62,7 @@ class Target:
 
 
 def boot_ms(stamp_s: float) -> int:
-    """A stamp as the 32-bit milliseconds of the wire."""
+    """Convert a stamp to MAVLink's 32-bit milliseconds."""
     return round(stamp_s * 1e3) & 0xFFFF_FFFF
 
 

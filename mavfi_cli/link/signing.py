@@ -1,4 +1,4 @@
-"""MAVLink 2 packet signing, with the clock injected.
+"""MAVLink 2 packet signing with a clock supplied by the caller.
 
 Source: https://mavlink.io/en/guide/message_signing.html. A signature block is a link id (1 byte),
 a timestamp (6 bytes, 10 us units since 2015-01-01 UTC) and the first 6 bytes of
@@ -12,27 +12,30 @@ import hmac
 from collections.abc import Callable
 
 SIGNATURE_LENGTH = 13  # bytes: link id, timestamp, truncated digest
-EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC, where signing time starts
+EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC, start of signing time
 UNITS_PER_S = 100_000  # one unit is 10 us
-NEW_STREAM_SLACK = 60 * UNITS_PER_S  # a stream not yet known may be this far behind
+NEW_STREAM_SLACK = 60 * UNITS_PER_S  # maximum lag of a new stream's timestamp
 
 _TIMESTAMP_END = 2**48
-_RADIO_STATUS = 109  # a telemetry radio adds it and holds no key; the guide says to let it in
+_RADIO_STATUS = 109  # sent by telemetry radios, which hold no key; the guide says to accept it
 
 
 def key_from_passphrase(passphrase: str) -> bytes:
-    """The 32-byte key that ground stations make of a passphrase: its SHA-256."""
+    """Return the 32-byte key of a passphrase, its SHA-256, as ground stations compute it."""
     return hashlib.sha256(passphrase.encode()).digest()
 
 
 class Signing:
-    """Key, outgoing timestamp and the newest timestamp of every signed stream heard.
+    """Key, outgoing timestamp, and the newest timestamp of every received stream.
 
     Args:
         key: 32 secret bytes, see `key_from_passphrase`.
-        clock: seconds since 1970 (`time.time`, or a fixed epoch plus simulated seconds).
-        link_id: identifies this channel among those of one sender, 0..255.
-        accept_unsigned: take frames that carry no signature; a wrong one is refused regardless.
+        clock: Function of seconds since 1970 (`time.time`, or a fixed epoch plus simulated time).
+        link_id: Id of this channel among those of the sender, 0..255.
+        accept_unsigned: Accept frames without a signature. Wrong signatures are always rejected.
+
+    Raises:
+        ValueError: The key does not have 32 bytes, or the link id is out of range.
     """
 
     def __init__(
@@ -55,20 +58,20 @@ class Signing:
         self._streams: dict[tuple[int, int, int], int] = {}
 
     def sign(self, frame: bytes) -> bytes:
-        """The 13-byte signature block of a frame (header to CRC, flag already set)."""
+        """Return the 13-byte signature block of a frame (header to CRC, signed flag set)."""
         timestamp = max(self._now(), self._next_timestamp) % _TIMESTAMP_END
         self._next_timestamp = timestamp + 1
         block = bytes([self._link_id]) + timestamp.to_bytes(6, "little")
         return block + self._digest(frame + block)
 
     def accept_plain(self, message_id: int) -> bool:
-        """Whether a frame without signature may pass."""
+        """Return True if a frame without signature is accepted."""
         return self._accept_unsigned or message_id == _RADIO_STATUS
 
     def accept(self, frame: bytes, system: int, component: int) -> bool:
-        """Whether a whole signed frame is genuine and not a replay.
+        """Return True if a signed frame is authentic and not a replay.
 
-        Only a genuine frame moves the timestamps, so a stranger cannot silence a stream.
+        Only authentic frames update the timestamps, so an attacker cannot block a stream.
         """
         if not hmac.compare_digest(self._digest(frame[:-6]), frame[-6:]):
             return False

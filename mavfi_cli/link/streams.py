@@ -1,4 +1,4 @@
-"""Byte streams: TCP in both directions and an inherited socket pair."""
+"""Byte-stream transports: TCP client, TCP server and inherited socket pair."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mavfi_cli.link.endpoint import Endpoint
 from mavfi_cli.link.waiting import readable, writable
 
 CONNECT_TIMEOUT_S = 5.0
-SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for so long is lost
+SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
 _CHUNK = 1 << 16
 
 
 class StreamTransport:
-    """One peer at the other end of a connected stream socket.
+    """A connected stream socket with one peer.
 
     Args:
         connection: the socket; owned from here on.
@@ -50,7 +50,7 @@ class StreamTransport:
             self._unsent = unsent
 
     def _push(self, data: bytes) -> bytes:
-        """Send what fits; the rest."""
+        """Send as much as fits and return the rest."""
         try:
             return data[self._socket.send(data) :]
         except BlockingIOError:
@@ -59,7 +59,7 @@ class StreamTransport:
             self._lost(error.strerror or str(error))
 
     def receive(self, timeout_s: float) -> bytes:
-        """The next bytes, or b"" after `timeout_s`; see `Transport`."""
+        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         data = self._pull()
         if data is None and timeout_s > 0.0 and readable(self._socket.fileno(), timeout_s):
             data = self._pull()
@@ -80,19 +80,19 @@ class StreamTransport:
         raise LinkLost(f"{self.url}: {why}")
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         self._socket.close()
 
 
 def inherited(endpoint: Endpoint) -> StreamTransport:
-    """The transport of a stream socket that the parent process left open.
+    """Open the transport of a stream socket inherited from the parent process.
 
     Raises:
-        EndpointError: no such descriptor, or not a connected stream socket.
+        EndpointError: The descriptor does not exist or is not a connected stream socket.
     """
     try:
         connection = socket.socket(fileno=endpoint.fd)
@@ -111,10 +111,10 @@ def inherited(endpoint: Endpoint) -> StreamTransport:
 
 
 def connected(endpoint: Endpoint, where: tuple[int, str]) -> StreamTransport:
-    """A TCP client of the endpoint, resolved to family and address `where`.
+    """Connect a TCP client to the endpoint, resolved to family and address `where`.
 
     Raises:
-        EndpointError: nobody listens there, or no way to get there.
+        EndpointError: Nobody listens there, or the host is unreachable.
     """
     family, address = where
     connection = socket.socket(family, socket.SOCK_STREAM)
@@ -135,10 +135,10 @@ def _reason(error: OSError) -> str:
 
 
 class TcpListener:
-    """Accepts TCP clients; each becomes a transport of its own.
+    """Accepts TCP clients. Each becomes a transport of its own.
 
     Raises:
-        EndpointError: the port is in use, or the address is not this machine's.
+        EndpointError: The port is in use, or the address is not this machine's.
     """
 
     def __init__(self, endpoint: Endpoint, where: tuple[int, str]) -> None:
@@ -152,15 +152,15 @@ class TcpListener:
 
     @property
     def port(self) -> int:
-        """The bound port, chosen by the system when the URL says 0."""
+        """Bound port. The system chooses it if the URL says 0."""
         return int(self._socket.getsockname()[1])
 
     def accept_ready(self) -> list[StreamTransport]:
-        """The clients that called since; a slow reader among them loses frames."""
+        """Return the clients since the last call. Slow readers among them lose frames."""
         return self.accept_clients(patient=False)
 
     def accept_clients(self, *, patient: bool) -> list[StreamTransport]:
-        """The clients that called since; see `StreamTransport` for `patient`."""
+        """Return the clients since the last call; see `StreamTransport` for `patient`."""
         clients = []
         while (connection := self._accept()) is not None:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -170,20 +170,20 @@ class TcpListener:
     def _accept(self) -> socket.socket | None:
         try:
             return self._socket.accept()[0]
-        except OSError:  # none waits, or it went away again while waiting
+        except OSError:  # no client is waiting, or it has disconnected already
             return None
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         self._socket.close()
 
 
 def bind(listening: socket.socket, endpoint: Endpoint, address: str) -> None:
-    """Bind, or close the socket and say in one line why not."""
+    """Bind the socket, or close it and raise EndpointError."""
     try:
         listening.bind((address, endpoint.port))
     except OSError as error:
@@ -197,7 +197,7 @@ def bind(listening: socket.socket, endpoint: Endpoint, address: str) -> None:
 
 
 class TcpServerEnd:
-    """A listening endpoint that serves the first client only; before it calls, sends are lost."""
+    """A listening endpoint for the first client only. Data sent before it connects is lost."""
 
     datagram = False
 
@@ -208,7 +208,7 @@ class TcpServerEnd:
 
     @property
     def port(self) -> int:
-        """The bound port, chosen by the system when the URL says 0."""
+        """Bound port. The system chooses it if the URL says 0."""
         return self._listener.port
 
     def _serve(self) -> StreamTransport | None:
@@ -226,7 +226,7 @@ class TcpServerEnd:
             client.send(data)
 
     def receive(self, timeout_s: float) -> bytes:
-        """The next bytes, or b"" after `timeout_s`; see `Transport`."""
+        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         client = self._serve()
         if client is None:
             if timeout_s > 0 and readable(self._listener.fileno(), timeout_s):
@@ -235,11 +235,11 @@ class TcpServerEnd:
         return client.receive(timeout_s)
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._listener.fileno() if self._client is None else self._client.fileno()
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         self._listener.close()
         if self._client is not None:
             self._client.close()

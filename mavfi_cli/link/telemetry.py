@@ -1,4 +1,4 @@
-"""What the autopilot tells about itself, kept up to date message by message."""
+"""Newest telemetry of one autopilot, updated message by message."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
 from mavfi_cli.core.types import FloatArray, VehicleState
-from mavfi_cli.link.autopilots import PX4, Autopilot, autopilot_of
+from mavfi_cli.link.autopilots import PX4, AutopilotProfile, autopilot_of
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.history import StateHistory
 from mavfi_cli.link.texts import TextCollector
@@ -30,29 +30,29 @@ class LandedState(IntEnum):
 
 
 class Telemetry:
-    """The newest word of one autopilot.
+    """Newest telemetry of one autopilot.
 
-    The first autopilot heard (component 1, of any system) is the one; others are not listened to.
+    The first autopilot that sends (component 1 of any system) is used. Others are ignored.
 
     Attributes:
-        now_s: set by the owner before messages are handled; when they count as received.
-        system: the autopilot's system id, 0 before it is heard.
-        state: position, velocity and attitude in ENU, None before both are known.
-        armed: HEARTBEAT's word.
-        mode: name of the flight mode, "" before the first HEARTBEAT.
-        landed_state: EXTENDED_SYS_STATE's word.
-        ready: SYS_STATUS says that the pre-arm checks pass.
-        home_amsl_m: altitude of home above sea level, m, None when unknown.
-        battery_remaining: 0..1, None when unknown.
-        battery_voltage_v: None when unknown.
-        texts: STATUSTEXTs.
-        collision_text: the text in which the referee reports a collision, None without one.
+        now_s: Time at which handled messages count as received. The owner sets it.
+        system: System id of the autopilot; 0 before its first message.
+        state: Position, velocity and attitude in ENU; None before both are known.
+        armed: Armed flag in HEARTBEAT.
+        mode: Name of the flight mode; "" before the first HEARTBEAT.
+        landed_state: Landed state in EXTENDED_SYS_STATE.
+        ready: True if SYS_STATUS reports that the pre-arm checks pass.
+        home_amsl_m: Altitude of home above sea level, m; None if unknown.
+        battery_remaining: Remaining charge, 0..1; None if unknown.
+        battery_voltage_v: Battery voltage, V; None if unknown.
+        texts: Received STATUSTEXTs.
+        collision_text: Text in which the referee reports a collision; None without one.
     """
 
     def __init__(self) -> None:
         self.now_s = 0.0
         self.system = 0
-        self.autopilot: Autopilot = PX4
+        self.autopilot: AutopilotProfile = PX4
         self.state: VehicleState | None = None
         self.armed = False
         self.mode = ""
@@ -69,17 +69,17 @@ class Telemetry:
 
     @property
     def heard(self) -> bool:
-        """Whether an autopilot has been heard at all."""
+        """True once an autopilot has sent a HEARTBEAT."""
         return self.system != 0
 
     @property
     def link_lost(self) -> bool:
-        """Whether a known autopilot's HEARTBEAT has been missing for three seconds."""
+        """True if no HEARTBEAT of a known autopilot has arrived for three seconds."""
         return self.heard and self.now_s - self.heartbeat_s >= HEARTBEAT_LOSS_S
 
     @property
     def in_air(self) -> bool:
-        """Whether the autopilot says that it flies."""
+        """True if the autopilot reports that it is in the air."""
         return self.landed_state in (
             LandedState.IN_AIR,
             LandedState.TAKEOFF,
@@ -87,7 +87,7 @@ class Telemetry:
         )
 
     def handle(self, message: Message) -> bool:
-        """Take a message; False where it is not the autopilot's."""
+        """Handle a message. Return False if it is not the autopilot's."""
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return False
         if not self.heard and isinstance(message, dialect.MAVLink_heartbeat_message):
@@ -133,7 +133,7 @@ class Telemetry:
             self._attitude_from(quaternion_from_euler(*angles).tolist())
 
     def _attitude_from(self, components: list[float]) -> None:
-        """Take a body-FRD-to-NED quaternion w x y z, if it is one."""
+        """Store a body-FRD-to-NED quaternion w x y z if it is valid."""
         norm = math.sqrt(sum(c * c for c in components))
         if math.isfinite(norm) and 0.5 < norm < 2.0:
             self._quaternion = flu_enu_from_frd_ned([c / norm for c in components])
@@ -162,7 +162,7 @@ class Telemetry:
         self._look_for_collision(before)
 
     def expire(self) -> None:
-        """Let texts go whose missing chunks are not to be expected any more."""
+        """Close texts whose missing chunks are overdue."""
         before = self.texts.total
         self.texts.expire(self.now_s)
         self._look_for_collision(before)

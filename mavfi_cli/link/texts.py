@@ -1,7 +1,7 @@
-"""STATUSTEXT: chunks joined into whole texts.
+"""STATUSTEXT: splits texts into chunks and joins them.
 
 Source: https://mavlink.io/en/messages/common.html#STATUSTEXT. A text longer than 50 characters
-comes in chunks with a common id; the last one is shorter than 50 characters.
+comes in chunks with a common id. The last chunk is shorter than 50 characters.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from mavfi_cli.link.codec import Message, dialect
 CHUNK_LENGTH = 50
 _MAX_OPEN = 16
 _MAX_TEXTS = 1000
-_PATIENCE_S = 1.0  # how long a text waits for its missing chunks
+_PATIENCE_S = 1.0  # maximum wait for missing chunks
 _GAP = "[...]"
 
 
 def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Any]:
-    """The STATUSTEXT messages of one text.
+    """Yield the STATUSTEXT messages of one text.
 
-    A text that fits into one message has id 0. A longer one goes in chunks with `text_id`, and
-    the chunk that ends it is shorter than CHUNK_LENGTH bytes.
+    A text that fits into one message has id 0. A longer text is sent in chunks with `text_id`.
+    Its last chunk is shorter than CHUNK_LENGTH bytes.
 
     Args:
         severity: MAV_SEVERITY, 0 emergency .. 7 debug.
-        data: the text in ASCII.
-        text_id: 1 .. 65535.
+        data: Text in ASCII.
+        text_id: Id of the text, 1 .. 65535.
     """
     if len(data) <= CHUNK_LENGTH:
         yield dialect.MAVLink_statustext_message(severity, data)
@@ -41,9 +41,9 @@ def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Text:
-    """One whole text of a component."""
+    """A complete text of a component."""
 
-    stamp_s: float  # when its last chunk came
+    stamp_s: float  # arrival of its last chunk
     severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
     text: str
 
@@ -56,7 +56,7 @@ class _Open:
 
 
 class TextCollector:
-    """Gathers texts; `texts` holds the newest thousand, `total` counts all."""
+    """Collects texts. `texts` holds the newest thousand, `total` counts all."""
 
     def __init__(self) -> None:
         self.texts: deque[Text] = deque(maxlen=_MAX_TEXTS)
@@ -64,12 +64,12 @@ class TextCollector:
         self._open: dict[tuple[int, int, int], _Open] = {}
 
     def since(self, total: int) -> list[Text]:
-        """The texts that came after `total` stood at this number."""
+        """Return the texts received since `total` had this value."""
         fresh = min(self.total - total, len(self.texts))
         return list(self.texts)[len(self.texts) - fresh :]
 
     def add(self, message: Message, stamp_s: float) -> None:
-        """Take a STATUSTEXT."""
+        """Handle a STATUSTEXT."""
         if message.id == 0:
             self._emit(stamp_s, message.severity, message.text)
             return
@@ -85,7 +85,7 @@ class TextCollector:
             self._finish(key, stamp_s)
 
     def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> None:
-        """Give up on chunks that did not come for so long; their text is kept with a gap."""
+        """Close texts with chunks missing for longer than the patience. They keep a gap."""
         if self._open:
             late = [k for k, o in self._open.items() if stamp_s - o.started_s >= patience_s]
             for key in late:

@@ -1,7 +1,7 @@
-"""The .tlog of a flight: every frame of both directions, as ground stations record them.
+"""The .tlog of a flight: every frame of both directions in the format of ground stations.
 
-A record is the time in microseconds since 1970 (8 bytes, big endian) and the frame as it was on
-the wire. Time is EPOCH_UNIX_S plus the simulated stamp, so the same flight gives the same bytes.
+A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame. The
+time is EPOCH_UNIX_S plus the simulated stamp, so the same flight gives the same bytes.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from mavfi_cli.core.errors import RecordError
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
 _FLUSH_BYTES = 1 << 16
-_FLUSH_INTERVAL_S = 1.0  # of simulated time
+_FLUSH_INTERVAL_S = 1.0  # simulated time
 
 
 class TlogWriter:
-    """Writes a .tlog; a kill leaves whole records, at most a second or 64 KiB short.
+    """Writes a .tlog. A kill leaves whole records and loses the last second or 64 KiB at most.
 
     Args:
-        path: created, or emptied.
+        path: File to create or overwrite.
 
     Raises:
-        RecordError: the file cannot be written (here or in any method).
+        RecordError: The file cannot be written, here or in any method.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._pending = bytearray()
-        self._whole = 0  # bytes of the file that are whole records
+        self._whole = 0  # length of the whole records in the file, bytes
         self._flushed_s = 0.0
         self._descriptor: int | None = None
         try:
@@ -49,7 +49,7 @@ class TlogWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Hand what is pending to the system, whole or not at all."""
+        """Write pending records to the file, each whole or not at all."""
         if self._descriptor is None or not self._pending:
             return
         data = memoryview(bytes(self._pending))
@@ -64,19 +64,19 @@ class TlogWriter:
         self._pending.clear()
 
     def _take_back(self) -> None:
-        """Cut off a record that did not fit on the disk, and write no more."""
+        """Remove a record that did not fit on the disk, and stop writing."""
         assert self._descriptor is not None
         descriptor, self._descriptor = self._descriptor, None
         self._pending.clear()
         try:
             os.ftruncate(descriptor, self._whole)
-        except OSError:  # not a plain file (a pipe, /dev/full): nothing to cut
+        except OSError:  # a pipe or device cannot be truncated
             pass
         finally:
             os.close(descriptor)
 
     def close(self) -> None:
-        """Flush and close; harmless when repeated."""
+        """Flush and close. May be called repeatedly."""
         self.flush()
         if self._descriptor is not None:
             os.close(self._descriptor)

@@ -1,7 +1,6 @@
-"""Transports: bytes to and from one peer, opened by URL.
+"""Transports, opened by URL, that carry bytes to and from one peer.
 
-Which class serves which URL is decided here; how each works is in `streams`, `datagrams` and
-`serial_port`.
+This module chooses the class for a URL. `streams`, `datagrams` and `serial_port` implement them.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
-from mavfi_cli.link.endpoint import Endpoint, Scheme, check_reach, parse_endpoint, resolve
+from mavfi_cli.link.endpoint import Endpoint, UrlScheme, check_reach, parse_endpoint, resolve
 
 __all__ = [
     "EndpointError",
@@ -27,44 +26,44 @@ class Transport(Protocol):
 
     @property
     def url(self) -> str:
-        """What it was opened by, for messages to people."""
+        """URL of the endpoint, for error messages."""
 
     @property
     def datagram(self) -> bool:
-        """Whether every `receive` returns whole frames (pass it on to `Codec.decode`)."""
+        """True if every `receive` returns whole frames; an argument of `Codec.decode`."""
 
     def send(self, data: bytes) -> None:
-        """Send whole frames. A datagram may get lost without a word; LinkLost on a closed peer."""
+        """Send whole frames. Datagrams may be lost. Raises LinkLost if the peer has closed."""
 
     def receive(self, timeout_s: float) -> bytes:
-        """The next bytes, waiting at most `timeout_s` (inf: for ever); b"" when none came.
+        """Return the next bytes, or b"" after `timeout_s` (inf waits without end).
 
         Raises:
-            LinkLost: the peer closed the connection, or the device went away.
+            LinkLost: The peer closed the connection, or the device was removed.
         """
 
     def fileno(self) -> int:
         """The descriptor that becomes readable when `receive` would return something; -1: none."""
 
     def close(self) -> None:
-        """Release the socket or device; harmless when repeated."""
+        """Release the socket or device. May be called repeatedly."""
 
 
 class Listener(Protocol):
-    """Finds the peers of one URL: each client of a listening one, the only peer of any other."""
+    """Peers of one URL: every client of a listening URL, the single peer of any other."""
 
     @property
     def url(self) -> str:
-        """What it was opened by, for messages to people."""
+        """URL of the endpoint, for error messages."""
 
     def accept_ready(self) -> Sequence[Transport]:
-        """The peers that appeared since the last call; does not wait."""
+        """Return the peers that appeared since the last call, without waiting."""
 
     def fileno(self) -> int:
-        """The descriptor that becomes readable when `accept_ready` may return something."""
+        """Return the descriptor that becomes readable when `accept_ready` may return peers."""
 
     def close(self) -> None:
-        """Stop listening; UDP peers, which share the socket, end with it."""
+        """Stop listening. This closes UDP peers, too, because they share the socket."""
 
 
 def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = False) -> Transport:
@@ -73,42 +72,42 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
     Args:
         url: `udpin:[host]:port`, `udpout:host:port`, `tcp:host:port`, `tcpin:[host]:port`,
             `serial:device[:baud]` or `fd:number`; without a host it listens on loopback.
-        signed: the caller signs this link, so that it may reach beyond this machine.
-        allow_unsigned: let an unsigned link reach beyond this machine all the same.
+        signed: The caller signs this link, so it may reach beyond this machine.
+        allow_unsigned: Allow an unsigned link to reach beyond this machine.
 
     Raises:
-        EndpointError: malformed URL, unknown scheme, port in use, nobody there, no such device,
-            or an unsigned link beyond this machine.
+        EndpointError: The URL is malformed, its scheme is unknown, its port is in use, nobody
+            listens, the device does not exist, or an unsigned link reaches beyond this machine.
     """
-    # The scheme's module is imported on use, to keep the import of this one cheap.
+    # Each scheme's module is imported on first use to keep the import of this module cheap.
     endpoint = parse_endpoint(url)
-    if endpoint.scheme is Scheme.SERIAL:
+    if endpoint.scheme is UrlScheme.SERIAL:
         from mavfi_cli.link.serial_port import SerialPort
 
         return SerialPort(endpoint)
-    if endpoint.scheme in (Scheme.UDP_IN, Scheme.UDP_OUT):
+    if endpoint.scheme in (UrlScheme.UDP_IN, UrlScheme.UDP_OUT):
         from mavfi_cli.link import datagrams
 
-        opened = datagrams.bound if endpoint.scheme is Scheme.UDP_IN else datagrams.connected
+        opened = datagrams.bound if endpoint.scheme is UrlScheme.UDP_IN else datagrams.connected
         return opened(endpoint, _reachable(endpoint, signed, allow_unsigned))
     from mavfi_cli.link import streams
 
-    if endpoint.scheme is Scheme.FD:
+    if endpoint.scheme is UrlScheme.FD:
         return streams.inherited(endpoint)
     address = _reachable(endpoint, signed, allow_unsigned)
-    if endpoint.scheme is Scheme.TCP:
+    if endpoint.scheme is UrlScheme.TCP:
         return streams.connected(endpoint, address)
     return streams.TcpServerEnd(streams.TcpListener(endpoint, address))
 
 
 def open_listener(url: str, *, signed: bool = False, allow_unsigned: bool = False) -> Listener:
-    """Open an endpoint that serves several peers; arguments and errors as `open_transport`."""
+    """Open an endpoint that serves several peers. Arguments and errors as in `open_transport`."""
     endpoint = parse_endpoint(url)
-    if endpoint.scheme is Scheme.UDP_IN:
+    if endpoint.scheme is UrlScheme.UDP_IN:
         from mavfi_cli.link.datagrams import UdpListener
 
         return UdpListener(endpoint, _reachable(endpoint, signed, allow_unsigned))
-    if endpoint.scheme is Scheme.TCP_IN:
+    if endpoint.scheme is UrlScheme.TCP_IN:
         from mavfi_cli.link.streams import TcpListener
 
         return TcpListener(endpoint, _reachable(endpoint, signed, allow_unsigned))
@@ -118,7 +117,7 @@ def open_listener(url: str, *, signed: bool = False, allow_unsigned: bool = Fals
 def _reachable(endpoint: Endpoint, signed: bool, allow_unsigned: bool) -> tuple[int, str]:
     import socket
 
-    datagram = endpoint.scheme in (Scheme.UDP_IN, Scheme.UDP_OUT)
+    datagram = endpoint.scheme in (UrlScheme.UDP_IN, UrlScheme.UDP_OUT)
     kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
     family, address = resolve(endpoint, kind)
     check_reach(endpoint, address, signed=signed, allow_unsigned=allow_unsigned)
@@ -126,7 +125,7 @@ def _reachable(endpoint: Endpoint, signed: bool, allow_unsigned: bool) -> tuple[
 
 
 class _OnePeer:
-    """A listener on an endpoint that has exactly one peer, there from the start."""
+    """Listener for an endpoint with exactly one peer, which exists from the start."""
 
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
@@ -134,14 +133,14 @@ class _OnePeer:
         self.url = transport.url
 
     def accept_ready(self) -> list[Transport]:
-        """The peer, the first time; nobody after."""
+        """Return the peer on the first call, nothing afterwards."""
         fresh, self._fresh = self._fresh, []
         return fresh
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._transport.fileno()
 
     def close(self) -> None:
-        """Release it; harmless when repeated."""
+        """Close it. May be called repeatedly."""
         self._transport.close()

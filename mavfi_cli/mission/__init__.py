@@ -1,1 +1,1 @@
-"""The composition root: link + autonomy (+ faults + detectors), one clock and one loop."""
+"""Composition root: combines link, autonomy, faults and detectors in one loop with one clock."""

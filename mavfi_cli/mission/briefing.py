@@ -1,7 +1,7 @@
-"""What the mission is told before it flies: where to go, and how its camera is mounted.
+"""Mission briefing: goal, flight bounds and camera mounting, known before the flight.
 
-The simulated vehicle's process leaves a `briefing.json` before its first message, since only it
-has the world; for a foreign autopilot the briefing comes from the command line.
+The simulated vehicle writes `briefing.json` before its first message, because only the vehicle has
+the world. For a foreign autopilot the briefing comes from the command line.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from mavfi_cli.mission.config import MissionConfig
 
 FILE = "briefing.json"
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home
-FARTHEST_M = 200.0  # a goal farther away asks for obstacle grids beyond any memory
-MARGIN_M = 30.0  # round home and goal, where no world says how far it reaches
+FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
+MARGIN_M = 30.0  # flight bounds round home and goal without a known world
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Briefing:
-    """Goal, where one may fly, and camera."""
+    """Start, goal, flight bounds and camera of a mission."""
 
     start_enu_m: FloatArray  # (3,) on the ground
     goal_enu_m: FloatArray  # (3,)
-    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax that plans keep to
-    camera_offset_flu_m: FloatArray  # (3,) of the optical centre from the vehicle's centre
-    hfov_rad: float = math.pi / 2.0  # used until the camera tells
+    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax of the allowed volume
+    camera_offset_flu_m: FloatArray  # (3,) from the vehicle's centre to the optical centre
+    hfov_rad: float = math.pi / 2.0  # used until the camera reports its own
 
 
 def of_simulation(folder: Path) -> Briefing:
-    """The briefing that the simulated vehicle left.
+    """Read the briefing of the simulated vehicle.
 
     Raises:
-        VehicleProcessError: there is none.
+        VehicleProcessError: There is no briefing.
     """
     try:
         data = json.loads((folder / FILE).read_text())
@@ -53,10 +53,10 @@ def of_simulation(folder: Path) -> Briefing:
 
 
 def of_config(config: MissionConfig) -> Briefing:
-    """The briefing for a foreign autopilot: the goal must be named.
+    """Build the briefing for a foreign autopilot. The configuration must give the goal.
 
     Raises:
-        ConfigError: no goal was given.
+        ConfigError: The configuration has no goal.
     """
     if config.goal is None:
         raise ConfigError("a foreign autopilot needs --goal X,Y,Z (ENU, m, from its local origin)")
@@ -71,14 +71,14 @@ def of_config(config: MissionConfig) -> Briefing:
 
 
 def require_flyable(briefing: Briefing, takeoff_height_m: float, tolerance_m: float) -> None:
-    """Refuse a goal that is no flight, or none that the planner's maps can hold.
+    """Reject a goal that is too near, too far, or outside the flight levels.
 
     Args:
-        takeoff_height_m: above the start.
-        tolerance_m: how near the goal counts as reached.
+        briefing: Briefing to check.
+        tolerance_m: Distance from the goal that counts as reached.
 
     Raises:
-        ConfigError: names what is wrong with the goal.
+        ConfigError: The goal is invalid. Says why.
     """
     start, goal = briefing.start_enu_m, briefing.goal_enu_m
     takeoff = np.add(start, (0.0, 0.0, takeoff_height_m))
@@ -94,7 +94,7 @@ def require_flyable(briefing: Briefing, takeoff_height_m: float, tolerance_m: fl
 
 
 def _flight_bounds(bounds_enu_m: list[float]) -> FloatArray:
-    """The bounds with its flight levels; the reference plans between 1 and 10 m."""
+    """Return the bounds with the flight levels in z; MAVBench plans between 1 and 10 m."""
     bounds = np.array(bounds_enu_m, dtype=np.float64)
     bounds[2], bounds[5] = LOWEST_M, HIGHEST_M
     return bounds

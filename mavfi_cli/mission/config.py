@@ -1,4 +1,4 @@
-"""What a mission is made of: one frozen record, complete enough to repeat the flight."""
+"""Configuration of a mission: one frozen record that suffices to repeat the flight."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mavfi_cli.mission.stack import DEFAULT, Stack, load_stack, with_tolerance
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 Vector3 = tuple[float, float, float]
-LIMITS = {  # smallest and largest of each number
+LIMITS = {  # minimum and maximum of each number
     "takeoff_height_m": (1.0, 50.0),
     "v_max_mps": (0.1, 12.0),
     "a_max_mps2": (0.5, 8.0),
@@ -35,22 +35,23 @@ class MissionConfig:
     """One mission. Positions in the world frame (ENU), m.
 
     Attributes:
-        world: name of a world, or the path of a TOML file of boxes.
-        planner: its name; of our own any spelling is taken, and the one name kept.
-        seed: the root seed; world, planner, latency and sensor streams derive from it.
-        stack: how the companion is wired and what it checks.
-        start, goal: None leaves the world's own.
-        goal_tolerance_m: None leaves the stack's own.
-        world_seed: of a generated world, and of start and goal in a scene; None is `seed`.
+        world: Name of a world, or path of a TOML file of boxes.
+        planner: Name of the planner, stored in its canonical form.
+        seed: Root seed of the mission, from which world, planner, latency and sensor streams
+            derive.
+        stack: Stack of the companion, as for `load_stack`.
+        start, goal: None selects the world's own.
+        goal_tolerance_m: None selects the stack's own.
+        world_seed: Seed of a generated world, or of start and goal in a scene; None for `seed`.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
-        realtime: pace the simulated vehicle by the wall clock.
-        land: land and disarm after the goal was reached.
-        fault: a source-level fault to inject; None for a golden flight.
-        instruction: an instruction-level fault to inject instead.
-        detector: what watches the states before they take effect; None for nothing.
-        node_restart_s: from the death of a node until its successor works, simulated.
-        node_watchdog_s: a node that works for so long hangs and is killed, simulated.
-        isolate: nodes that work in processes of their own; changes nothing in the record.
+        realtime: Run the simulated vehicle at wall-clock speed.
+        land: Land and disarm at the goal.
+        fault: Source-level fault to inject; None for a golden run.
+        instruction: Instruction-level fault to inject; None for a golden run.
+        detector: Detector that checks messages before they take effect; None for no detector.
+        node_restart_s: Simulated time from the death of a node to its restart, s.
+        node_watchdog_s: Simulated time after which a busy node counts as hung and is killed, s.
+        isolate: Nodes that run in processes of their own; does not change the record.
     """
 
     world: str = "dense"
@@ -131,25 +132,25 @@ class MissionConfig:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the record of the run; how it was computed is not part of it."""
+        """Return plain values for the record of the run, without settings of the host."""
         values = asdict(self)
         del values["isolate"]
         return values
 
     @property
     def seed_of_world(self) -> int:
-        """The seed from which the world is made."""
+        """Seed of the world."""
         return self.seed if self.world_seed is None else self.world_seed
 
     @property
     def files(self) -> tuple[str, ...]:
-        """What may be the users' own files, by name: a mission depends on what they hold."""
+        """Names of settings that may be user files, whose contents the mission depends on."""
         model = None if self.detector is None else self.detector.model
-        stack = self.stack.partition(":")[0]  # a variant's changes are not in the file
+        stack = self.stack.partition(":")[0]  # without the changes of a variant
         named = (self.world, self.platform, stack, self.vehicle)
         return tuple(name for name in named if name.endswith(".toml")) + ((model,) if model else ())
 
 
 def stack_of(config: MissionConfig) -> Stack:
-    """The stack that a mission flies, its goal's tolerance resolved; raises as `load_stack`."""
+    """Return the stack of a mission with its goal tolerance. Raises as `load_stack`."""
     return with_tolerance(load_stack(config.stack), config.goal_tolerance_m)

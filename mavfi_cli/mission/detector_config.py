@@ -1,4 +1,4 @@
-"""What a user asks to be detected, as plain values that a record can hold."""
+"""Configuration of a mission's detector, as plain values for the record."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mavfi_cli.detect.watch import ExtendedWatch
 from mavfi_cli.mission.stack import lineage, load_stack
 
 STAGES = tuple(stage.value for stage in Stage)
-PAPER, EXTENDED = "paper", "extended"  # which states are watched
+PAPER, EXTENDED = "paper", "extended"  # sets of watched states
 WATCHES = (PAPER, EXTENDED)
 
 
@@ -25,13 +25,13 @@ class DetectorConfig:
     """The detector of a mission.
 
     Attributes:
-        name: gad, aad, range, l2, or a plug-in's name.
-        protect: the stages whose states are watched.
-        threshold: replaces the model's own; for gad the number of sigmas.
-        model: path of a model file; None takes the one that is shipped for the mission's stack.
-        alarms_max: the alarm in a row of one stage at which the vehicle holds and plans anew.
-        any_stack: a model of another stack than the mission's will do.
-        watch: `paper`, the 13 states; `extended` adds those of `detect.watch`.
+        name: Name of the detector: gad, aad, range, l2 or a plug-in.
+        protect: Stages with watched states.
+        threshold: Replaces the model's threshold; a number of sigmas for gad.
+        model: Path of a model file; None selects the one shipped for the mission's stack.
+        alarms_max: Number of consecutive alarms of a stage at which the vehicle holds and replans.
+        any_stack: Allow a model for another stack than the mission's.
+        watch: Watched states: `paper` for the 13 states, `extended` adds those of `detect.watch`.
     """
 
     name: str
@@ -59,13 +59,14 @@ class DetectorConfig:
 
 
 def model_path(config: DetectorConfig, stack: str) -> Path | None:
-    """The model file of a mission's detector; None if it has no model.
+    """Return the model file of a mission's detector; None if it has no model.
 
-    The file is the one that is asked for, else the one that is shipped for the stack or for the
-    nearest stack that it is based on. `detector_of` refuses the latter without `any_stack`.
+    It is the configured file, or else the one shipped for the stack or for its nearest base stack.
+    `detector_of` rejects the model of a base stack without `any_stack`.
 
     Args:
-        stack: of the mission, as `load_stack` takes it; raises as that does.
+        config: Configuration of the detector.
+        stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
     """
     if config.model is not None:
         return Path(config.model)
@@ -76,16 +77,17 @@ def model_path(config: DetectorConfig, stack: str) -> Path | None:
 
 
 def detector_of(config: DetectorConfig, stack: str) -> Detector:
-    """A fresh detector for a mission that flies the stack.
+    """Create a new detector for a mission with the given stack.
 
     Args:
-        stack: as `load_stack` takes it; raises as that does.
+        config: Configuration of the detector.
+        stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
 
     Raises:
-        UnknownName: there is no such detector; names the nearest.
-        OtherStack: its model is that of another stack, and `any_stack` was not asked for.
-        ModelError: its model cannot be used.
-        ConfigError: a threshold out of range; extended states without ranges.
+        UnknownName: No detector has this name. Suggests the nearest.
+        OtherStack: The model is for another stack, and `any_stack` is not set.
+        ModelError: The model cannot be used.
+        ConfigError: The threshold is out of range, or the model lacks ranges of extended states.
     """
     path = model_path(config, stack)
     detector = find(config.name, model=path, threshold=config.threshold)
@@ -100,10 +102,10 @@ def detector_of(config: DetectorConfig, stack: str) -> Detector:
 
 
 def watch_of(config: DetectorConfig, detector: Detector) -> ExtendedWatch | None:
-    """What judges the extended states, by the ranges of the detector's model; None: nobody does.
+    """Create the watch of the extended states from the detector's model; None if not configured.
 
     Raises:
-        ConfigError: the detector has no such ranges.
+        ConfigError: The model lacks ranges of the extended states.
     """
     if config.watch == PAPER:
         return None

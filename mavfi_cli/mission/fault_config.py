@@ -1,4 +1,4 @@
-"""What a user asks to be injected, as plain values that a record can hold."""
+"""Configuration of a source-level fault, as plain values for the record."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from mavfi_cli.fi.source.fault import (
 )
 from mavfi_cli.mission.platform import KERNELS
 
-_UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # of a trigger's number
-DETECTOR = "detector"  # the target that is no state: what the detector keeps
-PROCESS = "process"  # and the one that is no value: the process in which a node works
-QUEUE = "queue"  # before a state of a waypoint: the copy of the plan that control has
+_UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
+DETECTOR = "detector"  # target: memory of the detector
+PROCESS = "process"  # target prefix: process of a node
+QUEUE = "queue"  # target prefix: control's copy of the plan
 _QUEUED = [name for name in dict.fromkeys((*BY_NAME, *GROUPS)) if name.startswith("waypoint_")]
 
 
@@ -32,13 +32,13 @@ class FaultConfig:
     """One source-level fault of a mission.
 
     Attributes:
-        target: a stage, a state, or a group of states; or `detector`, `detector.PART`: its own
-            memory, such as `detector.threshold`; or `process.NODE`: the node's process is killed;
-            or `queue.STATE`: a waypoint's state in control's own copy of the plan.
-        seed: root of the fault's own random streams.
-        at: "random", "time=SECONDS", "tick=N", "phase=NAME", "foreseen" or "invocation=N".
-        together: strike all components of the group at once.
-        exact_bits: these bits instead of drawn ones.
+        target: Injection site: a stage, a state or a group of states; `detector` or `detector.PART`
+            for the detector's memory, such as `detector.threshold`; `process.NODE` to kill the
+            node's process; `queue.STATE` for a waypoint's state in control's copy of the plan.
+        seed: Root seed of the fault's random streams.
+        at: Trigger: "random", "time=SECONDS", "tick=N", "phase=NAME", "foreseen" or "invocation=N".
+        together: Corrupt all components of the group at once.
+        exact_bits: Bits to flip instead of drawn ones.
     """
 
     target: str
@@ -50,39 +50,39 @@ class FaultConfig:
     field: str = "any"
     exact_bits: tuple[int, ...] | None = None
     persistence: str = "transient"
-    duration_s: float | None = None  # None: to the end
+    duration_s: float | None = None  # None: until the end of the mission
     period_s: float = 1.0
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the record of the run."""
+        """Return plain values for the record of the run."""
         return asdict(self)
 
     @property
     def attacks_detector(self) -> bool:
-        """Whether the detector's own memory is hit, not a state between kernels."""
+        """True if the injection site is the detector's memory."""
         return self.target.partition(".")[0] == DETECTOR
 
     @property
     def killed_node(self) -> str | None:
-        """The node whose process is killed; None for a fault in a value."""
+        """Node whose process is killed; None for a fault in a value."""
         what, dot, node = self.target.partition(".")
         return node if what == PROCESS and dot else None
 
     @property
     def strikes_queue(self) -> bool:
-        """Whether control's own copy of the plan is hit."""
+        """True if the injection site is control's copy of the plan."""
         return self.target.partition(".")[0] == QUEUE
 
     @property
     def detector_part(self) -> str | None:
-        """The array of the detector's memory that is hit; None draws one."""
+        """Array of the detector's memory to corrupt; None to draw one."""
         return self.target.partition(".")[2] or None
 
     def check(self) -> None:
-        """Say now what is wrong with it; raises as `draw`."""
+        """Validate the configuration. Raises as `draw`."""
         if self.killed_node is not None:
             self._check_kill(self.killed_node)
-        elif self.attacks_detector:  # its memory is known in the mission only
+        elif self.attacks_detector:  # its memory is only known during the mission
             self.trigger()
             self.corruption()
         else:
@@ -97,10 +97,10 @@ class FaultConfig:
             raise FaultSpecError(f"{self.target}: a process is killed at a time, tick or phase")
 
     def check_within(self, time_limit_s: float) -> None:
-        """Refuse a trigger that no mission of this length reaches; raises also as `trigger`.
+        """Reject a trigger beyond the mission's time limit. Also raises as `trigger`.
 
         Raises:
-            FaultSpecError: the time or the tick lies beyond the limit.
+            FaultSpecError: The time or the tick is beyond the limit.
         """
         trigger = self.trigger()
         at_s = trigger.number * _UNIT_S.get(trigger.when, 0.0)
@@ -111,11 +111,11 @@ class FaultConfig:
             )
 
     def trigger(self) -> Trigger:
-        """When it strikes; raises as `parse_trigger`."""
+        """Return the trigger. Raises as `parse_trigger`."""
         return parse_trigger(self.at)
 
     def corruption(self) -> Corruption:
-        """What is done to a value; raises UnknownName and FaultSpecError."""
+        """Return the corruption of the value. Raises UnknownName and FaultSpecError."""
         return Corruption(
             effect=_member(Effect, "effect", self.effect),
             bits=self.bits,
@@ -126,11 +126,11 @@ class FaultConfig:
         )
 
     def draw(self) -> SourceFault:
-        """The fault in a state between kernels, its site drawn.
+        """Draw the injection site and return the fault in an inter-kernel state.
 
         Raises:
-            UnknownName: a name that does not exist.
-            FaultError: values that do not fit.
+            UnknownName: A name does not exist.
+            FaultError: Values do not fit together.
         """
         target = self.target
         if self.strikes_queue:
@@ -150,13 +150,13 @@ class FaultConfig:
 
 
 def parse_trigger(text: str) -> Trigger:
-    """The trigger that a text like `time=12.5` stands for.
+    """Parse a trigger such as `time=12.5`.
 
     Raises:
-        UnknownName: no such kind of trigger, or no such phase.
-        FaultSpecError: a number that is none.
+        UnknownName: The kind of trigger or the phase does not exist.
+        FaultSpecError: The number is missing or invalid.
     """
-    from mavfi_cli.autonomy.orders import Mode
+    from mavfi_cli.autonomy.orders import PilotMode
 
     kind, _, value = text.partition("=")
     if not value and kind.replace(".", "", 1).isdigit():
@@ -165,7 +165,7 @@ def parse_trigger(text: str) -> Trigger:
     if when in (When.RANDOM, When.FORESEEN):
         return Trigger(when=when)
     if when is When.PHASE:
-        return Trigger(when=when, phase=_member(Mode, "phase", value).value)
+        return Trigger(when=when, phase=_member(PilotMode, "phase", value).value)
     try:
         return Trigger(when=when, number=float(value))
     except ValueError:

@@ -1,4 +1,4 @@
-"""The loop of one mission: messages in, one control tick a state, setpoints out.
+"""The loop of one mission: receives messages, runs a control tick per state, sends setpoints.
 
 The clock is the vehicle's: a LOCAL_POSITION_NED is the tick of its stamp. In lockstep the
 vehicle waits for the setpoint of that stamp; the answer goes out first, so that a vehicle in a
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import TURN_S
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
@@ -30,13 +30,13 @@ from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.protection import gate_of, protection_of
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.flight_logger import FlightLogger
 from mavfi_cli.mission.injection import (
     DetectorInjection,
-    Injection,
     NoInjection,
     ProcessInjection,
+    SourceInjection,
 )
-from mavfi_cli.mission.narrator import Narrator
 from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Watcher
@@ -45,10 +45,10 @@ from mavfi_cli.mission.record.events import EventLog
 from mavfi_cli.mission.record.trace import Trace
 from mavfi_cli.mission.stack import Stack
 
-SILENCE_S = 60.0  # a lockstep vehicle that says nothing for so long is gone
-IDLE_S = 0.1  # a foreign autopilot is spoken to this often when it says nothing
-CAMERA_BELOW_M = 1.0  # below the take-off height the camera is started
-LOST_S = 5.0  # a foreign autopilot that tells no new state for so long is lost
+SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts as lost
+IDLE_S = 0.1  # period of messages to a silent foreign autopilot
+CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
+LOST_S = 5.0  # time without a new state after which a foreign autopilot counts as lost
 _POSITION = dialect.MAVLink_local_position_ned_message
 _PACKET = dialect.MAVLink_encapsulated_data_message
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -83,7 +83,7 @@ class Flight:
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
         self.injection = NoInjection()
-        self._narrator = Narrator(watcher)
+        self._logger = FlightLogger(watcher)
         self.trace = Trace()
         self.wall = WallClock()
         self.stamp_s = 0.0
@@ -106,9 +106,9 @@ class Flight:
         """Wait for the autopilot's first heartbeat.
 
         Raises:
-            NoAutopilot: nothing was heard.
-            LinkLost: the other end closed the connection.
-            Interrupted: Ctrl-C, before there is anything to record.
+            NoAutopilot: No heartbeat arrived.
+            LinkLost: The other end closed the connection.
+            Interrupted: The user pressed Ctrl-C before there was anything to record.
         """
         while self._session.phase is Phase.CONNECTING:
             if self._interrupts:
@@ -118,7 +118,7 @@ class Flight:
             raise self._session.failure
 
     def brief(self, briefing: Briefing) -> None:
-        """Tell where the goal is and how the camera is mounted; makes the companion ready."""
+        """Set goal and camera mounting, and create the companion."""
         require_flyable(briefing, self._config.takeoff_height_m, self._stack.goal_tolerance_m)
         self._briefing = briefing
         fault, shortest_s = self._config.fault, self._shortest_flight_s(briefing)
@@ -128,7 +128,7 @@ class Flight:
         elif fault is not None and fault.attacks_detector:
             self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
         elif fault is not None:
-            self.injection = Injection(fault, shortest_s)
+            self.injection = SourceInjection(fault, shortest_s)
         self.companion = Companion(
             self._config,
             self._stack,
@@ -141,15 +141,16 @@ class Flight:
         )
 
     def record(self, recorder: Recorder) -> None:
-        """Have the recorder hear what the flight asks of its nodes; after `brief`."""
+        """Attach a recorder of the nodes' inputs. Call it after `brief`."""
         assert self.companion is not None
         recorder.briefing = self._briefing
         self.companion.executor.on_start = recorder.on_start
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """No flight takes less: a turn round where one comes first, then straight to the goal.
+        """Return a lower bound of the flight time.
 
-        Straight to the edge of the goal's tolerance, at full speed.
+        It consists of the turn before departure, if any, and a straight flight at full speed to the
+        edge of the goal's tolerance.
         """
         start = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
         distance_m = float(np.linalg.norm(briefing.goal_enu_m - start))
@@ -158,7 +159,7 @@ class Flight:
 
     @contextlib.contextmanager
     def isolated_nodes(self) -> Iterator[None]:
-        """Each node that the mission isolates works in a process of its own meanwhile."""
+        """Run each isolated node in a process of its own during the context."""
         assert self.companion is not None
         assert self._briefing is not None
         executor = self.companion.executor
@@ -177,8 +178,8 @@ class Flight:
         """Fly until the mission has an outcome.
 
         Raises:
-            CommandRefused: the autopilot refused to arm, take off or change its mode.
-            RecordError: the tlog could not be written.
+            CommandRefused: The autopilot refused to arm, take off or change its mode.
+            RecordError: The tlog could not be written.
         """
         with self.link.recording(tlog):
             try:
@@ -203,11 +204,11 @@ class Flight:
 
     @property
     def _landing_failed(self) -> Exception | None:
-        """A landing that was refused does not undo the mission's outcome."""
+        """Return the error of a failed landing, which does not change the mission's outcome."""
         return self._session.failure if self.outcome is not None else None
 
     def end(self, outcome: Outcome, reason: str = "") -> None:
-        """Settle how the mission ended; the first word counts."""
+        """Set the outcome of the mission. Later calls have no effect."""
         if self.outcome is not None:
             return
         self.outcome, self.reason, self.end_s = outcome, reason, self.stamp_s
@@ -215,14 +216,14 @@ class Flight:
         self._note("outcome", text)
 
     def explain(self, why: str) -> None:
-        """Add why the vehicle fell silent, where its process is known to have failed."""
+        """Add the failure of the vehicle's process to the reason of a lost link."""
         if self.outcome is Outcome.LINK_LOST:
             self.reason = f"{self.reason}: {why}"
 
-    # One turn of the loop -------------------------------------------------------------------------
+    # One iteration of the loop --------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Take what came, and do the control tick of every state in it."""
+        """Receive messages and run the control tick of every state among them."""
         foreign = self._config.link is not None
         begun = time.monotonic()
         with self.wall.measure("wait"):
@@ -237,7 +238,7 @@ class Flight:
             raise LinkLost(f"the simulated vehicle said nothing for {SILENCE_S:g} s")
 
     def _take(self, data: bytes) -> float | None:
-        """Take the messages in the data; the stamp of the newest state among them, s."""
+        """Handle the messages in the data. Return the stamp of the newest state, s, or None."""
         stamp_ms = None
         with self.wall.measure("link"):
             for message in self.link.messages(data, self.stamp_s):
@@ -257,7 +258,7 @@ class Flight:
         )
 
     def _go_without(self, waited_s: float) -> None:
-        """A foreign autopilot told no new state: speak to it all the same, but not for ever."""
+        """Run a tick without a new state of a foreign autopilot, until it counts as lost."""
         self._unheard_s += waited_s
         self._unspoken_s += waited_s
         if self._unheard_s >= LOST_S and self._on_clock:
@@ -271,9 +272,9 @@ class Flight:
             raise self._session.failure
 
     def _tick(self, stamp_s: float) -> bool:
-        """One control tick: publish what is due, decide, answer, and only then compute.
+        """Run one control tick: publish due outputs, decide, send the setpoint, then compute.
 
-        False, and nothing is done, where the stamp is not new.
+        Returns False without any effect if the stamp is not new.
         """
         if not self._on_clock:
             self._take_clock(stamp_s)
@@ -294,18 +295,18 @@ class Flight:
         if not self._camera_asked and self._nearly_up(state):
             self._camera_asked = True
             self._session.camera.start(1.0 / self._config.camera_rate_hz)
-        self._narrator.tell(stamp_s, self._session, companion, self.injection)
+        self._logger.tell(stamp_s, self._session, companion, self.injection)
         return True
 
     def _take_clock(self, stamp_s: float) -> None:
-        """From the first state on, the foreign vehicle's clock is ours: begin the talk anew."""
+        """Adopt the foreign vehicle's clock at its first state and restart the session."""
         self._on_clock = True
         telemetry = self._session.telemetry
         telemetry.heartbeat_s = telemetry.now_s = stamp_s
         self._session = self._new_session(telemetry)
 
     def _nearly_up(self, state: VehicleState | None) -> bool:
-        """High enough that a map begun now is there when the companion takes over."""
+        """Return True near the take-off height, early enough for a map at the take-over."""
         if self._session.phase is Phase.OFFBOARD:
             return True
         height_m = -1.0 if state is None else float(state.position_enu_m[2])
@@ -332,7 +333,7 @@ class Flight:
         )
 
     def _offer_frames(self, companion: Companion) -> None:
-        """Give the newest depth frames to perception, with the pose of their moment."""
+        """Pass the newest depth frames to perception, each with its camera pose."""
         assert self._briefing is not None
         for image in self._frames:
             pose = self._session.state_at(image.stamp_s)
@@ -347,10 +348,10 @@ class Flight:
                 )
         self._frames.clear()
 
-    # What became of it ----------------------------------------------------------------------------
+    # Outcome --------------------------------------------------------------------------------------
 
     def _judge(self) -> None:
-        """Does the mission have an outcome now?"""
+        """Set the outcome if the mission has ended."""
         if self.outcome is not None:
             return
         session, companion = self._session, self.companion
@@ -362,9 +363,9 @@ class Flight:
             self.end(Outcome.FAILSAFE, session.failsafe_text or "")
         elif session.link_lost:
             self.end(Outcome.LINK_LOST, "no heartbeat for 3 s")
-        elif companion is not None and companion.mode is Mode.ARRIVED:
+        elif companion is not None and companion.mode is PilotMode.ARRIVED:
             self.end(Outcome.SUCCESS)
-        elif companion is not None and companion.mode is Mode.GAVE_UP:
+        elif companion is not None and companion.mode is PilotMode.GAVE_UP:
             self.end(
                 Outcome.NO_PATH, f"{companion.pilot.params.attempts_max} plans in a row failed"
             )
@@ -372,32 +373,32 @@ class Flight:
             self.end(Outcome.TIMEOUT, f"{self._config.time_limit_s:g} s")
 
     def _note(self, kind: str, text: str) -> None:
-        self._narrator.note(self.stamp_s, kind, text, self._session.state)
+        self._logger.note(self.stamp_s, kind, text, self._session.state)
 
-    # For the record -------------------------------------------------------------------------------
+    # Record ---------------------------------------------------------------------------------------
 
     @property
     def goal_enu_m(self) -> FloatArray | None:
-        """(3,), m; None before the briefing."""
+        """Goal (3,), m; None before the briefing."""
         return None if self._briefing is None else self._briefing.goal_enu_m
 
     @property
     def goal_tolerance_m(self) -> float:
-        """How near the goal counts as reached: the mission's own, or the stack's."""
+        """Distance from the goal that counts as reached, m: the mission's own, or the stack's."""
         return self._stack.goal_tolerance_m
 
     def own_quality(self) -> quality.QualityOfFlight:
-        """Quality of flight as far as the companion itself knows it."""
+        """Return the part of the quality of flight that the companion can compute."""
         if self.goal_enu_m is None:
             return quality.QualityOfFlight()
         return quality.from_states(*self.trace.motion(), self.goal_enu_m)
 
     @property
     def log(self) -> EventLog:
-        """Every event so far."""
-        return self._narrator.log
+        """All events so far."""
+        return self._logger.log
 
     @property
     def images(self) -> ImageReceiver:
-        """What came of the camera's frames."""
+        """Receiver of the camera's frames."""
         return self._images

@@ -1,4 +1,4 @@
-"""The golden flight that a faulty one is held against: the same mission without the fault."""
+"""Golden run of a faulty run: the same mission without the fault."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ def kept_golden(run: Run) -> Run | None:
 
 
 def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
-    """The golden pair of a run: flown once, then kept in the run's folder.
+    """Return the golden run of a run. It is flown once and kept in the run's folder.
 
     Args:
-        note: is told before it is flown.
+        run: Run with a fault.
+        note: Callback with a message before the golden run is flown.
 
     Raises:
-        RecordError: the run does not repeat, or its folder cannot be written.
-        Interrupted: the user ended the golden flight; nothing of it is kept.
+        RecordError: The run is not repeatable, or its folder cannot be written.
+        Interrupted: The user ended the golden run. Nothing of it is kept.
     """
     config = config_of(run, with_fault=False)
     if (golden := kept_golden(run)) is not None:

@@ -1,4 +1,4 @@
-"""A fault's way through a mission: the injector, and the record that outlives the flight."""
+"""Injection of a fault into a mission, and its record on disk."""
 
 from __future__ import annotations
 
@@ -30,47 +30,47 @@ SCHEMA = 1
 
 
 class NoInjection:
-    """The null object: every message goes on as it is.
+    """Null object that leaves every message unchanged.
 
     Attributes:
-        follower: hears who works with which message.
-        in_queue: control's own copy of the plan is struck, not the plan.
+        follower: Tracks which node reads which message.
+        in_queue: True if the injection site is control's copy of the plan.
     """
 
     follower: Follower | None = None
     in_queue = False
 
     def watch(self, moment: Moment) -> None:
-        """Where the mission stands: said once a control tick, and before every report goes on."""
+        """Observe the mission once per control tick and before every report."""
 
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
-        """The message itself."""
+        """Return the message unchanged."""
         return message
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """The trajectory itself."""
+        """Return the trajectory unchanged."""
         return trajectory
 
     def strike_memory(self, moment: Moment) -> None:
-        """Nothing that a process keeps is attacked."""
+        """Do nothing."""
 
     def begin(self, path: Path) -> None:
-        """Nothing to record."""
+        """Write no record."""
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
         """No node needs a process of its own."""
 
     def news(self) -> list[str]:
-        """Nothing to tell."""
+        """Return no news."""
         return []
 
     def finish(self) -> dict[str, Any] | None:
-        """No record."""
+        """Return no record."""
         return None
 
 
 class _Recorded(NoInjection, ABC):
-    """The record of a fault: on the disk before the flight, at the first strike, at the end."""
+    """Record of a fault, written before the flight, at the first strike and at the end."""
 
     def __init__(self, config: FaultConfig) -> None:
         self._config = config
@@ -80,21 +80,21 @@ class _Recorded(NoInjection, ABC):
         self._strike: Strike | None = None
 
     def begin(self, path: Path) -> None:
-        """Write down what is going to happen, before the flight."""
+        """Write the planned fault before the flight."""
         self._path = path
         write_json(path, self.record())
 
     def news(self) -> list[str]:
-        """What was done since the last call, a line each."""
-        told, self._news = self._news, []
-        return told
+        """Return one line per strike since the last call."""
+        news, self._news = self._news, []
+        return news
 
     @abstractmethod
     def _missed(self) -> str:
-        """Why nothing was struck."""
+        """Return the reason why the fault has not struck."""
 
     def _on_strike(self, strike: Strike) -> None:
-        """The first strike reaches the disk before its message goes on."""
+        """Write the first strike to disk before its message is passed on."""
         self._strike = strike
         if self._state == "planned":
             self._news.append(strike_text(strike))
@@ -103,7 +103,7 @@ class _Recorded(NoInjection, ABC):
                 write_json(self._path, self.record())
 
     def finish(self) -> dict[str, Any] | None:
-        """The record at the end of the mission, written down as well."""
+        """Write and return the record at the end of the mission."""
         if self._state == "planned":
             self._state = "not_injected"
         if self._path is not None:
@@ -111,7 +111,7 @@ class _Recorded(NoInjection, ABC):
         return self.record()
 
     def record(self) -> dict[str, Any]:
-        """What was asked for, what was drawn, what was hit."""
+        """Return the requested fault, the drawn values and the strikes."""
         reason = self._missed() if self._state == "not_injected" else ""
         return {
             "schema": SCHEMA,
@@ -122,12 +122,12 @@ class _Recorded(NoInjection, ABC):
         }
 
 
-class Injection(_Recorded):
-    """One source-level fault in one mission.
+class SourceInjection(_Recorded):
+    """Injection of one source-level fault into a mission.
 
     Args:
-        config: as asked for.
-        shortest_flight_s: the time over which a random trigger is drawn.
+        config: Configuration of the fault.
+        shortest_flight_s: Interval from which a random trigger is drawn, s.
     """
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
@@ -143,18 +143,18 @@ class Injection(_Recorded):
         self.in_queue = config.strikes_queue
 
     def watch(self, moment: Moment) -> None:
-        """Let the trigger see where the mission stands."""
+        """Update the trigger."""
         self._injector.watch(moment)
 
     def _missed(self) -> str:
         return self._injector.missed
 
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
-        """A message as its receiver gets it."""
+        """Return the message as its receiver gets it, corrupted if the fault strikes."""
         return self._followed(message, self._injector.pass_on(message, moment, index))
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """The trajectory that is being flown, as it is from this tick on."""
+        """Return the active trajectory from this tick on, corrupted if the fault strikes."""
         struck = self._injector.strike_latched(trajectory, moment, index)
         return self._followed(trajectory, struck)
 
@@ -164,7 +164,7 @@ class Injection(_Recorded):
         return sent
 
     def record(self) -> dict[str, Any]:
-        """What was asked for, what was drawn, what was hit."""
+        """Return the requested fault, the drawn values and the strikes."""
         fault, reader = self._fault, self.follower.reader
         return {
             **super().record(),
@@ -182,14 +182,14 @@ class Injection(_Recorded):
 
 
 class DetectorInjection(_Recorded):
-    """One fault in the memory of the detector that should catch faults.
+    """Injection of one fault into the memory of the detector.
 
-    The detector reads all of its memory at its next check, so every strike is read.
+    The detector reads all of its memory at its next check, so every fault is activated.
 
     Args:
-        config: as asked for; its target is `detector` or `detector.PART`.
-        shortest_flight_s: the time over which a random trigger is drawn.
-        gate: whose memory is attacked.
+        config: Configuration of the fault. Its target is `detector` or `detector.PART`.
+        shortest_flight_s: Interval from which a random trigger is drawn, s.
+        gate: Gate with the detector's memory.
     """
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float, gate: Gate) -> None:
@@ -207,18 +207,18 @@ class DetectorInjection(_Recorded):
         )
 
     def watch(self, moment: Moment) -> None:
-        """Let the trigger see where the mission stands."""
+        """Update the trigger."""
         self._injector.watch(moment)
 
     def _missed(self) -> str:
         return self._injector.missed
 
     def strike_memory(self, moment: Moment) -> None:
-        """Act on the detector's memory if the moment has come."""
+        """Corrupt the detector's memory if the trigger fires."""
         self._injector.strike(moment)
 
     def record(self) -> dict[str, Any]:
-        """What was asked for, what was drawn, what was hit."""
+        """Return the requested fault, the drawn values and the strikes."""
         applied = self._state == "applied"
         return {
             **super().record(),
@@ -240,15 +240,15 @@ class DetectorInjection(_Recorded):
 
 
 class ProcessInjection(_Recorded):
-    """The process of a node is killed once.
+    """Injection that kills the process of a node once.
 
     Args:
-        config: as asked for; its target is `process.NODE`.
-        shortest_flight_s: the time over which a random trigger is drawn.
+        config: Configuration of the fault. Its target is `process.NODE`.
+        shortest_flight_s: Interval from which a random trigger is drawn, s.
 
     Attributes:
-        node: whose process it is.
-        kill: ends the process of a node at a stamp, s; set before the flight.
+        node: Node whose process is killed.
+        kill: Function that kills a node's process at a stamp, s. Set it before the flight.
     """
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
@@ -266,14 +266,14 @@ class ProcessInjection(_Recorded):
         self.kill = executor.kill
 
     def watch(self, moment: Moment) -> None:
-        """Let the trigger see where the mission stands."""
+        """Update the trigger."""
         self._schedule.watch(moment)
 
     def _missed(self) -> str:
         return self._schedule.missed("control tick")
 
     def strike_memory(self, moment: Moment) -> None:
-        """Kill the process if the moment has come."""
+        """Kill the process if the trigger fires."""
         if not self._schedule.due(moment):
             return
         self._schedule.acted(moment)
@@ -285,7 +285,7 @@ class ProcessInjection(_Recorded):
         self.kill(self.node, moment.stamp_s)
 
     def record(self) -> dict[str, Any]:
-        """What was asked for, what was drawn, what was killed."""
+        """Return the requested fault, the drawn values and the kill."""
         strike = self._strike
         reader = None
         if strike is not None:
@@ -307,7 +307,7 @@ class ProcessInjection(_Recorded):
 
 
 def trigger_record(trigger: Trigger, drawn_time_s: float) -> dict[str, Any]:
-    """A trigger as plain values."""
+    """Return a trigger as plain values."""
     return {
         "when": trigger.when.value,
         "number": trigger.number,
@@ -317,7 +317,7 @@ def trigger_record(trigger: Trigger, drawn_time_s: float) -> dict[str, Any]:
 
 
 def strike_text(strike: Strike) -> str:
-    """What a strike changed, in one line."""
+    """Describe the changes of a strike in one line."""
     if not strike.changes:
         return "fault: the process is killed"
     changes = [

@@ -1,4 +1,4 @@
-"""What a user asks of an instruction-level fault in a mission, as plain values for the record."""
+"""Configuration of an instruction-level fault in a mission, as plain values for the record."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class InstructionConfig:
     """One instruction-level fault of a mission.
 
     Attributes:
-        target: a node, or a stage of which one node is drawn.
-        seed: root of all that is drawn for the fault.
-        sampling: the sampling rule. Rules by time cannot be repeated, so missions refuse them.
-        compat: another injector's habits in choosing registers and bits; the moment stays drawn
-            uniformly over executed instructions.
-        sites, roles: which kinds of operands; empty: the usual ones.
-        bits: how many distinct bits of the operand.
-        null: do everything but the flip.
+        target: Injection site: a node, or a stage from which a node is drawn.
+        seed: Root seed of the fault's random streams.
+        sampling: Sampling rule. Missions reject rules by time, which are not repeatable.
+        compat: Choose registers and bits as another injector does. The time stays uniformly
+            distributed over executed instructions.
+        sites, roles: Kinds of operands; empty for the default.
+        bits: Number of distinct bits to flip.
+        null: Null injection: do everything except the flip.
     """
 
     target: str
@@ -49,14 +49,14 @@ class InstructionConfig:
     null: bool = False
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the record of the run."""
+        """Return plain values for the record of the run."""
         return asdict(self)
 
     def node(self) -> str:
-        """The attacked node.
+        """Return the target node.
 
         Raises:
-            UnknownName: no such node or stage.
+            UnknownName: The node or stage does not exist.
         """
         if self.target not in _NODES:
             raise UnknownName("node or stage", self.target, _NODES)
@@ -64,11 +64,11 @@ class InstructionConfig:
         return nodes[int(generator(self.seed, Stream.FAULT, "node").integers(len(nodes)))]
 
     def strategy(self) -> Strategy:
-        """The sampling strategy.
+        """Return the sampling strategy.
 
         Raises:
-            UnknownName: a name that does not exist.
-            FaultSpecError: a rule that cannot be repeated.
+            UnknownName: A name does not exist.
+            FaultSpecError: The rule is not repeatable.
         """
         from mavfi_cli.fi.tracer.fault import FaultModel
         from mavfi_cli.fi.tracer.sampling import Rule, strategy
@@ -85,7 +85,7 @@ class InstructionConfig:
         return chosen
 
     def sampling_name(self) -> str:
-        """The population, as printed beside every number."""
+        """Return the name of the population, which every report states."""
         if self.compat is not None:
             return f"{UNIFORM} with the operands and bits of {self.compat}"
         return self.sampling

@@ -1,4 +1,4 @@
-"""What isolated kernels are fed: recorded in a golden mission that is flown once."""
+"""Inputs of isolated kernels, recorded in a golden run that is flown once."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from mavfi_cli.mission.run import fly_golden
 
 
 def record_inputs(config: MissionConfig) -> KernelInputs:
-    """Fly the mission without a fault; the inputs of its kernels around the middle of the flight.
+    """Fly the mission without a fault and return its kernels' inputs near the middle of the flight.
 
     Raises:
-        TargetError: the flight did not reach its goal, or never had to plan round anything.
-        MavfiError: the mission could not begin.
+        TargetError: The flight did not reach its goal, or never had to plan round an obstacle.
+        MavfiError: The mission could not begin.
     """
     recorder = Recorder()
     with tempfile.TemporaryDirectory(prefix="mavfi-golden-") as scratch:
@@ -75,7 +75,7 @@ def _middle(name: str, config: MissionConfig, recorder: Recorder) -> KernelInput
 
 
 def _hard_task(name: str, config: MissionConfig, recorder: Recorder) -> PlanningTask:
-    """The middle one of the requests that a straight line does not answer."""
+    """Return the middle one of the requests that a straight line does not answer."""
     assert recorder.briefing is not None
     hard = []
     for (request, snapshot), _ in recorder.orders["planner"]:
@@ -101,7 +101,7 @@ def _hard_task(name: str, config: MissionConfig, recorder: Recorder) -> Planning
 def _tracked(
     config: MissionConfig, ticks: list[ControlInput]
 ) -> tuple[tracking.TrackingState, tracking.TrackingInputs, tracking.TrackingParams]:
-    """State, input and parameters of the controller at the middle tick that follows a path."""
+    """Return state, input and parameters of the controller at the middle tick with a path."""
     params = tracking.TrackingParams(v_max_mps=config.v_max_mps, a_max_mps2=config.a_max_mps2)
     following = [index for index, tick in enumerate(ticks) if tick.inputs.trajectory is not None]
     if not following:
@@ -115,13 +115,13 @@ def _tracked(
 
 
 def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
-    """The inputs of a golden flight: from the folder where it has them, else flown now.
+    """Return the inputs of a golden run, from the folder or else from a flight.
 
     Returns:
-        What a `KernelTarget` is told of its inputs: their file, its SHA-256, the flight in words.
+        Arguments of a `KernelTarget` about its inputs: file, SHA-256, and flight in words.
 
     Raises:
-        ConfigError: the folder has the inputs of another flight.
+        ConfigError: The folder contains the inputs of another flight.
     """
     path = folder / INPUTS
     if path.is_file():
@@ -139,5 +139,5 @@ def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
 
 
 def flight_name(config: MissionConfig) -> str:
-    """A golden flight in words."""
+    """Describe a golden run in words."""
     return f"golden flight: world {config.world}, seed {config.seed}"

@@ -1,4 +1,4 @@
-"""What this machine can do: each check says what it found, and what to do where it fails."""
+"""Checks of this machine, each with its finding and the remedy for a failure."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 
-class Verdict(Enum):
-    """How a check ended."""
+class CheckResult(Enum):
+    """Result of a check."""
 
     OK = "ok"
-    LIMITED = "limited"  # flying works, something else does not
+    LIMITED = "limited"  # flying works, but something else does not
     FAILED = "failed"  # flying does not work
 
 
@@ -32,12 +32,12 @@ class Check:
     """One line of the report."""
 
     name: str
-    verdict: Verdict
+    verdict: CheckResult
     found: str
     remedy: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for --json."""
+        """Return plain values for --json."""
         return {**asdict(self), "verdict": self.verdict.value}
 
 
@@ -49,9 +49,9 @@ _WHEELS = {
 }  # fmt: skip
 _LOAD_VEHICLE = """
 from sitl.vehicle.profile_files import load_profile
-from sitl.vehicle.vehicle import Vehicle
+from sitl.vehicle.vehicle import Quadrotor
 import numpy, sys
-vehicle = Vehicle(load_profile("solo"), position_enu_m=numpy.zeros(3), yaw_enu_rad=0.0)
+vehicle = Quadrotor(load_profile("solo"), position_enu_m=numpy.zeros(3), yaw_enu_rad=0.0)
 target = numpy.full(11, numpy.nan)
 target[3:6] = 0.0, 0.0, -1.0
 for _ in range(500):
@@ -67,7 +67,7 @@ _EXTRAS = {"train": "torch", "cluster": "distributed", "view": "rerun"}
 
 
 def check_machine() -> Iterator[Check]:
-    """Run every check, one after the other."""
+    """Run all checks in sequence and yield their results."""
     yield _python()
     yield _processor()
     yield from _wheels()
@@ -82,7 +82,7 @@ def _python() -> Check:
     version = platform.python_version()
     good = sys.version_info >= (3, 11)
     return Check(
-        name="Python", verdict=Verdict.OK if good else Verdict.FAILED, found=version,
+        name="Python", verdict=CheckResult.OK if good else CheckResult.FAILED, found=version,
         remedy="" if good else "install Python 3.11 or newer",
     )  # fmt: skip
 
@@ -92,12 +92,12 @@ def _processor() -> Check:
     system, machine = platform.system(), platform.machine()
     found = f"{system} {machine}, {cores} core{'s' if cores != 1 else ''} usable"
     if system != "Linux" or machine not in ("x86_64", "aarch64"):
-        return Check(name="Processor", verdict=Verdict.LIMITED, found=found,
+        return Check(name="Processor", verdict=CheckResult.LIMITED, found=found,
                      remedy="wheels exist for Linux on x86-64")  # fmt: skip
     if machine == "aarch64":
-        return Check(name="Processor", verdict=Verdict.LIMITED, found=found,
+        return Check(name="Processor", verdict=CheckResult.LIMITED, found=found,
                      remedy="jsbsim and pyoctomap have no wheel here: build them")  # fmt: skip
-    return Check(name="Processor", verdict=Verdict.OK, found=found)
+    return Check(name="Processor", verdict=CheckResult.OK, found=found)
 
 
 def _wheels() -> Iterator[Check]:
@@ -109,25 +109,25 @@ def _wheels() -> Iterator[Check]:
         except (ImportError, importlib.metadata.PackageNotFoundError, OSError) as error:
             missing.append(f"{distribution} ({error})")
     if missing:
-        told = "missing: " + "; ".join(missing)
-        yield Check(name="Libraries", verdict=Verdict.FAILED, found=told,
+        problem = "missing: " + "; ".join(missing)
+        yield Check(name="Libraries", verdict=CheckResult.FAILED, found=problem,
                     remedy="pip install -e . in the project's folder")  # fmt: skip
     else:
-        yield Check(name="Libraries", verdict=Verdict.OK, found=", ".join(found))
+        yield Check(name="Libraries", verdict=CheckResult.OK, found=", ".join(found))
 
 
 def _extras() -> Check:
     have = [extra for extra, module in _EXTRAS.items() if importlib.util.find_spec(module)]
     lack = [extra for extra in _EXTRAS if extra not in have]
     found = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
-    return Check(name="Extras", verdict=Verdict.OK, found=found)
+    return Check(name="Extras", verdict=CheckResult.OK, found=found)
 
 
 def _disk() -> Check:
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     good = free > 1.0
     return Check(
-        name="Disk", verdict=Verdict.OK if good else Verdict.LIMITED,
+        name="Disk", verdict=CheckResult.OK if good else CheckResult.LIMITED,
         found=f"{free:.1f} GB free here",
         remedy="" if good else "a campaign wants more room; name another folder with --out",
     )  # fmt: skip
@@ -142,33 +142,33 @@ def _loopback() -> Check:
                 here.sendto(b"mavfi", there.getsockname())
             good = there.recv(16) == b"mavfi"
     except OSError as error:
-        return Check(name="Loopback", verdict=Verdict.LIMITED, found=f"UDP fails: {error}",
+        return Check(name="Loopback", verdict=CheckResult.LIMITED, found=f"UDP fails: {error}",
                      remedy="`mavfi fly` does not need it; ground stations do")  # fmt: skip
-    return Check(name="Loopback", verdict=Verdict.OK if good else Verdict.LIMITED,
+    return Check(name="Loopback", verdict=CheckResult.OK if good else CheckResult.LIMITED,
                  found="UDP on 127.0.0.1 works")  # fmt: skip
 
 
 def _physics() -> Check:
-    """The vehicle's process starts, which loads JSBSim and every compiled kernel it has."""
+    """Start the vehicle's process, which loads JSBSim and its compiled kernels."""
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
             [sys.executable, "-c", _LOAD_VEHICLE], capture_output=True, text=True, cwd=folder,
             timeout=120.0, check=False,
         )  # fmt: skip
     if run.returncode == 0:
-        return Check(name="Vehicle", verdict=Verdict.OK, found=run.stdout.strip())
+        return Check(name="Vehicle", verdict=CheckResult.OK, found=run.stdout.strip())
     last = ((run.stderr or run.stdout).strip().splitlines() or ["no message"])[-1]
-    return Check(name="Vehicle", verdict=Verdict.FAILED, found=last,
+    return Check(name="Vehicle", verdict=CheckResult.FAILED, found=last,
                  remedy="pip install -e . in the project's folder")  # fmt: skip
 
 
 def _injection() -> Iterator[Check]:
-    """Tracing and counted breakpoints, tried on a real program."""
+    """Test tracing and counted breakpoints on a real program."""
     from mavfi_cli.fi.tracer.arch import SUPPORTED
     from mavfi_cli.fi.tracer.doctor import check_counting, check_tracing
 
     if not SUPPORTED:
-        yield Check(name="Tracing", verdict=Verdict.LIMITED, found="not Linux on x86-64",
+        yield Check(name="Tracing", verdict=CheckResult.LIMITED, found="not Linux on x86-64",
                     remedy="instruction-level injection is not available here")  # fmt: skip
         return
 
@@ -178,7 +178,7 @@ def _injection() -> Iterator[Check]:
             remedy = remedy or _ALLOW_PTRACE
         yield Check(
             name=capability.name,
-            verdict=Verdict.LIMITED if remedy else Verdict.OK,
+            verdict=CheckResult.LIMITED if remedy else CheckResult.OK,
             found=capability.problem or capability.found,
             remedy=remedy,
         )

@@ -1,4 +1,4 @@
-"""What a flight asks of its nodes, kept so that it can be asked again without flying."""
+"""Recorder of the nodes' inputs in a flight, to repeat invocations without flying."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from mavfi_cli.mission.briefing import Briefing
 
 
 class Recorder:
-    """Keeps the briefing of a flight, and input and start stamp of every invocation, by node."""
+    """Records the briefing, and input and start stamp of every invocation by node."""
 
     def __init__(self) -> None:
         self.briefing: Briefing | None = None
         self.orders: dict[str, list[tuple[Any, float]]] = {}
 
     def on_start(self, node: str, value: Any, start_s: float) -> None:
-        """An invocation begins."""
+        """Record the start of an invocation."""
         self.orders.setdefault(node, []).append((value, start_s))

@@ -1,10 +1,10 @@
-"""Compute platforms: how long each kernel takes in simulated time. TOML files, one a platform.
+"""Compute platforms: the latency of each kernel in simulated time. One TOML file per platform.
 
-A file either gives every kernel its latency, or names a shipped platform as its `base` and says
-by how much each kernel is slower: `scale` of the kernel, or that of the whole file.
+A file either gives the latency of every kernel, or names a shipped platform as its `base` with a
+factor `scale` for each kernel or for the whole file.
 
-`measured:FACTOR` is no file: the host's own kernel times, measured invocation by invocation while
-it flies, times the factor. Such a flight cannot repeat.
+`measured:FACTOR` needs no file. Its latencies are the kernel times that the host measures in
+flight, times the factor. Such a flight is not repeatable.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.wall import WallClock
 
 MEASURED = "measured"
-FACTORS = (0.01, 1000.0)  # smallest and largest of a measured platform
+FACTORS = (0.01, 1000.0)  # minimum and maximum factor of a measured platform
 KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
 _LONGEST_S = 3600.0
-LARGEST = 1.0e6  # in any unit of hardware; more is a slip of the unit
+LARGEST = 1.0e6  # maximum mass or power; a larger value has the wrong unit
 HARDWARE = ("mass_kg", "power_w", "heatsink_kgpw")
 _FOLDER = Path(__file__).parent / "platforms"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelLatency:
-    """Latency of one kernel: log-normal around its median."""
+    """Latency of one kernel, log-normally distributed round its median."""
 
-    latency_s: float  # median of one invocation
-    spread: float = 0.0  # sigma of the natural logarithm of the latency
+    latency_s: float  # median latency of an invocation
+    spread: float = 0.0  # standard deviation of the natural logarithm of the latency
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -46,23 +46,23 @@ class KernelLatency:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformProfile:
-    """A companion computer as the flight feels it: latencies, cores, power, mass.
+    """A companion computer: latencies, cores, power and mass.
 
     Raises:
-        ValueError: a number out of its range, a kernel missing or one that does not exist.
+        ValueError: A number is out of range, or a kernel is missing or unknown.
     """
 
     name: str
     cores: int
     kernels: dict[str, KernelLatency]
     description: str = ""
-    carried: bool = True  # False: it stays on the ground, the vehicle feeds and lifts nothing
+    carried: bool = True  # False: it stays on the ground and costs the vehicle no power or lift
     power_w: float = 0.0  # thermal design power
-    mass_kg: float = 0.0  # the board, without its heat sink
-    heatsink_kgpw: float = 0.0  # mass of the heat sink for each watt of power_w
-    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
-    base: str = ""  # the platform whose latencies are scaled, where there is one
-    measured_factor: float | None = None  # the host's own times, times this, are the latencies
+    mass_kg: float = 0.0  # board without its heat sink
+    heatsink_kgpw: float = 0.0  # mass of the heat sink per watt of power_w
+    sources: dict[str, str] = field(default_factory=dict)  # key -> source of its value
+    base: str = ""  # platform whose latencies are scaled, if any
+    measured_factor: float | None = None  # factor on the host's times, for a measured platform
 
     def __post_init__(self) -> None:
         if self.cores < 1:
@@ -73,11 +73,11 @@ class PlatformProfile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _KernelEntry:
-    """A kernel as a file describes it: a latency, or a factor on that of the base."""
+    """A kernel in a file: a latency, or a factor on the base's latency."""
 
     latency_s: float | None = None
     scale: float | None = None
-    spread: float | None = None  # None: the base's, or 0
+    spread: float | None = None  # None: that of the base, or 0
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -90,19 +90,19 @@ class _KernelEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlatformFile:
-    """A platform's TOML file."""
+    """Contents of a platform's TOML file."""
 
     name: str
     cores: int
     kernels: dict[str, _KernelEntry] = field(default_factory=dict)
     base: str = ""  # a shipped platform
-    scale: float = 1.0  # of the base's latencies, for the kernels that are not named
+    scale: float = 1.0  # factor on the base's latencies of kernels without an entry
     description: str = ""
     carried: bool = True
     power_w: float = 0.0
     mass_kg: float = 0.0
     heatsink_kgpw: float = 0.0
-    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
+    sources: dict[str, str] = field(default_factory=dict)  # key -> source of its value
 
     def __post_init__(self) -> None:
         _check_names(self.kernels)
@@ -137,7 +137,7 @@ def _check_kernels(kernels: Collection[str]) -> None:
 
 
 def check_hardware(board: object) -> None:
-    """Refuse a board whose mass or power is negative, or a slip of the unit.
+    """Reject a board with negative or implausibly large mass or power.
 
     Raises:
         ValueError: names the key and the value.
@@ -151,16 +151,16 @@ def check_hardware(board: object) -> None:
 
 
 def platform_names() -> list[str]:
-    """The shipped platforms, in alphabetical order."""
+    """Return the shipped platforms in alphabetical order."""
     return shipped_names(_FOLDER)
 
 
 def load_platform(name_or_path: str) -> PlatformProfile:
-    """A shipped platform by name, a user's own by the path of its TOML file, or `measured:FACTOR`.
+    """Load a shipped platform by name, a TOML file by path, or `measured:FACTOR`.
 
     Raises:
-        UnknownName: no shipped platform has this name, and it is not a path to a TOML file.
-        ConfigError: the file, or the factor, cannot be used.
+        UnknownName: No shipped platform has this name, and it is not a path to a TOML file.
+        ConfigError: The file or the factor cannot be used.
     """
     factor = measured_factor(name_or_path)
     if factor is not None:
@@ -172,10 +172,10 @@ def load_platform(name_or_path: str) -> PlatformProfile:
 
 
 def measured_factor(name: str) -> float | None:
-    """The factor of a platform `measured:FACTOR`; None of any other.
+    """Return the factor of a platform `measured:FACTOR`; None for any other.
 
     Raises:
-        ConfigError: it is not a number, or out of its range.
+        ConfigError: The factor is not a number or is out of range.
     """
     kind, colon, text = name.partition(":")
     if kind != MEASURED or not colon:
@@ -195,19 +195,19 @@ def measured_factor(name: str) -> float | None:
 
 
 def _measured(factor: float) -> PlatformProfile:
-    told = f"this host's own times while it flies, x {factor:g}"
+    source = f"this host's own times while it flies, x {factor:g}"
     return PlatformProfile(
         name=f"{MEASURED}:{factor:g}",
         cores=len(os.sched_getaffinity(0)),
-        kernels=dict.fromkeys(KERNELS, KernelLatency(latency_s=0.0, source=told)),
-        description=f"{told}; needs --realtime, and does not repeat",
+        kernels=dict.fromkeys(KERNELS, KernelLatency(latency_s=0.0, source=source)),
+        description=f"{source}; needs --realtime, and does not repeat",
         carried=False,
         measured_factor=factor,
     )
 
 
 def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
-    """The profile of a file: its own latencies and those that it takes from its base."""
+    """Build the profile of a file from its own latencies and those of its base."""
     base: dict[str, KernelLatency] = {}
     if file.base:
         if file.base not in platform_names() or path == _FOLDER / f"{file.base}.toml":
@@ -225,10 +225,10 @@ def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
 def _kernels(
     file: _PlatformFile, base: dict[str, KernelLatency], path: Path
 ) -> dict[str, KernelLatency]:
-    """Every kernel's latency: the base's times the file's factor, or the kernel's own entry."""
-    told = _scaled(file.base, file.scale, file.sources.get("scale", ""))
+    """Return the latency of each kernel: its own entry, or the base's times the file's factor."""
+    scale_source = _scaled(file.base, file.scale, file.sources.get("scale", ""))
     kernels = {
-        name: replace(latency, latency_s=latency.latency_s * file.scale, source=told)
+        name: replace(latency, latency_s=latency.latency_s * file.scale, source=scale_source)
         for name, latency in base.items()
     }
     for name, entry in file.kernels.items():
@@ -251,16 +251,16 @@ def _latency(entry: _KernelEntry, base: KernelLatency | None, base_name: str) ->
 
 
 def _scaled(base_name: str, scale: float, source: str) -> str:
-    """Where a latency comes from that is a multiple of another platform's."""
-    told = f"{base_name} x {scale:g}"
-    return f"{told}: {source}" if source else told
+    """Describe the source of a latency that is a multiple of another platform's."""
+    scaled = f"{base_name} x {scale:g}"
+    return f"{scaled}: {source}" if source else scaled
 
 
 class LatencyModel:
     """Draws the latency of each invocation from a platform profile.
 
-    Each kernel has its own random stream, so that one kernel being called more often never
-    changes what another draws.
+    Each kernel has its own random stream, so the number of calls of one kernel never changes the
+    latencies of another.
     """
 
     def __init__(self, profile: PlatformProfile, root_seed: int) -> None:
@@ -270,7 +270,7 @@ class LatencyModel:
         }
 
     def draw_s(self, kernel: str) -> float:
-        """Latency of the next invocation of `kernel`, s."""
+        """Return the latency of the next invocation of `kernel`, s."""
         latency = self._profile.kernels[kernel]
         if latency.spread == 0.0:
             return latency.latency_s
@@ -279,12 +279,12 @@ class LatencyModel:
         )
 
     def summary(self) -> dict[str, Any] | None:
-        """Nothing was measured."""
+        """Return None, because nothing was measured."""
         return None
 
 
 class MeasuredLatency(LatencyModel):
-    """The host's own time of the newest invocation of a kernel, times the profile's factor."""
+    """Latencies from the host time of a kernel's newest invocation, times the profile's factor."""
 
     def __init__(self, profile: PlatformProfile, wall: WallClock) -> None:
         assert profile.measured_factor is not None
@@ -292,13 +292,13 @@ class MeasuredLatency(LatencyModel):
         self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
 
     def draw_s(self, kernel: str) -> float:
-        """Latency of the invocation of `kernel` that the host has just done, s."""
+        """Return the latency of the newest invocation of `kernel` on the host, s."""
         host_s = self._wall.newest.get(kernel, 0.0)
         self._host_s[kernel].append(host_s)
         return self._factor * host_s
 
     def summary(self) -> dict[str, Any]:
-        """Platform, factor, and of each kernel the median on the host and in the flight, s."""
+        """Return platform, factor, and each kernel's median on the host and in the flight, s."""
         medians = {kernel: float(np.median(s)) for kernel, s in self._host_s.items() if s}
         return {
             "platform": self._name,
@@ -315,10 +315,12 @@ class MeasuredLatency(LatencyModel):
 
 
 def latency_model(profile: PlatformProfile, root_seed: int, wall: WallClock) -> LatencyModel:
-    """Where a platform's latencies come from.
+    """Create the latency model of a platform.
 
     Args:
-        wall: has measured the invocation that a latency is asked for, where it is measured.
+        profile: Platform.
+        root_seed: Root seed of the mission.
+        wall: Clock with the host times, for a measured platform.
     """
     if profile.measured_factor is not None:
         return MeasuredLatency(profile, wall)

@@ -1,4 +1,4 @@
-"""What a mission tells while it flies. The watcher here listens to nothing: a null object."""
+"""Progress reports of a mission in flight. The base class `Watcher` ignores them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from mavfi_cli.mission.record.events import Event
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
-    """The state of the flight, told once a simulated second."""
+class FlightProgress:
+    """State of the flight, reported once per simulated second."""
 
     stamp_s: float
     phase: str
@@ -19,13 +19,13 @@ class Progress:
 
 
 class Watcher:
-    """Gets progress and events; override what is of interest."""
+    """Receives progress and events. Subclasses override the methods of interest."""
 
-    def on_progress(self, progress: Progress) -> None:
-        """Called once a simulated second."""
+    def on_progress(self, progress: FlightProgress) -> None:
+        """Handle a progress report, once per simulated second."""
 
     def on_note(self, text: str) -> None:
-        """Called before something that takes long and is no part of the flight."""
+        """Handle the announcement of a long operation that is not part of the flight."""
 
     def on_event(self, event: Event) -> None:
-        """Called for every event as it happens."""
+        """Handle an event."""

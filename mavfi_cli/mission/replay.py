@@ -1,4 +1,4 @@
-"""Repeat a run from its record, and say where two runs part."""
+"""Repeats a run from its record and finds the first difference between two runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HOST_SECTION = "host"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parting:
-    """The first value in which two runs differ."""
+    """First value in which two runs differ."""
 
     stamp_s: float
     column: str
@@ -30,14 +30,13 @@ class Parting:
 
 
 def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
-    """The mission that a run flew, ready to be flown again; its golden pair without the fault.
+    """Return the configuration of a run, or of its golden run if `with_fault` is False.
 
-    The golden pair has no detector either: it is what both the fault and its detection are held
-    against.
+    The golden run has no detector either, because it is the reference for fault and detection.
 
     Raises:
-        RecordError: it flew a foreign autopilot, on measured times, or until a person ended it:
-            nothing can repeat that.
+        RecordError: The run is not repeatable, because it flew a foreign autopilot, used measured
+            times, or was interrupted by the user.
     """
     values = dict(run.result["config"])
     if interrupted(run):
@@ -52,12 +51,12 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
 
 
 def interrupted(run: Run) -> bool:
-    """Whether a person ended the flight, so that its record says nothing about the mission."""
+    """Return True if the user interrupted the flight, so that the mission has no outcome."""
     return bool(run.result["outcome"] == Outcome.INTERRUPTED.value)
 
 
 def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]) -> list[str]:
-    """Which libraries differ between a record and this installation, a phrase each."""
+    """Describe each library that differs between a record and this installation."""
     return [
         f"{name} was {recorded.get(name, 'absent')}, is {versions.get(name, 'absent')}"
         for name in sorted({*recorded, *versions})
@@ -66,7 +65,7 @@ def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]
 
 
 def differing_results(this: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """The sections of two results that differ; the host's does not count."""
+    """Return the sections in which two results differ, except the host's."""
     keys = sorted({*this, *other} - {HOST_SECTION})
     return [key for key in keys if this.get(key) != other.get(key)]
 
@@ -74,14 +73,14 @@ def differing_results(this: dict[str, Any], other: dict[str, Any]) -> list[str]:
 def first_difference(
     this: Run, other: Run, *, truth: bool = False, leave_out: Collection[str] = ()
 ) -> Parting | None:
-    """Where the traces of two runs first differ; None where they never do.
+    """Find the first difference between the traces of two runs; None if they are equal.
 
-    Within one tick the columns are compared in the order of the pipeline: perception, planning,
-    control, then the vehicle. The referee's truth is left out unless asked for, and so are the
-    columns of `leave_out`.
+    Within a tick the columns are compared in the order of the pipeline: perception, planning,
+    control, then the vehicle. The referee's truth is ignored by default. Columns in `leave_out` are
+    ignored, too.
 
     Raises:
-        RecordError: one of them has no trace.
+        RecordError: A run has no trace.
     """
     if this.trace is None or other.trace is None:
         raise RecordError(f"{(this if this.trace is None else other).folder.path}: no trace")
@@ -114,7 +113,7 @@ def first_difference(
 
 
 def _end(this: Run, other: Run, rows: int) -> Parting | None:
-    """Where one of two runs that were equal so far goes on, or ends otherwise."""
+    """Compare length and outcome of two runs with equal traces so far."""
     assert this.trace is not None
     stamp_s = this.trace["stamp_s"][rows - 1].as_py() if rows else 0.0
     ends = [str(run.result["outcome"]) for run in (this, other)]
@@ -131,12 +130,12 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def same_file(this: Path, other: Path) -> bool:
-    """Whether two files have the same bytes."""
+    """Return True if two files have the same bytes."""
     return this.read_bytes() == other.read_bytes()
 
 
 def largest_deviation_m(this: Run, other: Run) -> float:
-    """How far the two vehicles were apart at most, at equal stamps, m."""
+    """Return the largest distance between two vehicles at equal stamps, m."""
     if this.trace is None or other.trace is None:
         return float("nan")
     rows = min(this.trace.num_rows, other.trace.num_rows)

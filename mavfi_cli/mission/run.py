@@ -1,4 +1,4 @@
-"""Fly one mission and leave its record: the function behind `mavfi fly`."""
+"""Flies one mission and writes its record. This is the function behind `mavfi fly`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def fly_mission(
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
-    Whatever becomes of the flight, crash of the companion included, is a result and is recorded.
+    Every end of the flight, including a crash of the companion, is a result and is recorded.
 
     Args:
         config: the mission.
@@ -156,7 +156,7 @@ def _injection(
     for_debugger: Callable[[int], None] | None,
     launch: StartVehicle,
 ) -> Iterator[NoInjection | None]:
-    """The instruction-level fault of a mission, its node's process already starting."""
+    """Create the instruction-level fault of a mission and start its node's process."""
     if config.instruction is None:
         yield None
         return
@@ -183,14 +183,14 @@ def fly_golden(
     *,
     launch: StartVehicle = start_vehicle,
 ) -> dict[str, Any]:
-    """Fly a mission without a fault, from which faults or inputs are drawn.
+    """Fly a golden run, from which faults or inputs are drawn.
 
     Returns:
-        Its result.
+        Contents of its result.json.
 
     Raises:
-        Interrupted: it was cut off: others would be drawn.
-        VehicleProcessError: the vehicle died: there is nothing to draw from.
+        Interrupted: The run was cut off, so other faults would be drawn.
+        VehicleProcessError: The vehicle died, so there is nothing to draw from.
     """
     flown = fly_mission(config, out, Watcher(), recorder=recorder, launch=launch)
     result: dict[str, Any] = json.loads(flown.result.read_text())
@@ -215,9 +215,9 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[list[int]]:
-    """Turn Ctrl-C and SIGTERM into a request, so that what runs ends with a whole record.
+    """Turn Ctrl-C and SIGTERM into a request, so that a mission ends with a complete record.
 
-    Yields a list that is empty until then. Only the main thread can ask for this.
+    Yields a list that is empty until a signal arrives. Has no effect outside the main thread.
     """
     asked: list[int] = []
     previous: dict[signal.Signals, Any] = {}
@@ -232,7 +232,7 @@ def interruptible() -> Iterator[list[int]]:
 
 
 def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, Any] | None]:
-    """The referee's log and report; None for a foreign autopilot, or a vehicle that died."""
+    """Read the referee's log and report; None for a foreign autopilot or a dead vehicle."""
     if folder is None or not (folder / "truth.json").is_file():
         return None, None
     with np.load(folder / "truth.npz") as data:
@@ -241,7 +241,7 @@ def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, An
 
 
 def _vehicle_host(folder: Path | None) -> dict[str, Any]:
-    """What the vehicle's process tells of itself: stages, s, and memory, MB."""
+    """Read the statistics of the vehicle's process: stages, s, and memory, MB."""
     if folder is None or not (folder / "host.json").is_file():
         return {}
     told: dict[str, Any] = json.loads((folder / "host.json").read_text())
@@ -299,7 +299,7 @@ def _write(
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions that a record depends on."""
+    """Return the versions of all libraries that a record depends on."""
     versions = {"mavfi": __version__, "python": sys.version.split()[0]}
     for name in _VERSIONS:
         versions[name] = importlib.metadata.version(name)

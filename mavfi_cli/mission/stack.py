@@ -1,7 +1,7 @@
-"""Stacks: how the companion is wired and what it checks. TOML files, one a stack.
+"""Stacks: structure, checks and gains of the companion. One TOML file per stack.
 
-A file either says every key, or names a shipped stack as its `base` and says what differs. For an
-ablation a stack can be named with what differs: `mavbench:guards_tracking=true`.
+A file either gives every key, or names a shipped stack as its `base` and gives the differences. For
+an ablation, the name of a stack may include differences: `mavbench:guards_tracking=true`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from mavfi_cli.detect.base import StackMark
 from mavfi_cli.mission.platform import KERNELS
 
 DEFAULT = "mavbench"
-FIRST = "hardened"  # the stack of records that name none
+FIRST = "hardened"  # stack of records without a stack
 _FOLDER = Path(__file__).parent / "stacks"
 _ABOUT = ("name", "description", "base", "sources")
-_PAIR = re.compile(r",(?=\s*\w+\s*=)")  # between two KEY=VALUE; arrays have commas, too
-_LIMITS = {  # smallest and largest of each number
+_PAIR = re.compile(r",(?=\s*\w+\s*=)")  # separator of KEY=VALUE pairs; arrays have commas, too
+_LIMITS = {  # minimum and maximum of each number
     "tracking_guard_m": (0.1, 1000.0),
     "farthest_waypoint_m": (10.0, 1.0e6),
     "position_gain_per_s": (0.01, 10.0),
@@ -42,40 +42,43 @@ _LIMITS = {  # smallest and largest of each number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stack:
-    """How the companion is wired and what it checks. docs/stacks.md explains every key.
+    """Structure, checks and gains of the companion. docs/stacks.md explains every key.
 
     Attributes:
-        stretches_clock: a waypoint is flown until its distance is flown. A command that is clipped
-            to a share of its speed advances the trajectory's clock by that share.
-        skips_endless_slices: a waypoint whose slice of 10 ms is stretched to 2^63 s or more is over
-            at once.
-        guards_tracking: farther than `tracking_guard_m` from the reference the vehicle stops and
-            plans anew.
-        refuses_far_waypoints: the check reports a waypoint that is not finite, or farther than
-            `farthest_waypoint_m` from the first one, as a collision.
-        shifts_path_to_vehicle: the check moves the path rigidly until its front is the vehicle.
-        owns_sequence_numbers: planner, check and pilot count by themselves and reject what is
-            older than their own number. Else each continues the number of the other.
-        stops_on_report: a foreseen collision ends the plan: the vehicle stops. Else it goes on,
-            slows down or stops along the plan.
-        uses_time_to_collision: a stop waits until braking has to begin, or the choice between
-            going on, slowing down and stopping depends on it. Else the vehicle stops at once.
-        acts_on_report_once: of reports with the same number only the first counts.
-        plans_in_motion: plans begin where the vehicle will be. Else it hovers while it plans.
-        processes: nodes that share a process: they work one after the other, and die together.
-        control_owns_queue: control gets a plan once and keeps it. Else it gets the plan with every
-            tick.
+        stretches_clock: A waypoint lasts until its distance is flown. If the speed limit clips a
+            command, the trajectory's clock slows down by the ratio of clipped to demanded speed.
+        skips_endless_slices: A waypoint ends at once if its slice of 10 ms is stretched to 2^63 s
+            or more.
+        guards_tracking: The vehicle stops and plans anew if it is farther than `tracking_guard_m`
+            from the reference.
+        refuses_far_waypoints: The collision check reports a waypoint as a collision if it is not
+            finite, or farther than `farthest_waypoint_m` from the first one.
+        shifts_path_to_vehicle: The collision check translates the path so that it begins at the
+            vehicle.
+        owns_sequence_numbers: Planner, check and pilot keep their own counters and reject lower
+            numbers. Otherwise each continues the number of the other.
+        stops_on_report: A predicted collision ends the plan and the vehicle stops. Otherwise it
+            flies on, slows down or stops along the plan.
+        uses_time_to_collision: The time to collision delays a stop until braking must begin, or
+            decides between flying on, slowing down and stopping. Otherwise the vehicle stops at
+            once.
+        acts_on_report_once: Only the first of several reports with the same number counts.
+        plans_in_motion: Plans begin at the vehicle's future position. Otherwise the vehicle hovers
+            while it plans.
+        processes: Nodes that share a process, run one after the other and die together.
+        control_owns_queue: Control gets a plan once and keeps it. Otherwise it gets the plan in
+            every tick.
         position_gain_per_s, climb_gain_per_s: P gain of horizontal and vertical position.
         integral_gain_per_s2, damping_gain: I and D gain of position.
-        feeds_acceleration_forward: the reference accelerates as its waypoints say. Else it keeps
-            each waypoint's velocity, and nobody reads accelerations.
-        check_radius_m, planner_radius_m: distance that the check and the planner keep.
-        goal_tolerance_m: how near the goal counts as reached.
-        arrives_at_rest: only a vehicle at rest has arrived.
-        turns_before_departure: the vehicle turns once all round before the first plan.
-        rejected_plan_pause_s: pause before another plan is asked for after a rejected one.
-        slows_where_blind: the vehicle flies at half speed where it does not look.
-        sources: key -> where its value is from.
+        feeds_acceleration_forward: The reference uses the waypoints' accelerations. Otherwise it
+            keeps each waypoint's velocity, and no node reads accelerations.
+        check_radius_m, planner_radius_m: Clearance of the collision check and of the planner.
+        goal_tolerance_m: Distance from the goal that counts as reached.
+        arrives_at_rest: The vehicle must be at rest to have arrived.
+        turns_before_departure: The vehicle turns once round before the first plan.
+        rejected_plan_pause_s: Pause between a rejected plan and the next request.
+        slows_where_blind: The vehicle flies at half speed outside its field of view.
+        sources: Source of the value of each key.
     """
 
     name: str
@@ -145,12 +148,12 @@ class Stack:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Every key that decides how a mission flies, with its value."""
+        """Return every key that affects a flight, with its value."""
         return {key: getattr(self, key) for key in KEYS}
 
     @property
     def mark(self) -> StackMark:
-        """What a detector's model remembers of the stack that it was fitted to."""
+        """Return the identity of the stack for a detector's model."""
         text = json.dumps(self.settings, sort_keys=True)
         return StackMark(name=self.name, digest=hashlib.sha256(text.encode()).hexdigest())
 
@@ -159,21 +162,20 @@ KEYS: tuple[str, ...] = tuple(each.name for each in fields(Stack) if each.name n
 
 
 def stack_names() -> list[str]:
-    """The shipped stacks, in alphabetical order."""
+    """Return the shipped stacks in alphabetical order."""
     return shipped_names(_FOLDER)
 
 
 def load_stack(text: str) -> Stack:
-    """The stack that a text names: `NAME`, `FILE.toml`, or either with `:KEY=VALUE,KEY=VALUE`.
+    """Load a stack by `NAME`, `FILE.toml`, or either with `:KEY=VALUE,KEY=VALUE`.
 
-    A name is that of a shipped stack. Values are written as in TOML, and replace those of the
-    stack.
+    The name is that of a shipped stack. Values have TOML syntax and replace those of the stack.
 
     Raises:
-        UnknownName: no shipped stack has this name, and it is not a path to a TOML file.
-        UnknownKey: a key that no stack has; names the nearest.
-        ConfigError: the file or a value cannot be used; a key is missing; the stack contradicts
-            itself.
+        UnknownName: No shipped stack has this name, and it is not a path to a TOML file.
+        UnknownKey: No stack has this key. Suggests the nearest.
+        ConfigError: The file or a value cannot be used, a key is missing, or the stack is
+            inconsistent.
     """
     name, colon, changes = text.partition(":")
     path = shipped_path("stack", name, _FOLDER)
@@ -187,7 +189,7 @@ def load_stack(text: str) -> Stack:
 
 
 def lineage(stack: Stack) -> Iterator[Stack]:
-    """The stack, that which it is based on, and so on; raises as `load_stack`."""
+    """Yield the stack, its base, the base's base and so on. Raises as `load_stack`."""
     yield stack
     while stack.base:
         stack = load_stack(stack.base)
@@ -195,7 +197,7 @@ def lineage(stack: Stack) -> Iterator[Stack]:
 
 
 def _values(path: Path) -> tuple[dict[str, Any], str]:
-    """What a file and its base say, and the file's text."""
+    """Return the values of a file and its base, and the file's text."""
     values, text = read_toml(path)
     _require_known(values, path)
     base = values.get("base", "")
@@ -205,12 +207,12 @@ def _values(path: Path) -> tuple[dict[str, Any], str]:
         error = UnknownName("stack", str(base), set(stack_names()) - {path.stem})
         raise ConfigError(str(error), path=path, key="base")
     inherited, _ = _values(_FOLDER / f"{base}.toml")
-    told = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}
-    return {**inherited, **values, "sources": {**told, **values.get("sources", {})}}, text
+    kept = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}
+    return {**inherited, **values, "sources": {**kept, **values.get("sources", {})}}, text
 
 
 def _changes(text: str) -> dict[str, Any]:
-    """The values of `KEY=VALUE,KEY=VALUE`."""
+    """Parse `KEY=VALUE,KEY=VALUE`."""
     try:
         values = tomllib.loads("\n".join(_PAIR.split(text)))
     except tomllib.TOMLDecodeError:
@@ -228,5 +230,5 @@ def _require_known(values: Mapping[str, Any], path: Path | None) -> None:
 
 
 def with_tolerance(stack: Stack, goal_tolerance_m: float | None) -> Stack:
-    """The stack with a mission's own tolerance of the goal; None leaves the stack's."""
+    """Return the stack with a mission's goal tolerance; None keeps the stack's."""
     return stack if goal_tolerance_m is None else replace(stack, goal_tolerance_m=goal_tolerance_m)

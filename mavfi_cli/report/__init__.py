@@ -1,1 +1,1 @@
-"""What a person reads and looks at: summaries and pictures of runs."""
+"""Summaries and pictures of runs."""

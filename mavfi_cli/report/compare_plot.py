@@ -1,4 +1,4 @@
-"""Platforms side by side: every flight, success, response, ratios, and worst cases."""
+"""Plot of a platform comparison: flight times, success, response, ratios and worst cases."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _RATIOS = (
     ("energy_regression_j", "energy\n(regression)"),
     ("energy_propeller_j", "energy\n(propellers)"),
 )
-_TURN = 0.6180339887498949  # golden section: spreads dots evenly, and the same way each time
+_TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
 Row = Mapping[str, Any]
 
 
-def write_compare_plot(told: Row, path: Path) -> None:
-    """Draw a comparison as SVG, atomically; equal ones give equal bytes."""
-    write_svg(draw_compare_plot(told), path)
+def write_compare_plot(comparison: Row, path: Path) -> None:
+    """Write the plot of a comparison as SVG, atomically. Equal comparisons give equal bytes."""
+    write_svg(draw_compare_plot(comparison), path)
 
 
-def draw_compare_plot(told: Row) -> Figure:
-    """A matplotlib figure of five panels; colours are platforms, times in s, shares in %."""
+def draw_compare_plot(comparison: Row) -> Figure:
+    """Draw a figure of five panels with one colour per platform, times in s, shares in %."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 8.0), layout="constrained")
@@ -41,28 +41,28 @@ def draw_compare_plot(told: Row) -> Figure:
     panels = figure.subplot_mosaic("TTTTSS;RRMMWW")
     colours = {
         row["platform"]: PLATFORMS[place % len(PLATFORMS)]
-        for place, row in enumerate(told["plan"]["platforms"])
+        for place, row in enumerate(comparison["plan"]["platforms"])
     }
-    _times(panels["T"], told, colours)
-    _success(panels["S"], told, colours)
-    _response(panels["R"], told, colours)
-    _ratios(panels["M"], told, colours)
-    _costs(panels["W"], told, colours)
+    _times(panels["T"], comparison, colours)
+    _success(panels["S"], comparison, colours)
+    _response(panels["R"], comparison, colours)
+    _ratios(panels["M"], comparison, colours)
+    _costs(panels["W"], comparison, colours)
     handles = [
         panels["S"].plot([], [], "s", color=colours[row["platform"]], markersize=9,
                                label=f"{row['title']}: {row['description']}")[0]
-        for row in told["plan"]["platforms"]
+        for row in comparison["plan"]["platforms"]
     ]  # fmt: skip
     figure.legend(
         handles=handles, loc="outside upper center", ncols=min(3, len(handles)), frameon=False,
         fontsize=9.5,
     )  # fmt: skip
-    figure.supxlabel(_caption(told), fontsize=8, color=NOTE)
+    figure.supxlabel(_caption(comparison), fontsize=8, color=NOTE)
     return figure
 
 
-def _caption(told: Row) -> str:
-    plan, share = told["plan"], 100 * told["confidence"]
+def _caption(comparison: Row) -> str:
+    plan, share = comparison["plan"], 100 * comparison["confidence"]
     struck = "no faults"
     if plan["inject"]:
         bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
@@ -82,9 +82,9 @@ def _frame(axes: Axes, title: str, grid: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _places(told: Row, settings: Sequence[str]) -> tuple[dict[tuple[str, str], float], float]:
-    """Where a platform's mark of a setting stands, and the width of it."""
-    platforms = [row["platform"] for row in told["plan"]["platforms"]]
+def _places(comparison: Row, settings: Sequence[str]) -> tuple[dict[tuple[str, str], float], float]:
+    """Return the position of each platform's mark of a setting, and the mark's width."""
+    platforms = [row["platform"] for row in comparison["plan"]["platforms"]]
     width = 0.76 / len(platforms)
     return {
         (platform, setting): group + width * (number - (len(platforms) - 1) / 2)
@@ -99,18 +99,18 @@ def _setting_ticks(axes: Axes, settings: Sequence[str]) -> None:
     axes.set_xlim(-0.55, len(settings) - 0.45)
 
 
-def _times(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
-    """Every successful flight as a dot, the median with its interval, the worst one by number."""
-    settings = told["plan"]["settings"]
-    places, width = _places(told, settings)
-    flown = [f["flight_time_s"] for f in told["flights"] if _shown(f)] or [1.0]
+def _times(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+    """Draw each successful flight as a dot, the median with its interval, and the worst flight."""
+    settings = comparison["plan"]["settings"]
+    places, width = _places(comparison, settings)
+    flown = [f["flight_time_s"] for f in comparison["flights"] if _shown(f)] or [1.0]
     room = 0.16 * max(max(flown) - min(flown), 0.1 * max(flown))
-    for row in told["settings"]:
+    for row in comparison["settings"]:
         key = row["platform"], row["setting"]
         x, colour = places[key], colours[row["platform"]]
         times = [
             f["flight_time_s"]
-            for f in told["flights"]
+            for f in comparison["flights"]
             if _shown(f) and (f["platform"], f["setting"]) == key
         ]
         _foot(axes, x, row, len(times), colour)
@@ -137,7 +137,7 @@ def _times(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
 
 
 def _foot(axes: Axes, x: float, row: Row, succeeded: int, colour: str) -> None:
-    """Below a setting's flights: the mean number of replans, and how many flights failed."""
+    """Write the mean number of replans and the number of failed flights below a setting."""
     replans, failed = row["quantities"]["replans"]["mean"]["value"], row["counted"] - succeeded
     lines = [f"{failed} failed"] if failed else []
     if not math.isnan(replans):
@@ -163,10 +163,10 @@ def _whisker(axes: Axes, x: float, each: Row, scale: float) -> None:
         )  # fmt: skip
 
 
-def _success(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
-    settings = told["plan"]["settings"]
-    places, width = _places(told, settings)
-    for row in told["settings"]:
+def _success(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+    settings = comparison["plan"]["settings"]
+    places, width = _places(comparison, settings)
+    for row in comparison["settings"]:
         share, x = row["success"], places[row["platform"], row["setting"]]
         if not share["total"]:
             continue
@@ -185,10 +185,12 @@ def _success(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
     _frame(axes, "Success", "y")
 
 
-def _response(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
-    """From frame to setpoint in golden flights: what of it is kernels, and what is waiting."""
-    rows = {r["platform"]: r["quantities"] for r in told["settings"] if r["setting"] == _GOLDEN}
-    platforms = told["plan"]["platforms"]
+def _response(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+    """Draw the response time of golden flights, divided into kernels and waiting."""
+    rows = {
+        r["platform"]: r["quantities"] for r in comparison["settings"] if r["setting"] == _GOLDEN
+    }
+    platforms = comparison["plan"]["platforms"]
     for place, platform in enumerate(platforms):
         name, left = platform["platform"], 0.0
         found = rows[name]
@@ -223,11 +225,11 @@ def _response(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
     axes.spines["left"].set_visible(False)
 
 
-def _ratios(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
-    """Each platform over the first, mission by mission: golden flights full, faulty ones open."""
-    drawn = [row for row in told["ratios"] if row["setting"] in (_GOLDEN, _NONE)]
-    titles = {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
-    first = told["plan"]["platforms"][0]["title"]
+def _ratios(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+    """Draw the paired ratios of each platform to the first: golden full, faulty open."""
+    drawn = [row for row in comparison["ratios"] if row["setting"] in (_GOLDEN, _NONE)]
+    titles = {row["platform"]: row["title"] for row in comparison["plan"]["platforms"]}
+    first = comparison["plan"]["platforms"][0]["title"]
     step = 0.8 / max(1, len(drawn))
     for place, (quantity, _) in enumerate(_RATIOS):
         for number, row in enumerate(drawn):
@@ -255,11 +257,11 @@ def _ratios(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
         axes.text(1.0, 1.5, "nothing to compare with", ha="center", fontsize=9, color=NOTE)
 
 
-def _costs(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
-    """How much longer flights with faults are than their own golden ones: worst and 95th perc."""
-    settings = [name for name in told["plan"]["settings"] if name != _GOLDEN]
-    places, width = _places(told, settings)
-    rows = [row for row in told["costs"] if row["pairs"]]
+def _costs(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+    """Draw the extra flight time over the golden run with faults: worst and 95th percentile."""
+    settings = [name for name in comparison["plan"]["settings"] if name != _GOLDEN]
+    places, width = _places(comparison, settings)
+    rows = [row for row in comparison["costs"] if row["pairs"]]
     _frame(axes, "Worst case and recovery (paper, Fig. 16)", "y")
     if not rows:
         axes.text(0.5, 0.5, "no faults", ha="center", color=NOTE, transform=axes.transAxes)
@@ -297,7 +299,7 @@ def _costs(axes: Axes, told: Row, colours: Mapping[str, str]) -> None:
 def _recovered(
     axes: Axes, rows: Sequence[Row], settings: Sequence[str], colours: Mapping[str, str]
 ) -> None:
-    """How much of the faults' increase each detector recovers: a line of numbers a platform."""
+    """Write the share of the faults' increase that each detector recovers, per platform."""
     lines = {name: place for place, name in enumerate(colours)}
     style: dict[str, Any] = {
         "transform": axes.get_xaxis_transform(), "va": "top", "fontsize": 8.5, "ha": "center",

@@ -1,4 +1,4 @@
-"""What detectors are worth, drawn: ROC and precision-recall, and what is undone."""
+"""Plots of a detector evaluation: ROC, precision-recall and recovery."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Evaluation = Mapping[str, Any]
 
 
 def write_roc_plot(evaluation: Evaluation, path: Path) -> None:
-    """Draw the curves of an evaluation as SVG, atomically; equal ones give equal bytes."""
+    """Write the curves of an evaluation as SVG, atomically. Equal evaluations give equal bytes."""
     write_svg(draw_roc_plot(evaluation), path)
 
 
 def write_recovery_plot(evaluation: Evaluation, path: Path) -> None:
-    """Draw what detectors recover as SVG, atomically; equal ones give equal bytes."""
+    """Write the recovery plot of an evaluation as SVG, atomically, with reproducible bytes."""
     write_svg(draw_recovery_plot(evaluation), path)
 
 
 def draw_roc_plot(evaluation: Evaluation) -> Figure:
-    """A matplotlib figure: ROC to the left, precision over recall to the right.
+    """Draw a figure with ROC on the left and precision over recall on the right.
 
-    The dot is the detector at its own threshold.
+    A dot marks the detector at its own threshold.
     """
     from matplotlib.figure import Figure
 
@@ -65,7 +65,7 @@ def draw_roc_plot(evaluation: Evaluation) -> Figure:
 
 
 def _at_threshold(curve: Mapping[str, Any]) -> tuple[float, float]:
-    """Recall and precision at the detector's own threshold; precision is 1 without any alarm."""
+    """Return recall and precision at the detector's threshold; precision is 1 without alarms."""
     fallout, recall = curve["operating_point"]
     hits, false = recall * curve["positives"], fallout * curve["negatives"]
     return recall, hits / (hits + false) if hits + false else 1.0
@@ -83,7 +83,7 @@ def _square(axes: Axes, x: str, y: str) -> None:
 
 
 def draw_recovery_plot(evaluation: Evaluation) -> Figure:
-    """A matplotlib figure: harmful faults whose harm is undone by stage, worst flights by world."""
+    """Draw a figure of recovered harmful faults by stage and worst flights by world."""
     from matplotlib.figure import Figure
 
     rows = evaluation["faults"]
@@ -124,11 +124,11 @@ def _bars(
     measure: Any,
     count: Any,
 ) -> None:
-    """Bars side by side: a group a value of the rows, a bar a detector; shares become per cent.
+    """Draw grouped bars: a group per value of the rows, a bar per detector, shares in per cent.
 
     Args:
-        measure: of a row its value and interval; not a number where there is none.
-        count: how many cases a row is of; a row of none has no bar.
+        measure: Function from a row to its value and interval; NaN if there is none.
+        count: Function from a row to its number of cases; a row without cases has no bar.
     """
     values = list(dict.fromkeys(row["value"] for row in rows))
     width = 0.8 / max(1, len(names))

@@ -1,4 +1,4 @@
-"""What the pictures share: how they are saved, and colours."""
+"""Colours of all pictures, and the function that saves them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 INK = "#1d232b"
 NOTE = "#5b6573"
 GRID = "#edf0f4"
-# One thing, one colour in all pictures: detectors, redundancy and platforms share none.
+# The same thing has the same colour in all pictures. No two kinds of things share a colour.
 NONE = "#8b93a1"  # no protection
 DETECTORS = {"gad": "#6a4fb3", "aad": "#1b7f4b", "range": "#a3a032", "l2": "#c77fae"}
-_PLUG_INS = ("#7f5539", "#4a6d8c", "#5d7052", "#a67c52")  # detectors of others, in turn
+_PLUG_INS = ("#7f5539", "#4a6d8c", "#5d7052", "#a67c52")  # plug-in detectors, cyclically
 REDUNDANCY = {"dmr": "#f2b134", "tmr": "#e4572e"}
 SCHEMES = {"none": NONE, **REDUNDANCY, **DETECTORS}
-PLATFORMS = ("#00838f", "#c2185b", "#2b4c7e", "#7b2d26", "#5c6b1f", "#5aa9e6")  # in their order
-KERNELS = {  # what they are called, and their colours
+PLATFORMS = ("#00838f", "#c2185b", "#2b4c7e", "#7b2d26", "#5c6b1f", "#5aa9e6")  # by position
+KERNELS = {  # labels and colours
     "point_cloud": ("point cloud", "#2f7fb8"),
     "octomap": ("OctoMap", "#1b4965"),
     "collision_check": ("collision check", "#2a9d8f"),
@@ -32,7 +32,7 @@ KERNELS = {  # what they are called, and their colours
 
 
 def detector_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour a detector, `none` among them; those of others take turns."""
+    """Return the colour of each detector, including `none`. Plug-ins cycle through theirs."""
     known = {"none": NONE, **DETECTORS}
     others = [name for name in names if name not in known]
     return {
@@ -41,10 +41,10 @@ def detector_colours(names: Sequence[str]) -> dict[str, str]:
 
 
 def write_svg(figure: Figure, path: Path) -> None:
-    """Write a figure as SVG, atomically; equal figures give equal bytes.
+    """Write a figure as SVG, atomically. Equal figures give equal bytes.
 
     Raises:
-        RecordError: the file could not be written, or its name does not end in .svg.
+        RecordError: The file could not be written. or its name does not end in .svg.
     """
     import matplotlib as mpl
 

@@ -1,4 +1,4 @@
-"""Model against flight: velocity, flight time and energy of every scheme."""
+"""Plot of model against flight: velocity, flight time and energy of every scheme."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ _RATIOS = (("velocity", "velocity"), ("flight_time", "flight time"), ("energy", 
 _STEP = 0.17
 
 
-def write_flight_plot(told: Mapping[str, Any], path: Path) -> None:
-    """Draw the flights of a report as SVG, atomically; equal reports give equal bytes."""
-    write_svg(draw_flight_plot(told), path)
+def write_flight_plot(report: Mapping[str, Any], path: Path) -> None:
+    """Write the plot of a report's flights as SVG, atomically. Equal reports give equal bytes."""
+    write_svg(draw_flight_plot(report), path)
 
 
-def draw_flight_plot(told: Mapping[str, Any]) -> Figure:
-    """A matplotlib figure: a row a vehicle; left the velocities, right ratios over the reference.
+def draw_flight_plot(report: Mapping[str, Any]) -> Figure:
+    """Draw a figure with a row per vehicle: velocities left, ratios to the reference right.
 
-    A diamond is the model, a bar the flights with their 95 % interval over missions.
+    A diamond marks the model. A bar shows the flights with their 95 % interval over missions.
     """
     from matplotlib.figure import Figure
 
-    flights = told["flights"]
+    flights = report["flights"]
     vehicles = flights["vehicles"]
     figure = Figure(figsize=(9.6, 1.0 + 3.1 * len(vehicles)), layout="constrained")
     panels = figure.subplots(

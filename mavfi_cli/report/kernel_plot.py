@@ -1,4 +1,4 @@
-"""What one bit flip does to each kernel: stacked bars with confidence intervals."""
+"""Plot of kernel campaign outcomes: stacked bars with confidence intervals."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 _COLOURS = {"sdc": "#8e5aa3", "crash": "#e4572e", "hang": "#f2b134", "benign": "#c3d4e6"}
 _DARKER = {"sdc": "#6d3f84", "crash": "#b23a17", "hang": "#a06c00", "benign": "#4f6a88"}
 _WIDTH = 0.6
-_ROOM = 5.0  # per cent that a number inside a bar needs; smaller shares are written beside it
-_LINE = 3.2  # per cent that a line of such numbers is high
-_VISIBLE = 0.5  # per cent; narrower intervals are not drawn
+_ROOM = 5.0  # per cent; minimum share for a number inside its bar segment
+_LINE = 3.2  # per cent; height of a line of numbers
+_VISIBLE = 0.5  # per cent; minimum width of a drawn interval
 _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 
 def write_kernel_plot(summary: Mapping[str, Any], path: Path) -> None:
-    """Draw the summary of a kernel campaign as SVG, atomically; equal ones give equal bytes."""
+    """Write the plot of a kernel campaign as SVG, atomically. Equal summaries give equal bytes."""
     write_svg(draw_kernel_plot(summary), path)
 
 
 def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
-    """A matplotlib figure: one bar a kernel, shares of the injected runs in per cent."""
+    """Draw a figure with one bar per kernel and the shares of its injected runs in per cent."""
     from matplotlib.figure import Figure
 
     kernels = summary["kernels"]
@@ -47,8 +47,8 @@ def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
 
 
 def _bar(axes: Axes, place: int, outcomes: Mapping[str, Any]) -> None:
-    """Segments from below; every one but the last has its interval at its upper edge."""
-    base, below = 0.0, -_LINE / 2  # a number does not lie on the axis
+    """Stack the segments from below. All but the last have an interval at their upper edge."""
+    base, below = 0.0, -_LINE / 2  # keeps numbers off the axis
     for number, (name, colour) in enumerate(_COLOURS.items()):
         row = outcomes[name]
         share = 100.0 * (row["share"] or 0.0)

@@ -1,4 +1,4 @@
-"""What redundancy costs, as bars: flight time and energy over detection and recovery."""
+"""Plot of the cost of redundancy: flight time and energy over detection and recovery."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _QUANTITIES = (("flight_time_ratio", "flight time"), ("energy_ratio", "energy"))
 _WIDTH = 0.15
 
 
-def write_redundancy_plot(told: Mapping[str, Any], path: Path) -> None:
-    """Draw the report of the model as SVG, atomically; equal reports give equal bytes."""
-    write_svg(draw_redundancy_plot(told), path)
+def write_redundancy_plot(report: Mapping[str, Any], path: Path) -> None:
+    """Write the plot of a model report as SVG, atomically. Equal reports give equal bytes."""
+    write_svg(draw_redundancy_plot(report), path)
 
 
-def draw_redundancy_plot(told: Mapping[str, Any]) -> Figure:
-    """A matplotlib figure: a panel a vehicle, a bar a scheme, ratios over the reference."""
+def draw_redundancy_plot(report: Mapping[str, Any]) -> Figure:
+    """Draw a figure with a panel per vehicle, a bar per scheme and ratios to the reference."""
     from matplotlib.figure import Figure
 
-    vehicles = told["vehicles"]
+    vehicles = report["vehicles"]
     figure = Figure(figsize=(max(6.8, 4.6 * len(vehicles)), 4.2), layout="constrained")
     panels = figure.subplots(1, len(vehicles), squeeze=False)[0]
     for axes, one in zip(panels, vehicles, strict=True):
@@ -35,7 +35,7 @@ def draw_redundancy_plot(told: Mapping[str, Any]) -> Figure:
     figure.legend(
         handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8
     )
-    figure.supxlabel(_caption(told), fontsize=7.5, color=NOTE)
+    figure.supxlabel(_caption(report), fontsize=7.5, color=NOTE)
     return figure
 
 
@@ -62,10 +62,10 @@ def _panel(axes: Axes, one: Mapping[str, Any]) -> None:
     axes.set_title(f"{one['vehicle']}, board {one['board']}", fontsize=9.5, color=INK)
 
 
-def _caption(told: Mapping[str, Any]) -> str:
-    """Which numbers are calibrated, and on what."""
-    lines = [f"{told['model']}; flights of {told['distance_m']:g} m at the safe velocity"]
-    for one in told["vehicles"]:
+def _caption(report: Mapping[str, Any]) -> str:
+    """Return the caption, which lists the calibrated numbers and their sources."""
+    lines = [f"{report['model']}; flights of {report['distance_m']:g} m at the safe velocity"]
+    for one in report["vehicles"]:
         if any(row["calibrated"] for row in one["parameters"]):
             found = one["calibrations"][0]
             lines.append(

@@ -1,4 +1,4 @@
-"""Rooflines of the performance model: safe velocity against action throughput."""
+"""Roofline plot of the performance model: safe velocity against action throughput."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _MOST_HZ = 1000.0
 _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
 
 
-def write_roofline_plot(told: Mapping[str, Any], path: Path) -> None:
-    """Draw the report of the model as SVG, atomically; equal reports give equal bytes."""
-    write_svg(draw_roofline_plot(told), path)
+def write_roofline_plot(report: Mapping[str, Any], path: Path) -> None:
+    """Write the plot of a model report as SVG, atomically. Equal reports give equal bytes."""
+    write_svg(draw_roofline_plot(report), path)
 
 
-def draw_roofline_plot(told: Mapping[str, Any]) -> Figure:
-    """A matplotlib figure: throughput in Hz and velocity in m/s, both logarithmic."""
+def draw_roofline_plot(report: Mapping[str, Any]) -> Figure:
+    """Draw a figure with throughput in Hz and velocity in m/s on logarithmic axes."""
     from matplotlib.figure import Figure
 
-    vehicles = told["vehicles"]
+    vehicles = report["vehicles"]
     figure = Figure(figsize=(max(6.4, 4.9 * len(vehicles)), 4.9), layout="constrained")
     panels = figure.subplots(1, len(vehicles), squeeze=False, sharey=True)[0]
     for axes, one in zip(panels, vehicles, strict=True):
-        _panel(axes, one, told["knee_velocity_over_roof_ratio"])
+        _panel(axes, one, report["knee_velocity_over_roof_ratio"])
     panels[0].set_ylabel("safe velocity, m/s")
     panels[0].set_ylim(top=1.25 * max(row["roof_mps"] or 0.0 for one in vehicles
                                       for row in one["schemes"]))  # fmt: skip
@@ -41,9 +41,9 @@ def draw_roofline_plot(told: Mapping[str, Any]) -> Figure:
     figure.legend(
         handles.values(), handles, loc="outside upper center", ncols=4, frameon=False, fontsize=8
     )
-    share = 100.0 * told["knee_velocity_over_roof_ratio"]
+    share = 100.0 * report["knee_velocity_over_roof_ratio"]
     figure.supxlabel(
-        f"action throughput, Hz\n{told['model']}; knee: {share:g} % of the roof", fontsize=9
+        f"action throughput, Hz\n{report['model']}; knee: {share:g} % of the roof", fontsize=9
     )
     return figure
 
@@ -75,18 +75,18 @@ def _panel(axes: Axes, one: Mapping[str, Any], share: float) -> None:
 
 
 def _ceilings(axes: Axes, one: Mapping[str, Any], row: Mapping[str, Any]) -> None:
-    """Where the sensor's rate and the computer's would stop one board's curve."""
+    """Draw the ceilings that the rates of sensor and computer set for one board."""
     sensor_hz = next(p["value"] for p in one["parameters"] if p["parameter"] == "sensor_hz")
-    told = [f"one board\nroof {row['roof_mps']:.2f} m/s, knee {row['knee_hz']:.1f} Hz"]
+    label = [f"one board\nroof {row['roof_mps']:.2f} m/s, knee {row['knee_hz']:.1f} Hz"]
     for name, at_hz, ceiling in (
         ("sensor", sensor_hz, row["sensor_ceiling_mps"]),
         ("compute", row["compute_hz"], row["compute_ceiling_mps"]),
     ):
         if at_hz < row["knee_hz"]:
             axes.hlines(ceiling, at_hz, _MOST_HZ, color=INK, linewidth=1.0, linestyle=":")
-            told.append(f"{name} ceiling {ceiling:.2f} m/s at {at_hz:.3g} Hz")
+            label.append(f"{name} ceiling {ceiling:.2f} m/s at {at_hz:.3g} Hz")
     axes.text(
-        0.98, 0.04, "\n".join(told), transform=axes.transAxes, ha="right", va="bottom",
+        0.98, 0.04, "\n".join(label), transform=axes.transAxes, ha="right", va="bottom",
         fontsize=8, color=NOTE,
     )  # fmt: skip
 

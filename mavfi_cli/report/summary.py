@@ -1,4 +1,4 @@
-"""A run in words: the lines that `mavfi fly` and `mavfi show` print."""
+"""Text summary of a run, printed by `mavfi fly` and `mavfi show`."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _OUTCOMES = {
     "no_path": "NO PATH: the planner gave up",
     "timeout": "TIMEOUT: the time limit passed before the goal was reached",
     "failsafe": "FAILSAFE: the flight controller took over",
-    "link_lost": "LINK LOST: the vehicle fell silent",
+    "link_lost": "LINK LOST: no more messages arrived from the vehicle",
     "crash": "CRASH: the companion software stopped with an error",
-    "hang": "HANG: the companion software stopped answering",
+    "hang": "HANG: the companion software stopped responding",
     "interrupted": "INTERRUPTED",
 }
 
@@ -30,14 +30,14 @@ def _number(value: Any, unit: str, digits: int = 1) -> str:
 
 
 def outcome_line(result: dict[str, Any]) -> str:
-    """The outcome and its reason in one line."""
+    """Return the outcome and its reason in one line."""
     text = _OUTCOMES.get(result["outcome"], result["outcome"])
     reason = result.get("reason") or ""
     return f"{text} ({reason})" if reason else text
 
 
 def summary_lines(result: dict[str, Any]) -> list[str]:
-    """Outcome, quality of flight, perception-planning-control figures, cost on this machine."""
+    """Return outcome, quality of flight, pipeline figures and cost on this machine."""
     config = result["config"]
     flown = f"{config['vehicle']} in {config['world']}, seed {config['seed']}"
     if config["link"] is not None:
@@ -63,14 +63,14 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _folded(line: str) -> list[str]:
-    """A line, and what goes beyond the screen below its text; words stay whole."""
+    """Wrap a line at the screen width. Continuation lines align with its text."""
     return textwrap.wrap(
         line, WIDTH, subsequent_indent=_INDENT, break_long_words=False, break_on_hyphens=False
     ) or [""]
 
 
 def _host_lines(result: dict[str, Any]) -> list[str]:
-    """What the flight took of this machine's time."""
+    """Return the host time of the flight."""
     host = result["host"]
     if host.get("flight_wall_s"):
         factor = result["simulated_s"] / host["flight_wall_s"]
@@ -82,7 +82,7 @@ def _host_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _flight_lines(result: dict[str, Any]) -> list[str]:
-    """Quality of flight, and what became of the plans; of no flight that it was none."""
+    """Return quality of flight and counts of plans, or one line if there was no flight."""
     qof, counters = result["quality_of_flight"], result["pilot"]
     if qof["flight_time_s"] is None:
         return ["Flight      none: the mission ended before the companion took over"]
@@ -93,18 +93,18 @@ def _flight_lines(result: dict[str, Any]) -> list[str]:
         f"{_number(qof['distance_m'], 'm')} flown, "
         f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
         *_clearance_and_energy(qof),
-        f"Plans       {asked} asked for: {flown} flown ({counters['replans']} replans), "
+        f"Plans       {asked} requested: {flown} flown ({counters['replans']} replans), "
         f"{failed} failed, {asked - flown - failed} not used",
-        f"Obstacles   {counters['collisions_foreseen']} collisions foreseen, "
-        f"{counters['slowdowns']} slow-downs, {counters['stops']} stops",
+        f"Obstacles   {counters['collisions_foreseen']} collisions predicted, "
+        f"{counters['slowdowns']} slowdowns, {counters['stops']} stops",
     ]
 
 
 def _clearance_and_energy(qof: dict[str, Any]) -> list[str]:
-    """What the simulated vehicle's side knows; of a foreign autopilot's flight nobody does."""
+    """Return clearance and energy, which are unknown for a foreign autopilot."""
     clearance, energy = "not known", "not known"
     if qof["min_clearance_m"] is not None:
-        clearance = f"{_number(qof['min_clearance_m'], 'm', 2)} at the closest"
+        clearance = f"{_number(qof['min_clearance_m'], 'm', 2)} minimum"
     if qof["energy_regression_j"] is not None or qof["energy_propeller_j"] is not None:
         energy = (
             f"{_number(_kilo(qof['energy_regression_j']), 'kJ')} (paper's regression), "
@@ -114,18 +114,18 @@ def _clearance_and_energy(qof: dict[str, Any]) -> list[str]:
 
 
 def measured_lines(result: dict[str, Any]) -> list[str]:
-    """The medians of a platform whose kernels were measured on the host."""
+    """Return the kernel medians of a platform measured on the host."""
     measured = result.get("measured_platform")
     if not measured:
         return []
-    told = ", ".join(
+    medians = ", ".join(
         f"{name} {1e3 * each['host_median_s']:.2f} ms" for name, each in measured["kernels"].items()
     )
-    return [f"Measured    {told} (medians on this host), x {measured['factor']:g} in the flight"]
+    return [f"Measured    {medians} (medians on this host), x {measured['factor']:g} in the flight"]
 
 
 def node_lines(result: dict[str, Any]) -> list[str]:
-    """Which nodes died, and of what."""
+    """Return the crashes and hangs of each node."""
     lines = []
     for name, node in (result.get("nodes") or {}).items():
         ends = [f"{c['how']} at {c['stamp_s']:.2f} s" for c in node["crashes"][:3]]
@@ -139,7 +139,7 @@ def node_lines(result: dict[str, Any]) -> list[str]:
 
 
 def detection_lines(result: dict[str, Any]) -> list[str]:
-    """What the detector saw, what was computed again, and what its checks cost on this machine."""
+    """Return the detector's alarms, its recomputations, and the host time of its checks."""
     detection = result.get("detection")
     if not detection:
         return []
@@ -178,12 +178,12 @@ def _kilo(value: float | None) -> float | None:
 
 
 def event_lines(result: dict[str, Any]) -> list[str]:
-    """One line an event, with its simulated time."""
+    """Return one line per event with its simulated time."""
     return [f"{e['stamp_s']:9.2f} s  {e['kind']:<10} {e['text']}" for e in result["events"]]
 
 
 def fault_lines(result: dict[str, Any]) -> list[str]:
-    """What was to be hit, and what was."""
+    """Return the requested fault and its strikes."""
     fault = result.get("fault")
     if not fault:
         return []
@@ -215,7 +215,7 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _activation(fault: dict[str, Any]) -> str:
-    """Whether anybody worked with the corrupted value."""
+    """Return the activation: whether any node read the corrupted value."""
     reader = fault["activation"]["first_reader"]
     if reader is not None:
         return f"first read by {reader['name']} at {reader['stamp_s']:.2f} s ({reader['state']})"
@@ -228,7 +228,7 @@ def _activation(fault: dict[str, Any]) -> str:
 
 
 def _instruction_lines(fault: dict[str, Any]) -> list[str]:
-    """What was drawn, from how much, and what came of it."""
+    """Return the drawn instruction-level fault, its population and its effect."""
     lines = [
         f"Fault       node {fault['node']}, invocation {fault['invocation']} of "
         f"{fault['invocations']} of {fault['kernel']}, at {fault['stamp_s']:.2f} s; "
@@ -251,7 +251,7 @@ def _instruction_lines(fault: dict[str, Any]) -> list[str]:
 
 
 def _place(fault: dict[str, Any]) -> str:
-    """Where an instruction is: its function by its plain name, or the offset in its object."""
+    """Return the place of an instruction: function and offset, or offset in its object."""
     if not fault["symbol"]:
         return f"{fault['object']}+{fault['offset']:#x}"
     name, _, offset = fault["symbol"].partition("+")
@@ -264,12 +264,12 @@ def _change_line(stamp_s: float, change: dict[str, Any]) -> str:
     plural = "s" if len(change["bits"]) > 1 else ""
     return (
         f"            at {stamp_s:.2f} s: {change['state']}{place} "
-        f"{_told(change, 'before')} -> {_told(change, 'after')} (bit{plural} {bits})"
+        f"{_formatted(change, 'before')} -> {_formatted(change, 'after')} (bit{plural} {bits})"
     )
 
 
-def _told(change: dict[str, Any], when: str) -> str:
-    """A value as a number; infinities and NaN, which JSON cannot hold, as their bits."""
+def _formatted(change: dict[str, Any], when: str) -> str:
+    """Format a value. Infinities and NaN, which JSON lacks, are decoded from their bits."""
     value, pattern = change[when], change[f"{when}_hex"]
     if value is None:
         return {"0x7ff0000000000000": "inf", "0xfff0000000000000": "-inf"}.get(
@@ -282,7 +282,7 @@ def _told(change: dict[str, Any], when: str) -> str:
 
 
 def difference_lines(run: Run, golden: Run) -> list[str]:
-    """What a run did otherwise than its golden pair: first difference, and what became of it."""
+    """Compare a run with its golden run: first difference, deviation and outcome."""
     parting = first_difference(run, golden)
     fault = run.result["fault"] or {}
     if parting is None or first_difference(run, golden, leave_out=fault.get("states", ())) is None:
@@ -304,7 +304,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
 
 
 def _no_effect(fault: dict[str, Any]) -> str:
-    """Why a fault did nothing: it was not there, nobody read it, or whoever did was not moved."""
+    """Return why a fault had no effect: not injected, not activated, or masked."""
     if fault["state"] == "not_injected":
         return "none, not injected"
     activation = fault["activation"]["activation"]
@@ -312,7 +312,7 @@ def _no_effect(fault: dict[str, Any]) -> str:
 
 
 def _pair(this: Any, other: Any) -> str:
-    """Two values that differ, with as many digits as that takes."""
+    """Format two different values with enough digits to tell them apart."""
     short = [_value(this), _value(other)]
     if short[0] == short[1]:
         short = [repr(this), repr(other)]

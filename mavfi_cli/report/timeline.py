@@ -1,4 +1,4 @@
-"""When each kernel ran, from a depth frame to the setpoint that answers it: a panel a platform."""
+"""Timeline of the kernels from a depth frame to its setpoint, with a panel per platform."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# From above: title, colour of what led to the setpoint, colour of the rest.
+# From top to bottom: title, colour of invocations that led to the setpoint, colour of others.
 _PALE = {
     "point_cloud": "#d3e4f1",
     "octomap": "#cad6de",
@@ -24,26 +24,26 @@ _LANES = {name: (*KERNELS[name], pale) for name, pale in _PALE.items()}
 _SETPOINT = len(_LANES)  # the lowest lane
 _ANSWER = "#c22f2f"
 _HEIGHT = 0.62
-_THINNEST = 0.0022  # of the window; a shorter invocation would not be seen
-_ROOM = 0.085  # of the window, for a duration inside its bar
-_LATE, _ANSWER_LATE = 0.93, 0.7  # of the window; from there on texts stand to the left
+_THINNEST = 0.0022  # minimum bar length as a fraction of the window
+_ROOM = 0.085  # minimum bar length for a text inside, as a fraction of the window
+_LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window from which texts go to the left
 Row = Mapping[str, Any]
 
 
-def write_timeline(told: Row, path: Path) -> None:
-    """Draw the timeline of a comparison as SVG, atomically; equal ones give equal bytes."""
-    write_svg(draw_timeline(told), path)
+def write_timeline(comparison: Row, path: Path) -> None:
+    """Write the timeline of a comparison as SVG, atomically. Equal input gives equal bytes."""
+    write_svg(draw_timeline(comparison), path)
 
 
-def draw_timeline(told: Row) -> Figure:
-    """A matplotlib figure: simulated time since the frame to the right, a lane a kernel.
+def draw_timeline(comparison: Row) -> Figure:
+    """Draw a figure with simulated time since the frame on x and a lane per kernel.
 
-    All platforms have the same axis, so that the same length is the same time.
+    All platforms share the time axis, so equal lengths are equal times.
     """
     from matplotlib.figure import Figure
 
-    rows = told["timeline"]["platforms"]
-    known = {row["platform"]: row for row in told["plan"]["platforms"]}
+    rows = comparison["timeline"]["platforms"]
+    known = {row["platform"]: row for row in comparison["plan"]["platforms"]}
     figure = Figure(figsize=(11.0, 0.9 + 2.9 * max(1, len(rows))), layout="constrained")
     panels = figure.subplots(max(1, len(rows)), 1, squeeze=False, sharex=True)[:, 0]
     if not rows:
@@ -54,14 +54,14 @@ def draw_timeline(told: Row) -> Figure:
     for axes, row in zip(panels, rows, strict=True):
         _panel(axes, row, known[row["platform"]], shown)
     panels[-1].set_xlabel("simulated time since the depth frame, s", fontsize=9)
-    figure.supxlabel(_caption(told), fontsize=7.5, color=NOTE)
+    figure.supxlabel(_caption(comparison), fontsize=7.5, color=NOTE)
     return figure
 
 
-def _caption(told: Row) -> str:
+def _caption(comparison: Row) -> str:
     return (
-        f"golden flights in {told['plan']['world']}, seed {told['timeline']['seed']}; full colour: "
-        "what led from the frame to its setpoint, and to the new plan;\n"
+        f"golden flights in {comparison['plan']['world']}, seed {comparison['timeline']['seed']}; "
+        "full colour: what led from the frame to its setpoint, and to the new plan;\n"
         "an output takes effect at the end of its bar; setpoints go out every control tick"
     )
 
@@ -97,7 +97,7 @@ def _length(span: list[float], width_s: float) -> float:
 
 
 def _others(axes: Axes, lane: int, spans: list[list[float]], colour: str, width_s: float) -> None:
-    """All that a kernel did, with a gap between neighbours that have room for one."""
+    """Draw all invocations of a kernel, with gaps between neighbours if there is room."""
     low = lane - _HEIGHT / 2
     axes.broken_barh(
         [(span[0], _length(span, width_s)) for span in spans], (low, _HEIGHT), color=colour,
@@ -112,18 +112,18 @@ def _bar(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) 
 
 
 def _duration(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) -> None:
-    """How long it took: within the bar where that is long enough, else to its right."""
-    told = _time(span[1] - span[0])
+    """Write the duration inside the bar if it is long enough, else to its right."""
+    text = _time(span[1] - span[0])
     if span[1] - span[0] >= _ROOM * width_s:
         axes.text(
-            (span[0] + span[1]) / 2, lane, told, ha="center", va="center", fontsize=8,
+            (span[0] + span[1]) / 2, lane, text, ha="center", va="center", fontsize=8,
             color="white", zorder=6,
         )  # fmt: skip
         return
     late = span[1] > _LATE * axes.get_xlim()[1]
     axes.text(
         span[0] - 0.005 * width_s if late else span[0] + _length(span, width_s) + 0.005 * width_s,
-        lane, told, ha="right" if late else "left", va="center", fontsize=8, color=colour,
+        lane, text, ha="right" if late else "left", va="center", fontsize=8, color=colour,
         zorder=6, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85},
     )  # fmt: skip
 
@@ -134,7 +134,7 @@ def _time(seconds: float) -> str:
 
 
 def _steps(axes: Axes, row: Row) -> None:
-    """Lines from each end to the start that it led to; level where the message waited."""
+    """Draw lines from each end to the start that it triggered, level while a message waited."""
     places = {kernel: lane for lane, kernel in enumerate(_LANES)}
     links = [("point_cloud", "octomap"), ("octomap", "collision_check"),
              ("collision_check", "control")]  # fmt: skip
@@ -159,7 +159,7 @@ def _step(axes: Axes, upper: int, end_s: float, lower: int, start_s: float, colo
 
 
 def _answers(axes: Axes, row: Row, width_s: float) -> None:
-    """The frame, its setpoint with the time in between, and the setpoint of the new plan."""
+    """Mark the frame, its setpoint with the response time, and the setpoint of the new plan."""
     answer_s, plan_s = row["response_s"], row["plan_setpoint_s"]
     axes.vlines(0.0, -1.1, _SETPOINT + 0.3, color=INK, linewidth=0.9, zorder=1)
     axes.vlines(answer_s, -1.1, _SETPOINT, color=_ANSWER, linewidth=0.9, zorder=1)
@@ -181,14 +181,14 @@ def _answers(axes: Axes, row: Row, width_s: float) -> None:
         colour = _LANES["planner"][1]
         axes.plot(plan_s, _SETPOINT, marker="D", color=colour, markersize=6, zorder=7)
         near = plan_s - answer_s < 0.35 * width_s
-        told = f"flies the new plan, {_time(plan_s)} after the frame"
-        _acts(axes, plan_s, told, "#a55f08", 1.18 if near else 0.68, width_s)
+        text = f"flies the new plan, {_time(plan_s)} after the frame"
+        _acts(axes, plan_s, text, "#a55f08", 1.18 if near else 0.68, width_s)
 
 
-def _acts(axes: Axes, stamp_s: float, told: str, colour: str, below: float, width_s: float) -> None:
-    """What the vehicle does from a setpoint on, written below it."""
+def _acts(axes: Axes, stamp_s: float, text: str, colour: str, below: float, width_s: float) -> None:
+    """Write below a setpoint what the vehicle does from then on."""
     late = stamp_s > _ANSWER_LATE * axes.get_xlim()[1]
     axes.text(
-        stamp_s + (-0.004 if late else 0.006) * width_s, _SETPOINT + below, told, fontsize=8,
+        stamp_s + (-0.004 if late else 0.006) * width_s, _SETPOINT + below, text, fontsize=8,
         color=colour, va="center", ha="right" if late else "left", zorder=8,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The top view of a flight: obstacles, the path by its speed, plans, and what happened where."""
+"""Top view of a flight: obstacles, path coloured by speed, plans and events."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _OBSTACLE = "#c9ced6"
 _OBSTACLE_EDGE = "#8b93a1"
-_LOW = "#e3ead9"  # boxes that end below the flight: hedges
+_LOW = "#e3ead9"  # boxes that end below the flight, such as hedges
 _PLAN = "#7a8699"
 _GOOD = "#1b7f4b"
 _BAD = "#c22f2f"
@@ -38,12 +38,12 @@ _LABELS = {
 
 
 def write_top_view(run: Run, path: Path) -> None:
-    """Draw the run and write it as SVG, atomically; equal runs give equal bytes."""
+    """Write the top view of a run as SVG, atomically. Equal runs give equal bytes."""
     write_svg(draw_top_view(run), path)
 
 
 def draw_top_view(run: Run) -> Figure:
-    """A matplotlib figure of the run, in metres, east to the right and north up."""
+    """Draw a figure of the run in metres, with east to the right and north up."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 6.0), layout="constrained")
@@ -65,14 +65,14 @@ def draw_top_view(run: Run) -> Figure:
 
 
 def path_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 3) m and speeds (n,) m/s of the flight: the truth where it is known."""
+    """Return positions (n, 3) m and speeds (n,) m/s of the flight, from the truth if known."""
     trace = run.trace
     if trace is None or trace.num_rows == 0:
         return np.empty((0, 3)), np.empty(0)
     prefix = "truth_" if "truth_x_m" in trace.column_names else ""
 
     def columns(names: tuple[str, ...]) -> np.ndarray:
-        """Columns of the trace side by side, (n, len(names)); the truth where it is known."""
+        """Return columns of the trace (n, len(names)), from the truth if known."""
         return np.column_stack(
             [trace[f"{prefix}{n}"].to_numpy(zero_copy_only=False) for n in names]
         )
@@ -84,7 +84,7 @@ def path_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_obstacles(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
-    """The boxes of a world; pale where they end below the flight, whose positions are (n, 3) m."""
+    """Draw the boxes of a world, pale if they end below the positions (n, 3) m of the flight."""
     from matplotlib.patches import Rectangle
 
     flight_height_m = float(np.median(positions[:, 2])) if len(positions) else 5.0
@@ -129,7 +129,7 @@ def _draw_path(
 
 
 def draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> None:
-    """Start and goal of a flight, whose positions are (n, 3) m."""
+    """Mark start and goal of a flight with positions (n, 3) m."""
     from matplotlib.patches import Circle
 
     world = result.get("world") or {}
@@ -143,13 +143,13 @@ def draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> No
     if len(positions):
         axes.scatter(
             [positions[0, 0]], [positions[0, 1]], marker="^", s=55, color="#222831",
-            edgecolors="white", linewidths=0.8, zorder=6.5,  # above a fault that strikes there
+            edgecolors="white", linewidths=0.8, zorder=6.5,  # above the mark of a fault
             label="start",
         )  # fmt: skip
 
 
 def draw_end(axes: Axes, result: dict[str, Any], positions: np.ndarray, colour: str = _BAD) -> None:
-    """Where a flight that failed ended; its positions are (n, 3) m."""
+    """Mark the end of a failed flight with positions (n, 3) m."""
     if len(positions) and result["outcome"] != "success":
         axes.scatter(
             [positions[-1, 0]], [positions[-1, 1]], marker="X", s=90, color=colour,
@@ -158,7 +158,7 @@ def draw_end(axes: Axes, result: dict[str, Any], positions: np.ndarray, colour: 
 
 
 def draw_marks(axes: Axes, events: Iterable[dict[str, Any]], kind: str, **style: Any) -> np.ndarray:
-    """Where something of a kind happened, (n, 2) m; `style` is what is to look otherwise."""
+    """Mark events of a kind and return their positions (n, 2) m. `style` overrides the mark."""
     found = [e["position_enu_m"] for e in events if e["kind"] == kind and e["position_enu_m"]]
     places = np.array(found, dtype=float).reshape(-1, 3)[:, :2]
     if found:
@@ -168,7 +168,7 @@ def draw_marks(axes: Axes, events: Iterable[dict[str, Any]], kind: str, **style:
 
 
 def frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
-    """Limits round what matters, equal scales, quiet axes; positions are (n, 3) m."""
+    """Set the limits round world and positions (n, 3) m, equal scales and plain axes."""
     places = [positions[:, :2]] if len(positions) else []
     places += [np.array([world[key][:2]], dtype=float) for key in ("start", "goal") if key in world]
     if places:
@@ -189,7 +189,7 @@ def frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
 
 
 def place_of(result: dict[str, Any]) -> str:
-    """World and seed of a flight."""
+    """Return world and seed of a flight as text."""
     config = result["config"]
     world = config["link"] or config["world"].removesuffix(".toml").rpartition("/")[2]
     return f"{world}, seed {config['seed']}"

@@ -1,4 +1,4 @@
-"""How the autoencoder's training went: its loss over the epochs."""
+"""Plot of the autoencoder's training loss over the epochs."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
 
 def write_loss_curve(curve: Sequence[Sequence[float]], path: Path) -> None:
-    """Draw the loss curve as SVG, atomically; equal ones give equal bytes.
+    """Write the loss curve as SVG, atomically. Equal curves give equal bytes.
 
     Raises:
-        RecordError: the file could not be written.
+        RecordError: The file could not be written.
     """
     write_svg(draw_loss_curve(curve), path)
 
 
 def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:
-    """A matplotlib figure: mean squared errors of scaled deltas, logarithmic, over the epochs.
+    """Draw a figure of the mean squared errors of scaled deltas, logarithmic, over the epochs.
 
     Args:
-        curve: rows of epoch, mean error of the training vectors, largest of the validation ones.
+        curve: Rows of epoch, mean training error and largest validation error.
     """
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Flights of one mission side by side, from above: golden, with a fault, protected (Fig. 13)."""
+"""Top views of flights of one mission: golden, with a fault, protected (paper, Fig. 13)."""
 
 from __future__ import annotations
 
@@ -27,38 +27,38 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# By the order of the names: golden and faulty flights are blue and orange, as in the paper's;
-# protected ones have their detector's colour, which for AAD is the paper's green.
+# In the order of names: golden and faulty flights are blue and orange, as in the paper. Protected
+# flights have their detector's colour, which is the paper's green for AAD.
 _COLOURS = ("#3a7bd5", "#e8751a", "#b8860b", "#00838f", "#c2185b", "#5d4037")
-_WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # points: flights of one way are seen through each other
+_WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # line widths in points, so that equal paths stay visible
 _COLUMNS = 3
-_MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # points: so far beside its place
-_BESIDE = 11.0  # points between the marks of flights at one place
+_MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # offset from the position, points
+_BESIDE = 11.0  # points between marks at the same position
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """Flights over one another; equal names have equal colours in all panels."""
+    """Superposed flights. Equal names have equal colours in all panels."""
 
     title: str
     flights: Sequence[tuple[str, Run]]
 
 
 def write_trajectories(panels: Sequence[Panel], path: Path) -> None:
-    """Draw flights of one world and write them as SVG, atomically; equal ones give equal bytes.
+    """Write flights of one world as SVG, atomically. Equal flights give equal bytes.
 
     Raises:
-        RecordError: the file could not be written.
+        RecordError: The file could not be written.
     """
     write_svg(draw_trajectories(panels), path)
 
 
 def draw_trajectories(panels: Sequence[Panel]) -> Figure:
-    """A matplotlib figure with a top view a panel, in metres, east to the right and north up.
+    """Draw a figure with a top view per panel, in metres, east to the right and north up.
 
     Args:
-        panels: at least one, with at least one flight each; the first without fault and detector is
-            the one that the others' flight times are compared with.
+        panels: At least one panel, each with at least one flight. The first flight without fault
+            and detector is the reference for the flight times of the others.
     """
     from matplotlib.figure import Figure
 
@@ -80,7 +80,7 @@ def draw_trajectories(panels: Sequence[Panel]) -> Figure:
 
 
 def _colours(panels: Sequence[Panel]) -> dict[str, str]:
-    """A colour a name: its detector's, where no name before it has that; else the next in turn."""
+    """Return a colour per name: its detector's if still unused, else the next free one."""
     colours: dict[str, str] = {}
     turn = itertools.cycle(_COLOURS)
     for name, run in (flight for panel in panels for flight in panel.flights):
@@ -92,16 +92,16 @@ def _colours(panels: Sequence[Panel]) -> dict[str, str]:
 
 
 def lines(panels: Sequence[Panel]) -> list[str]:
-    """The picture in words: world and seed; of every flight the end, the time, and its folder."""
-    told = [place_of(panels[0].flights[0][1].result)]
+    """Describe the picture: world and seed, and outcome, time and folder of every flight."""
+    text = [place_of(panels[0].flights[0][1].result)]
     for panel in panels:
-        told += [f"fault: {panel.title}"] if panel.title else []
+        text += [f"fault: {panel.title}"] if panel.title else []
         golden_s = _golden_s([run for _, run in panel.flights])
-        told += [
-            f"  {_told(name, run.result, golden_s)}  {run.folder.path}"
+        text += [
+            f"  {_legend_entry(name, run.result, golden_s)}  {run.folder.path}"
             for name, run in panel.flights
         ]
-    return told
+    return text
 
 
 def _draw_panel(
@@ -119,7 +119,7 @@ def _draw_panel(
             positions[:, 0], positions[:, 1], color=colours[name], zorder=4.0 + 0.01 * place,
             linewidth=max(_LEAST, _WIDEST - _STEP * place), alpha=0.5 if place == 0 else 1.0,
             solid_capstyle="round", solid_joinstyle="round", gid=f"flight-{number}-{place}",
-            label=_told(name, run.result, golden_s),
+            label=_legend_entry(name, run.result, golden_s),
         )  # fmt: skip
         draw_end(axes, run.result, positions, colours[name])
     draw_places(axes, first, paths[0])
@@ -131,11 +131,11 @@ def _draw_panel(
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, fontsize=8
     )
     for handle in handles:
-        handle.set_label(None)  # what is left is the same in all panels
+        handle.set_label(None)  # the remaining labels are the same in all panels
 
 
 def _draw_marks(figure: Figure, axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
-    """Faults and alarms in their flights' colours, beside the way, so that all are seen."""
+    """Mark faults and alarms beside the path in the colours of their flights."""
     from matplotlib.transforms import offset_copy
 
     for kind, (right, up) in _MARKED.items():
@@ -154,7 +154,7 @@ def _draw_marks(figure: Figure, axes: Axes, panel: Panel, colours: Mapping[str, 
 
 
 def _explain_marks(figure: Figure) -> None:
-    """One legend of all marks."""
+    """Draw one legend for all marks."""
     marks: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -164,12 +164,12 @@ def _explain_marks(figure: Figure) -> None:
         frameon=False, fontsize=8, handletextpad=0.3, columnspacing=0.9,
     )  # fmt: skip
     for shown, label in zip(legend.legend_handles, marks, strict=True):
-        if label in _MARKED and shown is not None:  # it stands for flights of all colours
+        if label in _MARKED and shown is not None:  # the legend entry covers all colours
             shown.set(facecolor="white", edgecolor=INK)
 
 
 def _golden_s(runs: Sequence[Run]) -> float | None:
-    """Flight time of the golden flight, where that succeeded."""
+    """Return the flight time of the golden flight if it succeeded, else None."""
     for run in runs:
         if not (run.result.get("fault") or run.result.get("detection")):
             time_s = run.result["quality_of_flight"]["flight_time_s"]
@@ -177,14 +177,14 @@ def _golden_s(runs: Sequence[Run]) -> float | None:
     return None
 
 
-def _told(name: str, result: Mapping[str, Any], golden_s: float | None) -> str:
-    """A flight in the legend: its setting, how it ended, how long it took."""
+def _legend_entry(name: str, result: Mapping[str, Any], golden_s: float | None) -> str:
+    """Return the legend entry of a flight: setting, outcome and flight time."""
     time_s = result["quality_of_flight"]["flight_time_s"]
-    told = f"{name}: {result['outcome'].replace('_', ' ')}"
+    entry = f"{name}: {result['outcome'].replace('_', ' ')}"
     if time_s is None:
-        return told
-    told += f", {time_s:.1f} s"
+        return entry
+    entry += f", {time_s:.1f} s"
     golden = not (result.get("fault") or result.get("detection"))
     if golden or golden_s is None or result["outcome"] != "success":
-        return told
-    return f"{told} ({100.0 * (time_s / golden_s - 1.0):+.1f} %)"
+        return entry
+    return f"{entry} ({100.0 * (time_s / golden_s - 1.0):+.1f} %)"

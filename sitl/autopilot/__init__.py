@@ -1,5 +1,5 @@
-"""A PX4-like autopilot as pure logic: MAVLink messages in, messages and setpoints out.
+"""A PX4-like autopilot as pure logic: turns MAVLink messages into messages and setpoints.
 
-No socket, no clock, no randomness: every stamp is an argument, so that the same messages at the
-same stamps give the same answers, byte for byte.
+It has no socket, no clock and no randomness. Every stamp is an argument, so the same messages at
+the same stamps give the same answers, byte for byte.
 """

@@ -1,4 +1,4 @@
-"""The autopilot: dispatches messages, flies the mode in force, and gathers telemetry."""
+"""The autopilot: dispatches messages, runs the active mode, and collects telemetry."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot import services
 from sitl.autopilot.commander import GPS_FIX_US, Commander, Result
-from sitl.autopilot.commands import Command, acknowledge, execute, from_int, from_long
+from sitl.autopilot.commands import VehicleCommand, acknowledge, execute, from_int, from_long
 from sitl.autopilot.flight_modes import External, Hold, Land, Return, Sticks, Takeoff
 from sitl.autopilot.guidance import Guidance, Situation, climbs
 from sitl.autopilot.link import Link
-from sitl.autopilot.modes import Mode, mode_from_custom
+from sitl.autopilot.modes import FlightMode, mode_from_custom
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import (
     Setpoint,
@@ -28,7 +28,7 @@ from sitl.autopilot.snapshot import Snapshot
 from sitl.autopilot.streams import Preset
 from sitl.autopilot.telemetry_status import consumed_mah
 from sitl.autopilot.text import Severity, text_messages
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 from sitl.geodesy import Origin
 
 COMPONENT = 1
@@ -41,16 +41,19 @@ Handler = Callable[[Any, Link], None]
 class Autopilot:
     """A PX4-like autopilot without sockets or clock.
 
-    At each stamp: `observe` the vehicle, `collect` what each link is due, `handle` what clients
-    send, then `fly`: `setpoint` (11,) and `motors_on` say what to do until the next stamp.
+    At each stamp, call `observe` with the vehicle's state, `collect` for the messages of each link,
+    `handle` for each received message, then `fly`. `setpoint` (11,) and `motors_on` hold until the
+    next stamp.
 
     Args:
-        truth: the vehicle's state; as it is before the first `observe`.
+        truth: Vehicle state before the first `observe`.
         system_id: MAVLink system id.
-        origin: where on earth the local frame lies.
+        origin: Geographic origin of the local frame.
     """
 
-    def __init__(self, truth: Truth, *, system_id: int = 1, origin: Origin | None = None) -> None:
+    def __init__(
+        self, truth: StateEstimate, *, system_id: int = 1, origin: Origin | None = None
+    ) -> None:
         self.system_id = system_id
         self.parameters = Parameters(system_id)
         self.commander = Commander(self.parameters)
@@ -68,8 +71,8 @@ class Autopilot:
         self._offboard: Setpoint = no_setpoint()
         self._sticks = _BUTTONS_CENTRED
         self._takeoff_down_m = math.nan
-        self._hold: Hold | None = None  # how to enter LOITER next
-        self._flown: Mode | None = None
+        self._hold: Hold | None = None  # guidance of the next entry into LOITER
+        self._flown: FlightMode | None = None
         self._guidance: Guidance = Hold()
         self._elapsed_s = 0.0
         self._text_id = 0
@@ -77,13 +80,13 @@ class Autopilot:
     # Links.
 
     def open_link(self, preset: Preset) -> Link:
-        """A new client with the streams of a preset."""
+        """Add a client with the streams of a preset."""
         link = Link(preset)
         self._links.append(link)
         return link
 
     def close_link(self, link: Link) -> None:
-        """Forget a client."""
+        """Remove a client."""
         self._links.remove(link)
 
     def broadcast(self, message: Any) -> None:
@@ -92,7 +95,7 @@ class Autopilot:
             link.send(message)
 
     def collect(self, link: Link) -> list[Any]:
-        """Everything that a link is due at the newest stamp: answers, then streams."""
+        """Return all due messages of a link at the newest stamp: answers, then streams."""
         if link.parameters_left:
             services.list_parameters(self, link)
         due = link.streams.due(self.snapshot.stamp_us, self.snapshot)
@@ -103,61 +106,61 @@ class Autopilot:
         return messages
 
     def take_outbox(self, link: Link) -> list[Any]:
-        """Answers and texts only, for a link that is served between ticks."""
+        """Return answers and texts only, for a link that is served between ticks."""
         messages, link.outbox = link.outbox, []
         return messages
 
-    # What clients ask.
+    # Requests of clients.
 
     def handle(self, message: Any, link: Link) -> None:
-        """Take one message of a client; what is not for this autopilot is ignored."""
+        """Handle a message of a client. Messages for other systems are ignored."""
         handler = self._handlers.get(message.get_msgId())
         if handler is not None:
             handler(message, link)
             self._flush_texts()
 
-    def enter_mode(self, mode: Mode | None) -> Result:
-        """Change the mode as a user asks; entering a mode again starts it anew."""
+    def enter_mode(self, mode: FlightMode | None) -> Result:
+        """Change the mode on a user's request. Entering the present mode restarts it."""
         result = self.commander.request_mode(mode)
         if result is Result.ACCEPTED:
             self._flown = None
             self._hold = None
-            if mode is Mode.TAKEOFF:
+            if mode is FlightMode.TAKEOFF:
                 self._takeoff_down_m = math.nan
         return result
 
     def take_off(self, target_down_m: float) -> Result:
-        """Enter AUTO.TAKEOFF to a height; disarmed, it begins with arming."""
-        result = self.enter_mode(Mode.TAKEOFF)
+        """Enter AUTO.TAKEOFF to a height. A disarmed vehicle takes off after arming."""
+        result = self.enter_mode(FlightMode.TAKEOFF)
         if result is Result.ACCEPTED:
             self._takeoff_down_m = target_down_m
         return result
 
     def go_to(self, target_ned_m: Vector, yaw_rad: float) -> Result:
-        """Enter AUTO.LOITER at a place."""
+        """Enter AUTO.LOITER at a position."""
         if self.commander.landed:
             return Result.DENIED
-        result = self.enter_mode(Mode.LOITER)
+        result = self.enter_mode(FlightMode.LOITER)
         if result is Result.ACCEPTED:
             self._hold = Hold(target_ned_m, yaw_rad)
         return result
 
     def set_home(self, place_ned_m: Vector) -> None:
-        """Move the home position and tell everybody."""
+        """Set the home position and broadcast it."""
         self.snapshot.home_ned_m = place_ned_m
         self._announce_home()
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Change a REAL32 parameter from inside, with its broadcast."""
+        """Change a REAL32 parameter internally and broadcast it."""
         index = self.parameters.index(name)
         assert index is not None
         self.parameters.write(name, value, 9)
         self.broadcast(self.parameters.message(index))
 
-    # What time brings.
+    # Updates over time.
 
-    def observe(self, stamp_us: int, truth: Truth) -> None:
-        """Take the vehicle's state at a stamp; the commander decides what follows from it."""
+    def observe(self, stamp_us: int, truth: StateEstimate) -> None:
+        """Take the vehicle's state at a stamp and update the commander."""
         now = self.snapshot
         self._elapsed_s = elapsed_s = (stamp_us - now.stamp_us) * 1e-6
         has_fix_now = stamp_us >= GPS_FIX_US > now.stamp_us
@@ -171,14 +174,14 @@ class Autopilot:
 
     @property
     def may_touch_ground(self) -> bool:
-        """Whether a gentle touch of the ground now would be a landing."""
-        if self.commander.mode is not Mode.OFFBOARD:
+        """True if a gentle ground contact now counts as a landing."""
+        if self.commander.mode is not FlightMode.OFFBOARD:
             return True
         north, east, down = self.setpoint[3:6]
         return bool(math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0)
 
     def fly(self) -> None:
-        """Let the mode in force choose setpoint and motors until the next stamp."""
+        """Let the active mode set setpoint and motors until the next stamp."""
         commander, truth = self.commander, self.snapshot.truth
         out = no_setpoint()
         if not commander.armed:
@@ -207,17 +210,17 @@ class Autopilot:
         self.setpoint = self.snapshot.setpoint = setpoint
         self.motors_on = self.snapshot.motors_on = motors_on
 
-    def _enter(self, mode: Mode) -> Guidance:
-        """The guidance that begins a mode."""
-        if mode is Mode.OFFBOARD:
+    def _enter(self, mode: FlightMode) -> Guidance:
+        """Create the guidance of a mode at its entry."""
+        if mode is FlightMode.OFFBOARD:
             return External(lambda: self._offboard)
-        if mode is Mode.POSCTL:
+        if mode is FlightMode.POSCTL:
             return Sticks(lambda: self._sticks)
-        if mode is Mode.TAKEOFF:
+        if mode is FlightMode.TAKEOFF:
             return self._begin_takeoff()
-        if mode is Mode.LAND:
+        if mode is FlightMode.LAND:
             return Land()
-        if mode is Mode.RTL:
+        if mode is FlightMode.RTL:
             return Return(self._announce_return)
         hold, self._hold = self._hold or Hold(), None
         return hold
@@ -229,7 +232,7 @@ class Autopilot:
             down = float(self.snapshot.home_ned_m[2]) - height
 
         def finished() -> None:
-            """Hold at the height that was asked for, but no lower than half a metre below here."""
+            """Hold at the requested height, but at most 0.5 m below the present one."""
             place = np.array(self.snapshot.truth.position_ned_m)
             place[2] = min(down, float(place[2]) + 0.5)
             self._hold = Hold(place)
@@ -264,10 +267,10 @@ class Autopilot:
 
     def _handler_table(self) -> dict[int, Handler]:
         def addressed(service: Callable[[Autopilot, Any, Link], None]) -> Handler:
-            """A service that ignores messages for other components."""
+            """Wrap a service so that it ignores messages for other components."""
 
             def handler(message: Any, link: Link) -> None:
-                """Serve a message if it is for us."""
+                """Serve a message addressed to us."""
                 if self._is_for_me(message):
                     service(self, message, link)
 
@@ -333,11 +336,11 @@ class Autopilot:
             execute(self, from_int(message), link)
 
     def _on_set_mode(self, message: Any, link: Link) -> None:
-        """The message before DO_SET_MODE; answered as that, once."""
+        """Handle SET_MODE, the predecessor of DO_SET_MODE, with one answer."""
         if message.target_system != self.system_id:
             return
         mode = mode_from_custom(message.custom_mode) if message.base_mode & 1 else None
-        command = Command(
+        command = VehicleCommand(
             number=dialect.MAV_CMD_DO_SET_MODE, p1=1.0, p2=0.0, p3=0.0, p4=0.0,
             latitude_deg=math.nan, longitude_deg=math.nan, altitude_m=math.nan,
             above_home=False, system=message.get_srcSystem(),

@@ -1,6 +1,6 @@
-"""Modes, arming, failsafe and disarming: the decisions that PX4's commander takes.
+"""Modes, arming, failsafe and disarming, as in PX4's commander.
 
-Texts, results and delays are those that a PX4 v1.17 was seen to give on the wire.
+Texts, results and delays are those observed in messages of PX4 v1.17.
 """
 
 from __future__ import annotations
@@ -8,19 +8,19 @@ from __future__ import annotations
 from enum import IntEnum
 
 from sitl.autopilot.landing import LandDetector
-from sitl.autopilot.modes import Mode
+from sitl.autopilot.modes import FlightMode
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.text import Severity
-from sitl.autopilot.truth import Truth
+from sitl.autopilot.truth import StateEstimate
 
-GPS_FIX_US = 2_500_000  # first fix after boot, and with it the home position
+GPS_FIX_US = 2_500_000  # first fix and home position after boot
 POSITION_US = 3_060_000  # global position fused
 READY_US = 4_000_000  # pre-arm checks pass
 
-_CONTROL_BACK_US = 1_000_000  # a lost source of setpoints must be back this long
-_RETRIED_MODES = (Mode.TAKEOFF, Mode.LAND, Mode.RTL)  # disarming ends them
-_UNARMABLE = (Mode.LAND, Mode.RTL)
-_OBL_ACTIONS = {4: Mode.LAND, 5: Mode.LOITER}  # COM_OBL_RC_ACT; the rest is RTL without a stick
+_CONTROL_BACK_US = 1_000_000  # time for which a lost setpoint source must be back
+_RETRIED_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RTL)  # ended by disarming
+_UNARMABLE = (FlightMode.LAND, FlightMode.RTL)
+_OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
 _OBL_TERMINATE = 6
 
 
@@ -35,7 +35,7 @@ class Result(IntEnum):
 
 
 class SystemStatus(IntEnum):
-    """MAV_STATE, the values in use."""
+    """Used values of MAV_STATE."""
 
     UNINIT = 0
     STANDBY = 3
@@ -44,7 +44,7 @@ class SystemStatus(IntEnum):
     FLIGHT_TERMINATION = 8
 
 
-class LandedState(IntEnum):
+class FlightState(IntEnum):
     """MAV_LANDED_STATE."""
 
     ON_GROUND = 1
@@ -54,60 +54,60 @@ class LandedState(IntEnum):
 
 
 class Commander:
-    """Owns the mode and the arming state.
+    """State machine of mode and arming.
 
     Attributes:
-        mode: the mode that flies: what the user chose, or the failsafe's.
-        armed: whether it is armed.
-        terminated: whether flight termination has stopped the motors for good.
-        texts: severity and words of what there is to say; the owner takes them away.
+        mode: Active mode: the user's choice, or the failsafe's.
+        armed: True while armed.
+        terminated: True once flight termination has stopped the motors permanently.
+        texts: Pending status texts with their severities; the owner removes them.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self._detector = LandDetector()
         self.stamp_us = 0
-        self.user_mode = Mode.LOITER
-        self.failsafe: Mode | None = None
+        self.user_mode = FlightMode.LOITER
+        self.failsafe: FlightMode | None = None
         self.armed = False
         self.terminated = False
         self.texts: list[tuple[Severity, str]] = []
         self._armed_us = 0
         self._landed_us = 0
         self._flown_since_arming = False
-        self._offboard_us: int | None = None  # newest accepted setpoint
-        self._sticks_us: int | None = None  # newest stick message
+        self._offboard_us: int | None = None  # stamp of the newest accepted setpoint
+        self._sticks_us: int | None = None  # stamp of the newest stick message
         self._control_back_us: int | None = None
         self._battery_warned = 0
 
     @property
-    def mode(self) -> Mode:
-        """The mode in force."""
+    def mode(self) -> FlightMode:
+        """Active mode."""
         return self.failsafe or self.user_mode
 
     @property
     def landed(self) -> bool:
-        """Whether the vehicle stands on the ground."""
+        """True if the vehicle stands on the ground."""
         return self._detector.landed
 
     @property
     def armed_for_s(self) -> float:
-        """Time since arming; meaningless while disarmed."""
+        """Time since arming, s; undefined while disarmed."""
         return (self.stamp_us - self._armed_us) * 1e-6
 
     @property
     def has_gps_fix(self) -> bool:
-        """Whether GPS has its fix and home is known."""
+        """True once GPS has a fix and home is known."""
         return self.stamp_us >= GPS_FIX_US
 
     @property
     def has_global_position(self) -> bool:
-        """Whether the estimator has taken in the GPS."""
+        """True once the estimator uses GPS."""
         return self.stamp_us >= POSITION_US
 
     @property
     def can_arm(self) -> bool:
-        """The PREARM_CHECK health bit."""
+        """PREARM_CHECK health bit."""
         return (
             self.stamp_us >= READY_US
             and not self.terminated
@@ -127,20 +127,20 @@ class Commander:
         return SystemStatus.STANDBY if self.can_arm else SystemStatus.UNINIT
 
     @property
-    def landed_state(self) -> LandedState:
+    def landed_state(self) -> FlightState:
         """EXTENDED_SYS_STATE.landed_state."""
         if self.landed:
-            return LandedState.ON_GROUND
-        special = {Mode.TAKEOFF: LandedState.TAKEOFF, Mode.LAND: LandedState.LANDING}
-        return special.get(self.mode, LandedState.IN_AIR)
+            return FlightState.ON_GROUND
+        special = {FlightMode.TAKEOFF: FlightState.TAKEOFF, FlightMode.LAND: FlightState.LANDING}
+        return special.get(self.mode, FlightState.IN_AIR)
 
-    def is_available(self, mode: Mode) -> bool:
-        """Whether the mode has what it needs: OFFBOARD its setpoints, POSCTL its sticks."""
-        if mode is Mode.OFFBOARD:
+    def is_available(self, mode: FlightMode) -> bool:
+        """Return True if the mode has its inputs: setpoints for OFFBOARD, sticks for POSCTL."""
+        if mode is FlightMode.OFFBOARD:
             return self._is_fresh(self._offboard_us, "COM_OF_LOSS_T")
-        if mode is Mode.POSCTL:
+        if mode is FlightMode.POSCTL:
             return self._is_fresh(self._sticks_us, "COM_RC_LOSS_T")
-        return mode is not Mode.MANUAL  # attitude sticks: there is no radio control
+        return mode is not FlightMode.MANUAL  # MANUAL needs radio control, which does not exist
 
     def _is_fresh(self, stamp_us: int | None, parameter: str) -> bool:
         if stamp_us is None:
@@ -148,21 +148,21 @@ class Commander:
         return self.stamp_us - stamp_us <= self._parameters.effective(parameter) * 1e6
 
     def offboard_setpoint_arrived(self) -> None:
-        """Feed the watchdog of OFFBOARD."""
+        """Reset the watchdog of OFFBOARD."""
         self._offboard_us = self.stamp_us
 
     def sticks_arrived(self) -> None:
-        """Feed the watchdog of POSCTL."""
+        """Reset the watchdog of POSCTL."""
         self._sticks_us = self.stamp_us
 
     def say(self, severity: Severity, text: str) -> None:
-        """Queue a text for every client."""
+        """Queue a status text for every client."""
         self.texts.append((severity, text))
 
-    # Requests of a client.
+    # Requests of clients.
 
-    def request_mode(self, mode: Mode | None) -> Result:
-        """Change the user's mode; disarmed, any mode will do."""
+    def request_mode(self, mode: FlightMode | None) -> Result:
+        """Change the user's mode. A disarmed vehicle accepts any mode."""
         if mode is None:
             return Result.TEMPORARILY_REJECTED
         if self.armed and not self.is_available(mode):
@@ -173,7 +173,7 @@ class Commander:
         return Result.ACCEPTED
 
     def request_arm(self, *, force: bool) -> Result:
-        """Arm, after the checks unless forced."""
+        """Arm if the checks pass or `force` is set."""
         if self.armed:
             return Result.ACCEPTED
         if self.terminated or not (force or self.can_arm):
@@ -187,7 +187,7 @@ class Commander:
         return Result.ACCEPTED
 
     def request_disarm(self, *, force: bool) -> Result:
-        """Disarm; in the air only when forced."""
+        """Disarm, in the air only if `force` is set."""
         if self.armed and not self.landed and not force:
             self.say(Severity.CRITICAL, "Disarming denied: not landed")
             return Result.TEMPORARILY_REJECTED
@@ -196,20 +196,20 @@ class Commander:
         return Result.ACCEPTED
 
     def terminate(self, text: str) -> None:
-        """Stop the motors for good."""
+        """Stop the motors permanently."""
         if not self.terminated:
             self.terminated = True
             self.say(Severity.EMERGENCY, text)
 
-    # What time brings.
+    # Updates over time.
 
-    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool) -> None:
+    def update(self, stamp_us: int, truth: StateEstimate, *, wants_up: bool) -> None:
         """Advance to a stamp with the newest state of the vehicle.
 
         Args:
-            stamp_us: boot clock.
-            truth: the vehicle.
-            wants_up: whether the setpoint in force climbs.
+            stamp_us: Boot clock, us.
+            truth: Vehicle state.
+            wants_up: True if the active setpoint climbs.
         """
         self.stamp_us = stamp_us
         trigger = self._parameters.effective("LNDMC_TRIG_TIME")
@@ -221,9 +221,9 @@ class Commander:
         self._watch_battery(truth.battery_remaining)
 
     def takeoff_finished(self) -> None:
-        """Take-off height reached: AUTO.TAKEOFF hands over to AUTO.LOITER."""
-        if self.mode is Mode.TAKEOFF:
-            self.user_mode = Mode.LOITER
+        """Change from AUTO.TAKEOFF to AUTO.LOITER at the take-off height."""
+        if self.mode is FlightMode.TAKEOFF:
+            self.user_mode = FlightMode.LOITER
 
     def _note_landing(self) -> None:
         self._landed_us = self.stamp_us
@@ -234,7 +234,7 @@ class Commander:
             self.say(Severity.INFO, f"{what} detected")
 
     def _watch_control(self) -> None:
-        """Lose, and find again, what the user's mode lives on."""
+        """Enter or leave the failsafe when the input of the user's mode is lost or returns."""
         if self.is_available(self.user_mode):
             if self.failsafe is None:
                 return
@@ -247,7 +247,7 @@ class Commander:
         if self.failsafe is not None or self.terminated:
             return
         action = int(self._parameters.effective("COM_OBL_RC_ACT"))
-        self.failsafe = _OBL_ACTIONS.get(action, Mode.RTL)
+        self.failsafe = _OBL_ACTIONS.get(action, FlightMode.RTL)
         self.say(Severity.CRITICAL, "Failsafe activated")
         if action >= _OBL_TERMINATE:
             self.terminate("Flight termination active")
@@ -270,7 +270,7 @@ class Commander:
         self._control_back_us = None
         self.say(Severity.INFO, f"Disarmed by {reason}")
         if self.user_mode in _RETRIED_MODES:
-            self.user_mode = Mode.LOITER
+            self.user_mode = FlightMode.LOITER
 
     def _watch_battery(self, remaining: float) -> None:
         levels = (("BAT_LOW_THR", "Low battery level"), ("BAT_CRIT_THR", "Critical battery level"))

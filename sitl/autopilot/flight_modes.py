@@ -1,7 +1,7 @@
-"""The flight modes: each turns the situation into a setpoint.
+"""Guidance of the flight modes. Each computes a setpoint from the situation.
 
-Speeds and heights are PX4's parameters; the shapes (brake, then hold; climb, then cross, then
-come down) are those of its multicopter modes.
+Speeds and heights are PX4's parameters. The sequences (brake, then hold; climb, then cross, then
+descend) are those of PX4's multicopter modes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _STICK_INVALID = 32767
 
 
 class Hold:
-    """AUTO.LOITER: go to a place if one is given, then stay."""
+    """AUTO.LOITER: flies to a position, if given, and stays there."""
 
     def __init__(self, target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> None:
         self._target = target_ned_m
@@ -38,7 +38,7 @@ class Hold:
         self._anchor = Anchor(ALL_AXES, target_ned_m)
 
     def fly(self, now: Situation, out: Setpoint) -> None:
-        """Move in a straight line while far away; stay otherwise."""
+        """Fly straight to a distant position, otherwise hold."""
         out[9] = self._yaw_rad
         if self._target is not None:
             delta = self._target - now.truth.position_ned_m
@@ -49,7 +49,7 @@ class Hold:
 
 
 class Takeoff:
-    """AUTO.TAKEOFF: straight up to a height, then hand over."""
+    """AUTO.TAKEOFF: climbs straight to a height, then calls `finished`."""
 
     def __init__(self, target_down_m: float, finished: Callable[[], None]) -> None:
         self._target_down_m = target_down_m
@@ -58,7 +58,7 @@ class Takeoff:
         self._climbing_s = 0.0
 
     def fly(self, now: Situation, out: Setpoint) -> None:
-        """Climb with a speed that ramps up over MPC_TKO_RAMP_T."""
+        """Climb at a speed that ramps up over MPC_TKO_RAMP_T."""
         self._anchor.hold(now, out)
         delta = self._target_down_m - float(now.truth.position_ned_m[2])
         if not now.landed and delta > -_TAKEOFF_NEAR_M:
@@ -73,7 +73,7 @@ class Takeoff:
 
 
 class Land:
-    """AUTO.LAND: straight down, slower near the ground."""
+    """AUTO.LAND: descends straight, slower near the ground."""
 
     def __init__(self, over: Vector | None = None) -> None:
         self._anchor = Anchor(HORIZONTAL, over)
@@ -96,7 +96,7 @@ class _Leg(Enum):
 
 
 class Return:
-    """AUTO.RTL: climb, cross, descend and land at home."""
+    """AUTO.RTL: climbs, crosses, descends and lands at home."""
 
     def __init__(self, announce: Callable[[float], None]) -> None:
         self._announce = announce
@@ -106,7 +106,7 @@ class Return:
         self._landing: Land | None = None
 
     def fly(self, now: Situation, out: Setpoint) -> None:
-        """Fly the leg in force, and begin the next where it ends."""
+        """Fly the present leg and begin the next at its end."""
         if now.landed:
             out[5] = now.parameters.effective("MPC_LAND_SPEED")
             return
@@ -129,7 +129,7 @@ class Return:
             self._come_down(now, out)
 
     def _begin(self, now: Situation) -> None:
-        """Choose the height: a cone about home near it, RTL_RETURN_ALT far from it."""
+        """Choose the height: a cone round home when near, RTL_RETURN_ALT when far."""
         value = now.parameters.effective
         away = now.truth.position_ned_m - now.home_ned_m
         distance, above = math.hypot(away[0], away[1]), -float(away[2])
@@ -149,7 +149,7 @@ class Return:
 
 
 class External:
-    """OFFBOARD: fly what the companion asks for."""
+    """OFFBOARD: follows the companion's setpoints."""
 
     def __init__(self, newest: Callable[[], Setpoint]) -> None:
         self._newest = newest

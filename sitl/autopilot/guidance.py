@@ -1,4 +1,4 @@
-"""What a flight mode reads and writes, and the little arithmetic that modes share."""
+"""Interface of a flight mode's guidance, and the functions that modes share."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 
 POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4
-_CLIMB_MPS = 0.3  # a setpoint that asks for this much wants to leave the ground
+_CLIMB_MPS = 0.3  # minimum climb speed of a setpoint that leaves the ground
 _CLIMB_M = 0.3
 _STOPPED_MPS = 0.3
 
 
 @dataclass(slots=True, kw_only=True)
 class Situation:
-    """The vehicle as a flight mode sees it at one tick."""
+    """Inputs of a flight mode at one tick."""
 
-    truth: Truth
+    truth: StateEstimate
     dt_s: float
     parameters: Parameters
     landed: bool
@@ -32,22 +32,22 @@ class Situation:
 
 
 class Guidance(Protocol):
-    """One entry into a flight mode, from entering to leaving it."""
+    """Guidance of a flight mode from one entry to its end."""
 
     def fly(self, now: Situation, out: Setpoint) -> None:
         """Write the setpoint of this tick into `out`, which holds NaN."""
 
 
-def climbs(out: Setpoint, truth: Truth) -> bool:
-    """Whether a setpoint wants to go up; NaN wants nothing."""
+def climbs(out: Setpoint, truth: StateEstimate) -> bool:
+    """Return True if a setpoint climbs; NaN does not."""
     lift = out[2] - truth.position_ned_m[2]
     return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M)
 
 
 def approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:
-    """Velocity (n,) towards a point `delta` (n,) away that can stop there.
+    """Return a velocity (n,) towards a point at a distance `delta` (n,) that allows a stop there.
 
-    The slowest of the limit, sqrt(2 a d) with half the acceleration, and the position loop.
+    It is the minimum of the limit, sqrt(2 a d) with half the acceleration, and the position loop.
     """
     distance = math.sqrt(float(delta @ delta))
     if distance < 1e-6:
@@ -57,7 +57,7 @@ def approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Ve
 
 
 def limit_velocity(out: Setpoint, parameters: Parameters) -> None:
-    """Hold the velocity of a setpoint inside MPC_XY_VEL_MAX and MPC_Z_VEL_MAX_*, in place."""
+    """Limit the velocity of a setpoint to MPC_XY_VEL_MAX and MPC_Z_VEL_MAX_*, in place."""
     speed = math.hypot(out[3], out[4])
     fastest = parameters.effective("MPC_XY_VEL_MAX")
     if speed > fastest:
@@ -70,7 +70,7 @@ def limit_velocity(out: Setpoint, parameters: Parameters) -> None:
 
 
 class Anchor:
-    """A place to stay at: brakes first, then keeps the point where it came to rest."""
+    """A position hold that brakes first, then keeps the point of rest."""
 
     __slots__ = ("_axes", "_place")
 

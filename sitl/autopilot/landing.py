@@ -1,14 +1,14 @@
-"""The land detector: on the ground, still, and not asked to climb, for some time."""
+"""Land detector: on the ground, still, and without a climb setpoint for some time."""
 
 from __future__ import annotations
 
-from sitl.autopilot.truth import Truth
+from sitl.autopilot.truth import StateEstimate
 
 _STILL_MPS = 0.5
 
 
 class LandDetector:
-    """Whether the vehicle has landed, with PX4's LNDMC_TRIG_TIME as hysteresis."""
+    """Detects landing, with PX4's LNDMC_TRIG_TIME as hysteresis."""
 
     __slots__ = ("_settled_since_us", "landed")
 
@@ -16,8 +16,10 @@ class LandDetector:
         self.landed = True
         self._settled_since_us: int | None = None
 
-    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool, trigger_s: float) -> bool:
-        """Take the newest state; True where `landed` has just changed."""
+    def update(
+        self, stamp_us: int, truth: StateEstimate, *, wants_up: bool, trigger_s: float
+    ) -> bool:
+        """Take the newest state. Return True if `landed` has changed."""
         if self.landed:
             self.landed = truth.on_ground
             self._settled_since_us = None
@@ -31,6 +33,6 @@ class LandDetector:
         return self.landed
 
 
-def _is_still(truth: Truth) -> bool:
+def _is_still(truth: StateEstimate) -> bool:
     velocity = truth.velocity_ned_mps
     return bool(abs(velocity[0]) + abs(velocity[1]) + abs(velocity[2]) < _STILL_MPS)

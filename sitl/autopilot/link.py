@@ -1,4 +1,4 @@
-"""One client of the autopilot: its streams and what waits to be sent to it."""
+"""One client of the autopilot with its streams and pending messages."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from sitl.autopilot.streams import Preset, Streams
 
 
 class Link:
-    """The autopilot's end of one connection; knows nothing of sockets.
+    """The autopilot's end of one connection, without a socket.
 
     Attributes:
-        streams: the telemetry of this client.
-        outbox: messages that wait for the next collection, oldest first.
-        parameters_left: indices of parameters still to be listed.
+        streams: Telemetry streams of this client.
+        outbox: Pending messages, oldest first.
+        parameters_left: Indices of parameters still to be listed.
     """
 
     __slots__ = ("outbox", "parameters_left", "streams")

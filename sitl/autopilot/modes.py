@@ -1,6 +1,6 @@
-"""Flight modes of a PX4 and how HEARTBEAT and DO_SET_MODE spell them.
+"""Flight modes of PX4 and their codes in HEARTBEAT and DO_SET_MODE.
 
-custom_mode = main << 16 | sub << 24 (PX4's px4_custom_mode.h, as seen on the wire of v1.17).
+custom_mode = main << 16 | sub << 24 (PX4's px4_custom_mode.h, confirmed with v1.17).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _MANUAL_INPUT_ENABLED = 0x40
 SAFETY_ARMED = 0x80
 
 
-class Mode(Enum):
+class FlightMode(Enum):
     """A flight mode: PX4's main mode, its sub mode, and the name that PX4's texts use."""
 
     MANUAL = (1, 0, "Manual")
@@ -34,34 +34,34 @@ class Mode(Enum):
 
     @property
     def is_auto(self) -> bool:
-        """Whether the autopilot flies by itself in this mode."""
+        """True if the autopilot flies by itself in this mode."""
         return self.main == 4
 
 
-_BY_NUMBERS = {(mode.main, mode.sub): mode for mode in Mode}
+_BY_NUMBERS = {(mode.main, mode.sub): mode for mode in FlightMode}
 
 
-def mode_from_numbers(main: int, sub: int) -> Mode | None:
-    """The mode of a DO_SET_MODE's param2 and param3; None where there is none like it.
+def mode_from_numbers(main: int, sub: int) -> FlightMode | None:
+    """Return the mode of param2 and param3 of a DO_SET_MODE; None if there is none.
 
-    The sub mode counts only for AUTO, and AUTO without one is LOITER.
+    The sub mode is used for AUTO only. AUTO without a sub mode is LOITER.
     """
     if main == 4:
-        return _BY_NUMBERS.get((4, sub or Mode.LOITER.sub))
+        return _BY_NUMBERS.get((4, sub or FlightMode.LOITER.sub))
     return _BY_NUMBERS.get((main, 0))
 
 
-def mode_from_custom(custom_mode: int) -> Mode | None:
-    """The mode of a SET_MODE's custom_mode; None where there is none like it."""
+def mode_from_custom(custom_mode: int) -> FlightMode | None:
+    """Return the mode of a SET_MODE's custom_mode; None if there is none."""
     return mode_from_numbers(custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF)
 
 
-def base_mode(mode: Mode, *, armed: bool) -> int:
-    """HEARTBEAT.base_mode of a mode, as PX4 v1.17 sends it."""
+def base_mode(mode: FlightMode, *, armed: bool) -> int:
+    """Return HEARTBEAT.base_mode of a mode as in PX4 v1.17."""
     flags = _CUSTOM_MODE_ENABLED | (SAFETY_ARMED if armed else 0)
     if mode.is_auto:
         return flags | _AUTO_ENABLED | _GUIDED_ENABLED | _STABILIZE_ENABLED
-    if mode is Mode.OFFBOARD:
+    if mode is FlightMode.OFFBOARD:
         return flags | _STABILIZE_ENABLED
-    stabilized = _STABILIZE_ENABLED if mode is Mode.POSCTL else 0
+    stabilized = _STABILIZE_ENABLED if mode is FlightMode.POSCTL else 0
     return flags | _MANUAL_INPUT_ENABLED | stabilized

@@ -1,7 +1,8 @@
-"""The parameters of the autopilot: PX4's names, types and defaults.
+"""Parameters of the autopilot with PX4's names, types and defaults.
 
-Those marked as acting change the flight; the others are there because ground stations ask for
-them. Limits bound what the flight code uses, not what may be stored: PX4 stores any value.
+Parameters marked as acting affect the flight. The others exist because ground stations request
+them. Limits apply to the values that the flight code uses, not to stored values, as PX4 stores any
+value.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parameter:
-    """One parameter: a name of up to 16 characters, its default, and its usable range."""
+    """One parameter: name of up to 16 characters, default and usable range."""
 
     name: str
     default: float | int  # the type of the default is the type of the parameter
@@ -21,7 +22,7 @@ class Parameter:
 
     @property
     def is_integer(self) -> bool:
-        """Whether it is an INT32; otherwise it is a REAL32."""
+        """True for an INT32, False for a REAL32."""
         return isinstance(self.default, int)
 
 
@@ -92,7 +93,7 @@ _PRESENT = (
 
 
 def parameter_table(system_id: int) -> tuple[Parameter, ...]:
-    """All parameters in index order, which is the order of their names."""
+    """Return all parameters in index order, which is alphabetical."""
     fixed = (
         Parameter(name="MAV_COMP_ID", default=1, read_only=True),
         Parameter(name="MAV_SYS_ID", default=system_id, read_only=True),

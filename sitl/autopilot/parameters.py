@@ -1,4 +1,4 @@
-"""The parameter store and its wire form: REAL32, or INT32 bytewise in the float field."""
+"""Parameter store and its wire format: REAL32, or INT32 bytewise in the float field."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ HASH_INDEX = 65535
 
 
 class SetResult(Enum):
-    """What became of a PARAM_SET."""
+    """Result of a PARAM_SET."""
 
     CHANGED = "changed"
-    UNCHANGED = "unchanged"  # same value, or a value that is refused: the answer is the old value
-    IGNORED = "ignored"  # unknown name or wrong type: PX4 stays silent
+    UNCHANGED = "unchanged"  # same or rejected value; the answer is the old value
+    IGNORED = "ignored"  # unknown name or wrong type; no answer, as in PX4
 
 
 class Parameters:
-    """Values by name and by index.
+    """Parameter values by name and by index.
 
-    `value` is what a client stored; `effective` is what the flight code may use, inside the
-    parameter's limits, so that no stored value can put the vehicle into an undefined state.
+    `value` returns the stored value. `effective` returns the value for the flight code, within the
+    parameter's limits, so that no stored value can cause an undefined state.
     """
 
     def __init__(self, system_id: int) -> None:
@@ -42,24 +42,24 @@ class Parameters:
         return len(self._table)
 
     def index(self, name: str) -> int | None:
-        """The index of a name; None where there is none."""
+        """Return the index of a name; None if it is unknown."""
         return self._index.get(name)
 
     def value(self, name: str) -> float | int:
-        """The stored value of a name that exists."""
+        """Return the stored value of a known name."""
         return self._values[self._index[name]]
 
     def effective(self, name: str) -> float:
-        """The stored value, held inside the parameter's limits."""
+        """Return the stored value, clamped to the parameter's limits."""
         number = self._index[name]
         row = self._table[number]
         return float(min(max(self._values[number], row.low), row.high))
 
     def write(self, name: str, wire_value: float, wire_type: int) -> SetResult:
-        """Store what a PARAM_SET carries, decoded by its type.
+        """Store the value of a PARAM_SET, decoded by its type.
 
-        A value that is not finite is refused (a real PX4 stores it and then hangs), and so is
-        any change of a read-only parameter.
+        A value that is not finite is rejected (a real PX4 stores it and then hangs). A change of a
+        read-only parameter is rejected, too.
         """
         number = self._index.get(name)
         if number is None or wire_type != _wire_type(self._table[number]):
@@ -72,13 +72,13 @@ class Parameters:
         return SetResult.CHANGED
 
     def message(self, index: int) -> Any:
-        """PARAM_VALUE of an index that exists."""
+        """Return the PARAM_VALUE of a valid index."""
         row, value = self._table[index], self._values[index]
         wire = _float_of_bytes(struct.pack("<i", value)) if row.is_integer else value
         return _value_message(row.name, wire, _wire_type(row), len(self), index)
 
     def hash_message(self) -> Any:
-        """PARAM_VALUE of the pseudo-parameter that tells a client whether its cache is good."""
+        """Return the PARAM_VALUE of the hash, with which a client validates its cache."""
         digest = 0
         for row, value in zip(self._table, self._values, strict=True):
             packed = struct.pack("<i" if row.is_integer else "<f", value)
@@ -96,7 +96,7 @@ def _wire_type(row: Parameter) -> int:
 
 
 def _stored(row: Parameter, value: float) -> float | int:
-    """The value at the precision that the wire has."""
+    """Return the value rounded to the wire's precision."""
     if row.is_integer:
         return int(value)
     single: float = struct.unpack("<f", struct.pack("<f", value))[0]

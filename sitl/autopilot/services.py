@@ -12,7 +12,7 @@ from sitl.autopilot.parameters import HASH_INDEX, HASH_NAME, SetResult
 if TYPE_CHECKING:
     from sitl.autopilot.autopilot import Autopilot
 
-PARAMETERS_A_TICK = 20  # about the thousand a second that a PX4 lists
+PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
 
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
@@ -22,14 +22,14 @@ _MISSION_INVALID_SEQUENCE = 13
 
 
 def param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
-    """List all parameters, the hash first, the rest a few at a time."""
+    """Start to list all parameters: the hash first, then a few per tick."""
     link.send(autopilot.parameters.hash_message())
     link.parameters_left.clear()
     link.parameters_left.extend(range(len(autopilot.parameters)))
 
 
 def param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Send one parameter by index, or by name where the index is -1; silence if unknown."""
+    """Send one parameter by index, or by name if the index is -1; no answer if unknown."""
     if message.param_index < 0:
         if message.param_id == HASH_NAME:
             link.send(autopilot.parameters.hash_message())
@@ -44,9 +44,9 @@ def param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Store a value; answered on this link, and a change is broadcast on all."""
+    """Store a value, answer on this link, and broadcast a change to all."""
     if message.param_id == HASH_NAME:
-        link.parameters_left.clear()  # the client's cache is good, it needs no list
+        link.parameters_left.clear()  # the client's cache is valid and needs no list
         return
     store = autopilot.parameters
     result = store.write(message.param_id, message.param_value, message.param_type)
@@ -65,7 +65,7 @@ def list_parameters(autopilot: Autopilot, link: Link) -> None:
 
 
 def mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """There are no items of any kind."""
+    """Answer that there are no mission items."""
     link.send(
         dialect.MAVLink_mission_count_message(
             message.get_srcSystem(), message.get_srcComponent(), 0, message.mission_type
@@ -74,18 +74,18 @@ def mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> Non
 
 
 def mission_count(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """An upload: an empty one is a way to clear, any other is refused."""
+    """Accept an empty upload, which clears the mission, and reject any other."""
     empty = message.count == 0
     _mission_ack(message, link, _MISSION_ACCEPTED if empty else _MISSION_UNSUPPORTED)
 
 
 def mission_clear_all(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """There is nothing left to clear."""
+    """Acknowledge, as there is nothing to clear."""
     _mission_ack(message, link, _MISSION_ACCEPTED)
 
 
 def mission_request(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """No item has any number."""
+    """Answer that the item does not exist."""
     _mission_ack(message, link, _MISSION_INVALID_SEQUENCE)
 
 
@@ -98,7 +98,7 @@ def _mission_ack(message: Any, link: Link, result: int) -> None:
 
 
 def file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """There are no files; the NAK spares a client its retries."""
+    """Answer with a NAK, as there are no files, to stop the client's retries."""
     request = bytes(message.payload)
     sequence, session, opcode = struct.unpack_from("<HBB", request)
     reply = struct.pack(
@@ -113,7 +113,7 @@ def file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def log_request_list(_autopilot: Autopilot, _message: Any, link: Link) -> None:
-    """There are no logs."""
+    """Answer that there are no logs."""
     link.send(dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
 
 
@@ -125,7 +125,7 @@ def timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Echo a ping that asks everybody; its answer carries the asker's ids."""
+    """Echo a broadcast ping with the sender's ids."""
     if message.target_system == 0 and message.target_component == 0:
         system, component = message.get_srcSystem(), message.get_srcComponent()
         link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, system, component))

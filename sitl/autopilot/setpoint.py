@@ -1,7 +1,7 @@
-"""SET_POSITION_TARGET messages into the vehicle's setpoint, by PX4's rules.
+"""Converts SET_POSITION_TARGET messages to the vehicle's setpoint by PX4's rules.
 
 The setpoint is an array (11,): position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad)
-and yaw rate (rad/s); NaN where not controlled.
+and yaw rate (rad/s). NaN means not controlled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Setpoint = NDArray[np.float64]
 _LOCAL_NED = 1
 _BODY_NED = 8
 _ABSOLUTE_ALTITUDE = (0, 5)
-_ABOVE_HOME = (3, 6, 10, 11)  # the ground is flat: above terrain is above home
+_ABOVE_HOME = (3, 6, 10, 11)  # includes above terrain, because the ground is flat
 
 _IGNORE_POSITION = 0x0007
 _IGNORE_VELOCITY = 0x0038
@@ -28,25 +28,25 @@ _FORCE = 0x0200
 _IGNORE_YAW = 0x0400
 _IGNORE_YAW_RATE = 0x0800
 
-_FARTHEST_M = 1e6  # a value beyond it controls nothing: it is no place of this world
+_FARTHEST_M = 1e6  # a larger value counts as not controlled
 _STEEPEST_MPS2 = 100.0
 
 
 class SetpointRefused(Exception):
-    """A setpoint that the autopilot does not take; the words are those of its STATUSTEXT."""
+    """A setpoint that the autopilot rejects. The message is the STATUSTEXT."""
 
 
 def no_setpoint() -> Setpoint:
-    """A setpoint that controls nothing."""
+    """Return a setpoint that controls nothing."""
     return np.full(11, math.nan)
 
 
 def local_setpoint(message: Any, heading_rad: float) -> Setpoint:
-    """The setpoint of a SET_POSITION_TARGET_LOCAL_NED.
+    """Return the setpoint of a SET_POSITION_TARGET_LOCAL_NED.
 
     Args:
-        message: the message; frames LOCAL_NED, and BODY_NED turned by the heading.
-        heading_rad: of the vehicle now, from north.
+        message: Message with frame LOCAL_NED, or BODY_NED, which is rotated by the heading.
+        heading_rad: Present heading of the vehicle from north.
 
     Raises:
         SetpointRefused: the frame or the type mask is not supported.
@@ -56,7 +56,7 @@ def local_setpoint(message: Any, heading_rad: float) -> Setpoint:
     if frame not in (_LOCAL_NED, _BODY_NED):
         raise SetpointRefused(f"{name} coordinate frame {frame} unsupported")
     if frame == _BODY_NED:
-        mask |= _IGNORE_POSITION  # PX4 takes a position in the local frame only
+        mask |= _IGNORE_POSITION  # PX4 accepts positions in the local frame only
     _check_mask(name, mask)
     out = no_setpoint()
     _fill_motion(out, message, mask)
@@ -68,7 +68,7 @@ def local_setpoint(message: Any, heading_rad: float) -> Setpoint:
 
 
 def global_setpoint(message: Any, origin: Origin, home_down_m: float) -> Setpoint:
-    """The setpoint of a SET_POSITION_TARGET_GLOBAL_INT; altitudes above sea or above home.
+    """Return the setpoint of a SET_POSITION_TARGET_GLOBAL_INT, with altitude above sea or home.
 
     Raises:
         SetpointRefused: the frame or the type mask is not supported.
@@ -92,7 +92,7 @@ def _check_mask(name: str, mask: int) -> None:
     position = mask & _IGNORE_POSITION != _IGNORE_POSITION
     velocity = mask & _IGNORE_VELOCITY != _IGNORE_VELOCITY
     acceleration = mask & _IGNORE_ACCELERATION != _IGNORE_ACCELERATION
-    if acceleration and mask & _FORCE:  # the bit says what the acceleration fields mean
+    if acceleration and mask & _FORCE:  # the bit gives the acceleration fields' meaning
         raise SetpointRefused(f"{name} force not supported")
     if acceleration and not position and not velocity:
         raise SetpointRefused(f"{name} acceleration without velocity not supported")
@@ -112,7 +112,7 @@ def _fill_motion(out: Setpoint, message: Any, mask: int) -> None:
 def _fill(
     out: Setpoint, start: int, values: tuple[float, float, float], ignored: int, limit: float
 ) -> None:
-    """Write the components that the mask does not ignore; NaN and the absurd stay out."""
+    """Write the components that the mask does not ignore, except NaN and huge values."""
     for axis, value in enumerate(values):
         if not ignored >> axis & 1 and abs(value) <= limit:
             out[start + axis] = value

@@ -1,4 +1,4 @@
-"""What telemetry reports, gathered at one stamp."""
+"""State reported by telemetry at one stamp."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass, field
 from sitl.autopilot.commander import Commander
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint, no_setpoint
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 from sitl.geodesy import Origin
 
-UNIX_EPOCH_S = 1_750_000_000  # the unix time of boot: fixed, so that runs repeat
+UNIX_EPOCH_S = 1_750_000_000  # Unix time of boot; fixed, so that runs are repeatable
 
 
 @dataclass(slots=True, kw_only=True)
 class Snapshot:
-    """The state behind every telemetry message; refreshed by the autopilot each tick."""
+    """State behind every telemetry message. The autopilot updates it each tick."""
 
     commander: Commander
     parameters: Parameters
     origin: Origin
-    truth: Truth
+    truth: StateEstimate
     home_ned_m: Vector  # (3,)
     stamp_us: int = 0
     setpoint: Setpoint = field(default_factory=no_setpoint)
@@ -32,12 +32,12 @@ class Snapshot:
 
     @property
     def boot_ms(self) -> int:
-        """Boot clock, ms, wrapping as the wire's 32 bits do."""
+        """Boot clock, ms, with 32-bit wrap-around."""
         return self.stamp_us // 1000 & 0xFFFFFFFF
 
     @property
     def euler_rad(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw from north, z-y-x; computed once a tick."""
+        """Roll, pitch and yaw from north, z-y-x; computed once per tick."""
         if self._euler_us != self.stamp_us:
             w, x, y, z = self.truth.quaternion_frd_ned.tolist()
             self._euler = (
@@ -50,36 +50,36 @@ class Snapshot:
 
     @property
     def heading_deg(self) -> float:
-        """From north, 0 to 360."""
+        """Heading from north, 0 to 360 degrees."""
         return math.degrees(self.euler_rad[2]) % 360.0
 
     def geodetic_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
-        """Latitude and longitude of a local point, 1e-7 degrees."""
+        """Return latitude and longitude of a local point, 1e-7 degrees."""
         latitude, longitude = self.origin.geodetic(north_m, east_m)
         return round(latitude * 1e7), round(longitude * 1e7)
 
     def amsl_m(self, down_m: float) -> float:
-        """Altitude above sea of a local height."""
+        """Return the altitude above sea level of a local height, m."""
         return self.origin.altitude_amsl_m - down_m
 
 
 def clip(value: float, low: int, high: int) -> int:
-    """The nearest whole number that the wire's type holds; 0 for what is no number."""
+    """Return the nearest integer within the limits; 0 for NaN."""
     if math.isnan(value):
         return 0
     return round(min(max(value, low), high))
 
 
 def int16(value: float) -> int:
-    """For an int16 field."""
+    """Clip a value for an int16 field."""
     return clip(value, -32768, 32767)
 
 
 def uint16(value: float) -> int:
-    """For a uint16 field whose 65535 means unknown."""
+    """Clip a value for a uint16 field in which 65535 means unknown."""
     return clip(value, 0, 65534)
 
 
 def int32(value: float) -> int:
-    """For an int32 field."""
+    """Clip a value for an int32 field."""
     return clip(value, -(2**31), 2**31 - 1)

@@ -1,4 +1,4 @@
-"""Telemetry streams: which message goes out on which link, and how often."""
+"""Telemetry streams: messages of each link and their rates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sitl.autopilot.snapshot import Snapshot
 
 Builder = Callable[[Snapshot], Any]
 
-TICK_US = 20_000  # nothing is sent more often than the control loop runs
+TICK_US = 20_000  # period of the control loop, which is the highest rate of any stream
 
 BUILDERS: Mapping[int, Builder] = {
     dialect.MAVLINK_MSG_ID_HEARTBEAT: status.heartbeat,
@@ -40,7 +40,7 @@ BUILDERS: Mapping[int, Builder] = {
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: status.extended_sys_state,
     dialect.MAVLINK_MSG_ID_ODOMETRY: motion.odometry,
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: motion.attitude_quaternion,
-    # Last, because on a lockstep link it closes the tick's batch.
+    # Last, because it ends the tick's batch on a lockstep link.
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: motion.local_position_ned,
 }
 """Every message that can be streamed or requested, in the order of sending."""
@@ -59,11 +59,11 @@ _SLOW: Mapping[str, float] = {
 
 
 class Preset(Enum):
-    """Which default rates a link has."""
+    """Set of default rates of a link."""
 
     ONBOARD = "onboard"  # PX4 v1.17's link to a companion
     GCS = "gcs"  # PX4 v1.17's link to a ground station
-    LOCKSTEP = "lockstep"  # lean: what a companion in lockstep needs
+    LOCKSTEP = "lockstep"  # only the messages that a companion in lockstep needs
 
 
 _RATES_HZ: Mapping[Preset, Mapping[str, float]] = {
@@ -101,7 +101,7 @@ class Streams:
     """The streams of one link.
 
     Args:
-        preset: the rates that a client's "default" means.
+        preset: Default rates of the client.
     """
 
     def __init__(self, preset: Preset) -> None:
@@ -113,12 +113,12 @@ class Streams:
         self._choose_active()
 
     def interval_us(self, message_id: int) -> int | None:
-        """The interval of a message; 0 where it is not streamed, None where it is unknown."""
+        """Return the interval of a message; 0 if it is not streamed, None if unknown."""
         stream = self._streams.get(message_id)
         return None if stream is None else stream.interval_us
 
     def set_interval(self, message_id: int, interval_us: float, stamp_us: int) -> bool:
-        """Set a rate: a negative interval stops, 0 restores the default; False if unknown."""
+        """Set an interval: negative stops, 0 restores the default. Return False if unknown."""
         stream = self._streams.get(message_id)
         if stream is None:
             return False
@@ -133,11 +133,11 @@ class Streams:
         return True
 
     def hasten(self, message_id: int, stamp_us: int) -> None:
-        """Make a streamed message due now, because what it tells has changed."""
+        """Make a streamed message due now, because its contents have changed."""
         self._streams[message_id].due_us = stamp_us
 
     def due(self, stamp_us: int, snapshot: Snapshot) -> list[Any]:
-        """The messages due at a stamp; a stream that fell behind skips what it missed."""
+        """Return the messages due at a stamp. A late stream skips missed messages."""
         messages = []
         for stream in self._active:
             if stream.due_us > stamp_us:

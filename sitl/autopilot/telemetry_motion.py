@@ -1,4 +1,4 @@
-"""Telemetry about where the vehicle is and how it moves."""
+"""Telemetry of position and motion."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def attitude_quaternion(s: Snapshot) -> Any:
 
 
 def global_position_int(s: Snapshot) -> Any | None:
-    """GLOBAL_POSITION_INT, once the estimator has a global position."""
+    """Return GLOBAL_POSITION_INT once the estimator has a global position."""
     if not s.commander.has_global_position:
         return None
     north, east, down = s.truth.position_ned_m.tolist()
@@ -51,7 +51,7 @@ def global_position_int(s: Snapshot) -> Any | None:
 
 
 def gps_raw_int(s: Snapshot) -> Any:
-    """GPS_RAW_INT: no fix at first, then a good one."""
+    """Return GPS_RAW_INT: no fix at first, then a good one."""
     north, east, down = s.truth.position_ned_m.tolist()
     vn, ve, _ = s.truth.velocity_ned_mps.tolist()
     if not s.commander.has_gps_fix:
@@ -78,7 +78,7 @@ def vfr_hud(s: Snapshot) -> Any:
 
 
 def altitude(s: Snapshot) -> Any:
-    """ALTITUDE; the ground is flat at the origin's height."""
+    """Return ALTITUDE. The ground is flat at the origin's height."""
     down = float(s.truth.position_ned_m[2])
     amsl = s.amsl_m(down)
     return dialect.MAVLink_altitude_message(
@@ -88,7 +88,7 @@ def altitude(s: Snapshot) -> Any:
 
 
 def odometry(s: Snapshot) -> Any:
-    """ODOMETRY: pose in local NED, velocity in the body's FRD."""
+    """Return ODOMETRY: pose in local NED, velocity in the body's FRD."""
     w, x, y, z = quaternion = s.truth.quaternion_frd_ned.tolist()
     vn, ve, vd = s.truth.velocity_ned_mps.tolist()
     forward = (1 - 2 * (y * y + z * z)) * vn + 2 * (x * y + w * z) * ve + 2 * (x * z - w * y) * vd
@@ -102,7 +102,7 @@ def odometry(s: Snapshot) -> Any:
 
 
 def highres_imu(s: Snapshot) -> Any:
-    """HIGHRES_IMU: specific force and rates in FRD; no magnetometer is simulated."""
+    """Return HIGHRES_IMU: specific force and rates in FRD, without a magnetometer."""
     w, x, y, z = s.truth.quaternion_frd_ned.tolist()
     an, ae, ad = s.truth.acceleration_ned_mps2.tolist()
     ad -= _GRAVITY_MPS2
@@ -120,7 +120,7 @@ def highres_imu(s: Snapshot) -> Any:
 
 
 def position_target_local_ned(s: Snapshot) -> Any:
-    """POSITION_TARGET_LOCAL_NED: the setpoint in force, as PX4 echoes it."""
+    """Return POSITION_TARGET_LOCAL_NED: the active setpoint, as in PX4."""
     values = s.setpoint.tolist()
     mask = sum(
         bits for start, bits in _ZERO_MASKS if all(map(math.isnan, values[start : start + 3]))
@@ -132,7 +132,7 @@ def position_target_local_ned(s: Snapshot) -> Any:
 
 
 def attitude_target(s: Snapshot) -> Any:
-    """ATTITUDE_TARGET: the attitude flown and the mean motor command as thrust."""
+    """Return ATTITUDE_TARGET: the present attitude and the mean motor command as thrust."""
     commands = s.truth.motor_commands.tolist()
     return dialect.MAVLink_attitude_target_message(
         s.boot_ms, 0, s.truth.quaternion_frd_ned.tolist(), *s.truth.rates_frd_radps.tolist(),
@@ -141,7 +141,7 @@ def attitude_target(s: Snapshot) -> Any:
 
 
 def servo_output_raw(s: Snapshot) -> Any:
-    """SERVO_OUTPUT_RAW: motor commands as 1000 to 2000 us; 900 when stopped, as PX4 does."""
+    """Return SERVO_OUTPUT_RAW: motor commands of 1000 to 2000 us, 900 if stopped, as in PX4."""
     pulses = [
         uint16(1000.0 + 1000.0 * command) if s.motors_on else 900
         for command in s.truth.motor_commands.tolist()

@@ -1,4 +1,4 @@
-"""Telemetry about what the vehicle is, what state it is in and what it has."""
+"""Telemetry of identity, status and capabilities."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _QUADROTOR = 2
 _PX4 = 12
 _PREARM_CHECK = 1 << 28
 _GPS = 0x20
-_PRESENT = 0x0300402F  # as PX4 v1.17 SITL reports them
+_PRESENT = 0x0300402F  # as in PX4 v1.17 SITL
 _ENABLED = 0x0301402F
 _HEALTH = 0x0320C83F
 
-# MAV_PROTOCOL_CAPABILITY, only what is here: MISSION_INT, COMMAND_INT, PARAM_ENCODE_BYTEWISE,
+# Implemented MAV_PROTOCOL_CAPABILITY: MISSION_INT, COMMAND_INT, PARAM_ENCODE_BYTEWISE,
 # SET_POSITION_TARGET_GLOBAL_INT, SET_POSITION_TARGET_LOCAL_NED, FLIGHT_TERMINATION, MAVLINK2.
 _CAPABILITIES = 4 | 8 | 16 | 256 | 128 | 2048 | 8192
 _FLIGHT_VERSION = 0x011100FF  # 1.17.0 official
@@ -41,7 +41,7 @@ def heartbeat(s: Snapshot) -> Any:
 
 
 def sys_status(s: Snapshot) -> Any:
-    """SYS_STATUS: PREARM_CHECK shows in the health bits only, as a PX4 does it."""
+    """Return SYS_STATUS. PREARM_CHECK appears in the health bits only, as in PX4."""
     gps = _GPS if s.commander.has_gps_fix else 0
     health = _HEALTH & ~_GPS | gps
     if s.commander.can_arm:
@@ -60,7 +60,7 @@ def extended_sys_state(s: Snapshot) -> Any:
 
 
 def battery_status(s: Snapshot) -> Any:
-    """BATTERY_STATUS: the cells share the voltage equally."""
+    """Return BATTERY_STATUS with equal cell voltages."""
     truth = s.truth
     cells = min(max(int(s.parameters.value("BAT1_N_CELLS")), 1), 10)
     each = uint16(truth.battery_voltage_v / cells * 1e3)
@@ -72,7 +72,7 @@ def battery_status(s: Snapshot) -> Any:
 
 
 def home_position(s: Snapshot) -> Any | None:
-    """HOME_POSITION, once there is one."""
+    """Return HOME_POSITION once it is known."""
     if not s.commander.has_gps_fix:
         return None
     north, east, down = s.home_ned_m.tolist()
@@ -83,7 +83,7 @@ def home_position(s: Snapshot) -> Any | None:
 
 
 def gps_global_origin(s: Snapshot) -> Any | None:
-    """GPS_GLOBAL_ORIGIN, once there is one."""
+    """Return GPS_GLOBAL_ORIGIN once it is known."""
     if not s.commander.has_gps_fix:
         return None
     altitude_mm = round(s.origin.altitude_amsl_m * 1e3)
@@ -106,17 +106,17 @@ def system_time(s: Snapshot) -> Any:
 
 
 def timesync_request(s: Snapshot) -> Any:
-    """TIMESYNC: asks the peer for its time."""
+    """Return TIMESYNC, which requests the peer's time."""
     return dialect.MAVLink_timesync_message(0, s.stamp_us * 1000)
 
 
 def ping_request(s: Snapshot) -> Any:
-    """PING: asks every peer for an echo."""
+    """Return PING, which requests an echo from every peer."""
     return dialect.MAVLink_ping_message(s.stamp_us, s.stamp_us // 1_000_000 & 0xFFFFFFFF, 0, 0)
 
 
 def mission_current(_: Snapshot) -> Any:
-    """MISSION_CURRENT: there is no mission."""
+    """Return MISSION_CURRENT without a mission."""
     return dialect.MAVLink_mission_current_message(0, 0, _MISSION_NO_MISSION, 0)
 
 
@@ -130,10 +130,10 @@ def estimator_status(s: Snapshot) -> Any:
 
 
 def vibration(s: Snapshot) -> Any:
-    """VIBRATION: none is simulated."""
+    """Return VIBRATION with zeros, as vibration is not simulated."""
     return dialect.MAVLink_vibration_message(s.stamp_us, 0.0, 0.0, 0.0, 0, 0, 0)
 
 
 def consumed_mah(current_a: float, elapsed_s: float) -> float:
-    """Charge drawn in a time, mAh."""
+    """Return the consumed charge, mAh."""
     return max(current_a, 0.0) * elapsed_s / 3.6

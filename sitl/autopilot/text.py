@@ -1,4 +1,4 @@
-"""STATUSTEXT as PX4 sends it: a trailing TAB, and chunks of 50 bytes under one id."""
+"""STATUSTEXT in PX4's form: a trailing TAB, and chunks of 50 bytes with one id."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mavfi_cli.link import texts
 
 
 class Severity(IntEnum):
-    """MAV_SEVERITY, the levels in use."""
+    """Used levels of MAV_SEVERITY."""
 
     EMERGENCY = 0
     CRITICAL = 2
@@ -19,8 +19,8 @@ class Severity(IntEnum):
 
 
 def text_messages(severity: int, text: str, text_id: int) -> Iterator[Any]:
-    """The STATUSTEXT messages of one text.
+    """Yield the STATUSTEXT messages of one text.
 
-    The TAB tells clients which also take the events interface that the same words come there.
+    The TAB tells clients of the events interface that the same text arrives there, too.
     """
     yield from texts.text_messages(severity, text.encode("ascii", "replace") + b"\t", text_id)

@@ -1,4 +1,4 @@
-"""What the autopilot reads of the vehicle: a perfect estimator."""
+"""The vehicle state that the autopilot reads, as from a perfect estimator."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 
-class Truth(Protocol):
-    """The vehicle's state at one stamp; NED and FRD, SI units."""
+class StateEstimate(Protocol):
+    """State of the vehicle at one stamp, in NED and FRD, SI units."""
 
     @property
     def position_ned_m(self) -> Vector:
-        """Of the centre of mass (3,)."""
+        """Position of the centre of mass (3,)."""
 
     @property
     def velocity_ned_mps(self) -> Vector:
@@ -23,11 +23,11 @@ class Truth(Protocol):
 
     @property
     def acceleration_ned_mps2(self) -> Vector:
-        """(3,), gravity not included."""
+        """Acceleration (3,) without gravity."""
 
     @property
     def quaternion_frd_ned(self) -> Vector:
-        """(4,) w x y z, body FRD -> NED."""
+        """Attitude (4,) w x y z, body FRD -> NED."""
 
     @property
     def rates_frd_radps(self) -> Vector:
@@ -35,15 +35,15 @@ class Truth(Protocol):
 
     @property
     def motor_commands(self) -> Vector:
-        """(4,) 0..1."""
+        """Motor commands (4,), 0..1."""
 
     @property
     def on_ground(self) -> bool:
-        """Whether a leg carries weight."""
+        """True if a landing leg carries weight."""
 
     @property
     def battery_voltage_v(self) -> float:
-        """At the terminals."""
+        """Voltage at the terminals."""
 
     @property
     def battery_current_a(self) -> float:
@@ -51,4 +51,4 @@ class Truth(Protocol):
 
     @property
     def battery_remaining(self) -> float:
-        """Charge left, 0..1."""
+        """Remaining charge, 0..1."""

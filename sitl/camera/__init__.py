@@ -1,1 +1,1 @@
-"""The depth camera: ray casting against the world's boxes, served as a MAVLink camera."""
+"""The depth camera: casts rays against the world's boxes and serves a MAVLink camera."""

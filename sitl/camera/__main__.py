@@ -1,4 +1,4 @@
-"""`python -m sitl.camera`: the depth camera for a foreign autopilot."""
+"""`python -m sitl.camera`: runs the depth camera for a foreign autopilot."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The command line of the camera on its own."""
+"""Command line of the stand-alone camera."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def _size(_ctx: click.Context, _param: click.Parameter, value: str) -> tuple[int
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--world", "name", default="dense", show_default=True, metavar="NAME|FILE")
 @click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True)
-@click.option("--start", callback=_triple, metavar="X,Y,Z", help="As for the world, ENU m.")
-@click.option("--goal", callback=_triple, metavar="X,Y,Z", help="As for the world, ENU m.")
+@click.option("--start", callback=_triple, metavar="X,Y,Z", help="Start in the world, ENU m.")
+@click.option("--goal", callback=_triple, metavar="X,Y,Z", help="Goal in the world, ENU m.")
 @click.option(
     "--origin",
     callback=_triple,
     metavar="X,Y,Z",
-    help="Where in the world the autopilot's local origin is, ENU m  [the world's start].",
+    help="Position of the autopilot's local origin in the world, ENU m  [the world's start].",
 )
 @click.option(
     "--link",
@@ -61,7 +61,7 @@ def _size(_ctx: click.Context, _param: click.Parameter, value: str) -> tuple[int
     default=["udpin:127.0.0.1:14540"],
     show_default=True,
     metavar="URL",
-    help="An autopilot, or a client; repeatable: frames are passed on between all links.",
+    help="Endpoint of an autopilot or client; repeatable. Frames are forwarded between all links.",
 )
 @click.option("--size", callback=_size, default="64x48", show_default=True, metavar="COLSxROWS")
 @click.option("--rate", "rate_hz", type=float, default=10.0, show_default=True, help="Hz.")
@@ -72,10 +72,12 @@ def _size(_ctx: click.Context, _param: click.Parameter, value: str) -> tuple[int
     default="0.1,0,0",
     show_default=True,
     metavar="F,L,U",
-    help="The lens from the vehicle's position: forward, left, up in m.",
+    help="Offset of the lens from the vehicle's position: forward, left, up in m.",
 )
-@click.option("--passphrase-file", type=click.Path(path_type=Path), help="Sign with its content.")
-@click.option("--allow-unsigned", is_flag=True, help="Unsigned beyond loopback, too.")
+@click.option(
+    "--passphrase-file", type=click.Path(path_type=Path), help="File with the signing passphrase."
+)
+@click.option("--allow-unsigned", is_flag=True, help="Allow unsigned links beyond loopback.")
 def camera(
     name: str,
     seed: int,
@@ -90,11 +92,11 @@ def camera(
     passphrase_file: Path | None,
     allow_unsigned: bool,
 ) -> None:
-    """A depth camera for an autopilot that has no world, such as PX4 or ArduPilot SITL.
+    """Run a depth camera for an autopilot without a world, such as PX4 or ArduPilot SITL.
 
-    It takes the vehicle's pose from ATTITUDE_QUATERNION (or ATTITUDE) and LOCAL_POSITION_NED, asks
-    for them where they do not come, and serves the frames of a MAVLink camera (component 100) to
-    everyone on its links, once a client has sent IMAGE_START_CAPTURE.
+    The camera reads the vehicle's pose from ATTITUDE_QUATERNION (or ATTITUDE) and
+    LOCAL_POSITION_NED, and requests these messages if they do not arrive. It sends frames as a
+    MAVLink camera (component 100) on all links once a client has sent IMAGE_START_CAPTURE.
     """
     world = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
     forward, left, up = mount
@@ -140,7 +142,7 @@ def _run_until_stopped(station: Station) -> None:
     stopped: list[int] = []
 
     def stop(number: int, _frame: Any) -> None:
-        """Note the signal; the loop ends after its turn."""
+        """Note the signal. The loop ends after its present iteration."""
         stopped.append(number)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -156,7 +158,7 @@ def _run_until_stopped(station: Station) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run it: 0 stopped by the user, 1 a known error in one line, 2 usage."""
+    """Run the command. Return 0 if stopped by the user, 1 for a known error, 2 for wrong usage."""
     try:
         camera.main(args=arguments, prog_name="python -m sitl.camera", standalone_mode=False)
     except click.ClickException as error:

@@ -1,7 +1,7 @@
-"""The depth camera as a MAVLink camera component: commands in, frames out.
+"""The depth camera as a MAVLink camera component that takes commands and sends frames.
 
-It has no clock and no socket: `handle` answers a message, `poll` says what is due at a stamp, so
-the same stamps and messages give the same bytes.
+It has no clock and no socket. `handle` answers a message, and `poll` returns the messages due at a
+stamp. The same stamps and messages give the same bytes.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from mavfi_cli.link.codec import dialect
 from sitl.camera import messages
 from sitl.camera.depth import render_depth
 from sitl.camera.geometry import CameraPose, Optics, camera_pose
-from sitl.camera.schedule import Schedule
+from sitl.camera.schedule import PeriodicSchedule
 from sitl.geodesy import Origin
 
 Vector = NDArray[np.float64]
-Message = Any  # of pymavlink's `common` dialect
+Message = Any  # a message of pymavlink's `common` dialect
 
 COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
-MAX_RATE_HZ = 50.0  # one frame a control tick
+MAX_RATE_HZ = 50.0  # one frame per control tick
 _HEARTBEAT_S = 1.0
 _HOME = Origin()
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -43,16 +43,16 @@ class Camera:
 
     Args:
         world_boxes: (n, 6) xmin ymin zmin xmax ymax zmax, ENU m.
-        columns: image width, pixels.
-        rows: image height, pixels.
-        hfov_rad: horizontal field of view, rad.
-        mount_offset_flu_m: optical centre from the vehicle's position; forward, left, up.
-        rate_hz: frames a second where a client names no interval; at most 50.
-        system: the vehicle's MAVLink system id; commands to others are not heard.
-        origin: where on earth the world's origin is, for the position fields.
+        columns: Image width, pixels.
+        rows: Image height, pixels.
+        hfov_rad: Horizontal field of view, rad.
+        mount_offset_flu_m: Offset of the optical centre from the vehicle's position.
+        rate_hz: Default frame rate, at most 50 Hz.
+        system: MAVLink system id of the vehicle. Commands for other systems are ignored.
+        origin: Geographic origin of the world, for the position fields.
 
     Raises:
-        ConfigError: a size, field of view or rate that cannot be.
+        ConfigError: The size, field of view or rate is invalid.
     """
 
     def __init__(
@@ -74,18 +74,18 @@ class Camera:
             columns=columns, rows=rows, hfov_rad=hfov_rad, mount_offset_flu_m=(forward, left, up)
         )
         self.system = system
-        self.images = 0  # taken since boot; also the next image's index
+        self.images = 0  # images since boot, which is also the next index
         self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
         self._origin = origin
         self._default_interval_s = 1.0 / rate_hz
-        # Loads the compiled renderer now: in real time the first frame must not stall the flight.
+        # Load the compiled renderer now, so that the first frame does not stall a real-time flight.
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
         self._pose: CameraPose | None = None
         self._stamp_s = 0.0
-        self._heartbeat = Schedule(interval_s=_HEARTBEAT_S)
-        self._frames: Schedule | None = None
-        self._frames_left = 0  # 0: no end
-        self._streams: dict[int, Schedule] = {}
+        self._heartbeat = PeriodicSchedule(interval_s=_HEARTBEAT_S)
+        self._frames: PeriodicSchedule | None = None
+        self._frames_left = 0  # 0: unlimited
+        self._streams: dict[int, PeriodicSchedule] = {}
         self._commands: dict[int, Callable[[Message], int]] = {
             dialect.MAV_CMD_IMAGE_START_CAPTURE: self._start_capture,
             dialect.MAV_CMD_IMAGE_STOP_CAPTURE: self._stop_capture,
@@ -95,18 +95,18 @@ class Camera:
 
     @property
     def capturing(self) -> bool:
-        """Whether frames are being streamed."""
+        """True while frames are streamed."""
         return self._frames is not None
 
     def handle(self, message: Message) -> list[Message]:
-        """Answer one message; nothing where it is not for a camera."""
+        """Return the answer to a message, or nothing if it is not for a camera."""
         kind = message.get_type()
         if kind not in ("COMMAND_LONG", "COMMAND_INT") or message.target_system != self.system:
             return []
         if message.target_component == COMPONENT_ID:
             return self._command(message)
         if message.target_component == dialect.MAV_COMP_ID_ALL:
-            # The autopilot hears it too: refusing what is meant for it would confuse the sender.
+            # The autopilot gets the command, too. A refusal here would confuse the sender.
             answers = self._command(message)
             accepted = answers[-1].result == dialect.MAV_RESULT_ACCEPTED
             return answers if accepted else []
@@ -115,12 +115,12 @@ class Camera:
     def poll(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
     ) -> list[Message]:
-        """What is due at a stamp: heartbeat, streams, and a frame from the vehicle's pose.
+        """Return the messages due at a stamp: heartbeat, streams, and a frame from the pose.
 
         Args:
-            stamp_s: the vehicle's boot clock; a step back by a second is taken as a reboot.
-            position_enu_m: (3,) of the vehicle.
-            quaternion_flu_enu: (4,) of the vehicle.
+            stamp_s: Boot clock of the vehicle, s. A step back by 1 s counts as a reboot.
+            position_enu_m: Position of the vehicle (3,).
+            quaternion_flu_enu: Attitude of the vehicle (4,).
         """
         if stamp_s < self._stamp_s - 1.0:
             self._reboot()
@@ -136,7 +136,7 @@ class Camera:
         return due
 
     def idle(self) -> list[Message]:
-        """A heartbeat for while there is no pose to poll with."""
+        """Return a heartbeat to send while there is no pose."""
         return [messages.heartbeat()]
 
     def _reboot(self) -> None:
@@ -163,7 +163,7 @@ class Camera:
         return frame
 
     def _command(self, message: Message) -> list[Message]:
-        """The answer to a command: what was asked for, then the acknowledgement."""
+        """Return the answer to a command: requested messages, then the acknowledgement."""
         number = int(message.command)
         answers: list[Message] = []
         if number == dialect.MAV_CMD_REQUEST_MESSAGE or number in _LEGACY_REQUESTS:
@@ -180,7 +180,7 @@ class Camera:
         return [*answers, ack]
 
     def _request(self, message_id: int | None) -> Message | None:
-        """The message of an id as of now; None where the camera has no such thing."""
+        """Return the present message with an id; None if the camera does not send it."""
         stamp_s = self._stamp_s
         if message_id == dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION:
             return messages.information(self.optics, stamp_s)
@@ -196,14 +196,14 @@ class Camera:
         return None
 
     def _start_capture(self, message: Message) -> int:
-        """IMAGE_START_CAPTURE: param2 interval, s (0: the camera's own), param3 how many."""
+        """Handle IMAGE_START_CAPTURE: param2 is the interval, s (0: default), param3 the count."""
         interval_s, count = float(message.param2), _whole(message.param3)
         if count is None or count < 0 or interval_s < 0.0 or math.isinf(interval_s):
             return int(dialect.MAV_RESULT_DENIED)
         if math.isnan(interval_s) or interval_s == 0.0:
             interval_s = self._default_interval_s
-        interval_s = round(interval_s, 6)  # the wire's float32 of 0.1 would drift against ticks
-        self._frames = Schedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
+        interval_s = round(interval_s, 6)  # a float32 of 0.1 would drift against ticks
+        self._frames = PeriodicSchedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
         self._frames_left = count
         return int(dialect.MAV_RESULT_ACCEPTED)
 
@@ -216,7 +216,7 @@ class Camera:
         return int(dialect.MAV_RESULT_ACCEPTED if photo else dialect.MAV_RESULT_DENIED)
 
     def _set_interval(self, message: Message) -> int:
-        """SET_MESSAGE_INTERVAL for what can be requested; 0 and -1 both mean: on request only."""
+        """Handle SET_MESSAGE_INTERVAL for known messages; 0 and -1 both mean on request only."""
         message_id, interval_us = _whole(message.param1), _whole(message.param2)
         known = message_id is not None and self._request(message_id) is not None
         if not known or interval_us is None:
@@ -225,12 +225,12 @@ class Camera:
         self._streams.pop(message_id, None)
         if interval_us > 0:
             interval_s = max(interval_us / 1e6, 1.0 / MAX_RATE_HZ)
-            self._streams[message_id] = Schedule(interval_s=interval_s)
+            self._streams[message_id] = PeriodicSchedule(interval_s=interval_s)
         return int(dialect.MAV_RESULT_ACCEPTED)
 
 
 def _whole(value: float) -> int | None:
-    """A whole number that came in a float parameter; NaN, the wire's "not given", is 0."""
+    """Return an integer sent in a float parameter; NaN, which means not given, is 0."""
     if math.isnan(value):
         return 0
     return round(value) if abs(value) < 2**31 else None

@@ -1,18 +1,18 @@
-"""Planar depth of a world of boxes, as a depth camera's 8-bit image.
+"""Renders the planar depth of a world of boxes as an 8-bit image.
 
-Model (AirSim's DepthPlanner in the reference, facts 4.2): a pinhole camera looking along its
-forward axis, square pixels, depth measured along the optical axis, 0.1 m a grey level rounded
-down, and 255 (25.5 m) for nothing within range.
+The model is a pinhole camera with square pixels that looks along its forward axis, as AirSim's
+DepthPlanner in MAVBench. Depth is measured along the optical axis and rounded down to 0.1 m per
+grey level. The level 255 (25.5 m) means that nothing is in range.
 
 The ray of pixel (row, column) passes through the pixel's centre. In the camera frame (forward,
 left, up), with focal length f = (columns / 2) / tan(hfov / 2) in pixels:
 
     direction = (1, (columns / 2 - column - 0.5) / f, (rows / 2 - row - 0.5) / f)
 
-so the ray's parameter is the planar depth itself.
+so the ray's parameter is the planar depth.
 
-Each box is projected first: its part in front of the camera bounds the pixels that can see it,
-and only these are tested, so a frame costs what it shows.
+Each box is projected first. Its part in front of the camera bounds the pixels that can see it, and
+only these are tested, so the cost of a frame depends on the visible boxes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _TOUCHING_M = 1e-3
 _INFINITY = math.inf
 _EDGES = np.array(
     [[a, a | bit] for bit in (1, 2, 4) for a in range(8) if not a & bit], dtype=np.int64
-)  # (12, 2) corners of a box that share an edge; bit 0 is x, 1 is y, 2 is z
+)  # (12, 2) pairs of corners that share an edge; bit 0 is x, 1 is y, 2 is z
 
 
 def render_depth(
@@ -49,20 +49,20 @@ def render_depth(
     hfov_rad: float,
     max_range_m: float = MAX_RANGE_M,
 ) -> Image:
-    """The depth image (rows, columns), uint8, 0.1 m a level, 255 where nothing is in range.
+    """Render a depth image (rows, columns), uint8, 0.1 m per level, 255 if nothing is in range.
 
     Args:
-        boxes_enu_m: (n, 6) xmin ymin zmin xmax ymax zmax; the ground z = 0 is always there.
-        position_enu_m: (3,) the optical centre. Inside a box, or under the ground and looking
-            down, everything is at depth zero. A pose that is not finite sees nothing.
-        quaternion_flu_enu: (4,) unit, w x y z, camera forward-left-up to ENU.
-        columns: image width, at least 1.
-        rows: image height, at least 1.
-        hfov_rad: horizontal field of view, between 0 and pi, rad.
-        max_range_m: planar depth from which on nothing is seen; 25.5 m at most.
+        boxes_enu_m: Boxes (n, 6) xmin ymin zmin xmax ymax zmax. The ground z = 0 always exists.
+        position_enu_m: Optical centre (3,). The depth is zero everywhere if it is inside a box, or
+            below the ground and looking down. A pose that is not finite sees nothing.
+        quaternion_flu_enu: Unit quaternion (4,) w x y z, camera forward-left-up to ENU.
+        columns: Image width, at least 1.
+        rows: Image height, at least 1.
+        hfov_rad: Horizontal field of view, between 0 and pi, rad.
+        max_range_m: Planar depth limit of the range, at most 25.5 m.
 
     Raises:
-        ValueError: an image size or field of view that no camera has.
+        ValueError: The image size or field of view is invalid.
     """
     if columns < 1 or rows < 1 or not 0.0 < hfov_rad < math.pi:
         raise ValueError(f"no camera has {columns} x {rows} pixels and {hfov_rad} rad")
@@ -76,7 +76,7 @@ def render_depth(
 
 
 def focal_length_px(columns: int, hfov_rad: float) -> float:
-    """Focal length in pixels of a camera with square pixels."""
+    """Return the focal length in pixels of a camera with square pixels."""
     return columns / 2.0 / math.tan(hfov_rad / 2.0)
 
 
@@ -140,7 +140,7 @@ def _corners_in_camera(box: Vector, position: Vector, rotation: Vector, corners:
 
 @compiled
 def _touches(box: Vector, position: Vector) -> bool:
-    """Whether the optical centre is in the box, or so near that its projection degenerates."""
+    """Return True if the optical centre is in the box or too near for its projection."""
     for axis in range(3):
         if position[axis] < box[axis] - _TOUCHING_M or position[axis] > box[axis + 3] + _TOUCHING_M:
             return False
@@ -155,10 +155,10 @@ def _window(
     shape: tuple[int, int],
     window: NDArray[np.int64],
 ) -> None:
-    """Rows and columns (first, end, first, end) that can see the box; a pixel to spare.
+    """Return the rows and columns (first, end, first, end) that can see the box, plus a pixel.
 
-    The box's part beyond the near plane is convex, with corners in front and cut edges as its
-    vertices, so their projections bound it.
+    The part of the box beyond the near plane is convex. Its vertices are the corners in front and
+    the cut edges, so their projections bound it.
     """
     rows, columns = shape
     top, bottom, first, last = _INFINITY, -_INFINITY, _INFINITY, -_INFINITY

@@ -1,4 +1,4 @@
-"""Where the camera is: optics, mount and the pose it took a picture from."""
+"""Geometry of the camera: optics, mount and pose."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ MAX_SIDE_PX = 2048
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Optics:
-    """A pinhole camera with square pixels, looking forward from where it is mounted.
+    """A pinhole camera with square pixels that looks forward.
 
     Raises:
-        ConfigError: an image size or a field of view that no camera has.
+        ConfigError: The image size or field of view is invalid.
     """
 
     columns: int = 64
@@ -49,7 +49,7 @@ class Optics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraPose:
-    """The camera at one stamp."""
+    """Pose of the camera at one stamp."""
 
     stamp_s: float
     position_enu_m: Vector  # (3,) optical centre
@@ -57,7 +57,7 @@ class CameraPose:
 
     @property
     def quaternion_frd_ned(self) -> list[float]:
-        """The attitude as MAVLink has it, w x y z."""
+        """Attitude in MAVLink's frames, w x y z."""
         values: list[float] = flu_enu_from_frd_ned(self.quaternion_flu_enu).tolist()
         return values
 
@@ -65,7 +65,7 @@ class CameraPose:
 def camera_pose(
     optics: Optics, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
 ) -> CameraPose:
-    """The camera's pose on a vehicle at a position (3,) with an attitude (4,)."""
+    """Return the camera's pose on a vehicle at a position (3,) with an attitude (4,)."""
     offset = rotation_matrix(quaternion_flu_enu) @ np.array(optics.mount_offset_flu_m)
     return CameraPose(
         stamp_s=stamp_s,

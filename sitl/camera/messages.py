@@ -1,8 +1,8 @@
-"""The camera's MAVLink messages, built from what it knows; no state, no clock.
+"""Builds the camera's MAVLink messages, without state or clock.
 
-A frame on the wire is CAMERA_IMAGE_CAPTURED (when, from where, and the checksum of the pixels),
-DATA_TRANSMISSION_HANDSHAKE (size) and ENCAPSULATED_DATA (253 bytes each), which is MAVLink's
-image transmission protocol (https://mavlink.io/en/services/image_transmission.html).
+A frame consists of CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels),
+DATA_TRANSMISSION_HANDSHAKE (size) and ENCAPSULATED_DATA (253 bytes each). This is MAVLink's image
+transmission protocol (https://mavlink.io/en/services/image_transmission.html).
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from sitl.camera.geometry import CameraPose, Optics
 from sitl.geodesy import Origin
 
 PAYLOAD_BYTES = 253
-_PIXEL_PITCH_MM = 0.01  # any would do: field of view = 2 atan(sensor / 2 / focal length)
+_PIXEL_PITCH_MM = 0.01  # arbitrary: field of view = 2 atan(sensor / 2 / focal length)
 _UNKNOWN = 0x7FFF_FFFF
 _IMAGE_MODE = 0
 _VENDOR, _MODEL = b"mavfi", b"depth8"
 
 
 def boot_ms(stamp_s: float) -> int:
-    """Milliseconds since boot, as the wire counts them."""
+    """Convert a stamp to MAVLink's milliseconds since boot."""
     return round(stamp_s * 1000.0) & 0xFFFF_FFFF
 
 
 def heartbeat() -> Any:
-    """HEARTBEAT of a camera that works."""
+    """Return the HEARTBEAT of a working camera."""
     return dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_CAMERA, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
     )
 
 
 def information(optics: Optics, stamp_s: float) -> Any:
-    """CAMERA_INFORMATION; focal length and sensor size give the field of view exactly."""
+    """Return CAMERA_INFORMATION. Focal length and sensor size give the exact field of view."""
     return dialect.MAVLink_camera_information_message(
         boot_ms(stamp_s),
         list(_VENDOR.ljust(32, b"\0")),
@@ -55,21 +55,21 @@ def information(optics: Optics, stamp_s: float) -> Any:
 
 
 def settings(stamp_s: float) -> Any:
-    """CAMERA_SETTINGS: photo mode, no zoom, no focus."""
+    """Return CAMERA_SETTINGS: photo mode, no zoom, no focus."""
     return dialect.MAVLink_camera_settings_message(
         boot_ms(stamp_s), _IMAGE_MODE, math.nan, math.nan
     )
 
 
 def storage_information(stamp_s: float) -> Any:
-    """STORAGE_INFORMATION: none, frames go out at once."""
+    """Return STORAGE_INFORMATION without storage, as frames are sent at once."""
     return dialect.MAVLink_storage_information_message(
         boot_ms(stamp_s), 1, 0, dialect.STORAGE_STATUS_NOT_SUPPORTED, 0.0, 0.0, 0.0, 0.0, 0.0
     )
 
 
 def capture_status(stamp_s: float, *, interval_s: float | None, images: int) -> Any:
-    """CAMERA_CAPTURE_STATUS; an interval of None: idle."""
+    """Return CAMERA_CAPTURE_STATUS. An interval of None means idle."""
     image_status = 0 if interval_s is None else 3  # idle, or interval set and capturing
     return dialect.MAVLink_camera_capture_status_message(
         boot_ms(stamp_s), image_status, 0, interval_s or 0.0, 0, 0.0, images
@@ -77,7 +77,7 @@ def capture_status(stamp_s: float, *, interval_s: float | None, images: int) -> 
 
 
 def fov_status(optics: Optics, pose: CameraPose, origin: Origin) -> Any:
-    """CAMERA_FOV_STATUS; what the image's middle shows on earth is left unknown."""
+    """Return CAMERA_FOV_STATUS. The geographic position of the image centre is unknown."""
     return dialect.MAVLink_camera_fov_status_message(
         boot_ms(pose.stamp_s),
         *_geodetic_e7_mm(pose, origin),
@@ -91,7 +91,7 @@ def fov_status(optics: Optics, pose: CameraPose, origin: Origin) -> Any:
 
 
 def frame_messages(image: Image, index: int, pose: CameraPose, origin: Origin) -> list[Any]:
-    """One frame (rows, columns) as messages, in the order in which they go out."""
+    """Return the messages of one frame (rows, columns) in the order of sending."""
     rows, columns = image.shape
     pixels = image.tobytes()
     captured = dialect.MAVLink_camera_image_captured_message(

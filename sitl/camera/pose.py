@@ -1,4 +1,4 @@
-"""The pose of a foreign autopilot's vehicle, from its MAVLink messages."""
+"""Tracks the pose of a foreign autopilot's vehicle from its MAVLink messages."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _LONGEST_EXTRAPOLATION_S = 0.5
 
 
 class PoseTracker:
-    """Joins attitude and local position, which come at stamps of their own.
+    """Combines attitude and local position, which have different stamps.
 
-    The pose is given at each new attitude; the newest position is carried on to it with its
-    velocity, for half a second at most, so that a slow position stream does not smear frames.
+    There is a pose at each new attitude. The newest position is extrapolated to its stamp with the
+    velocity, for 0.5 s at most, so that a slow position stream does not blur frames.
 
     Args:
-        origin_enu_m: (3,) where in the world the autopilot's local origin is.
+        origin_enu_m: Autopilot's local origin in the world (3,).
     """
 
     def __init__(self, origin_enu_m: Vector) -> None:
@@ -34,16 +34,16 @@ class PoseTracker:
 
     @property
     def has_position(self) -> bool:
-        """Whether LOCAL_POSITION_NED has come."""
+        """True once LOCAL_POSITION_NED has arrived."""
         return self._position is not None
 
     @property
     def has_attitude(self) -> bool:
-        """Whether ATTITUDE_QUATERNION has come; ATTITUDE alone will do, but is asked for better."""
+        """True once ATTITUDE_QUATERNION has arrived, which is preferred to ATTITUDE."""
         return self._has_quaternions
 
     def take(self, message: Any) -> bool:
-        """Take a message; whether there is a new pose. Values that are not finite are skipped."""
+        """Handle a message with finite values. Return True if there is a new pose."""
         kind = message.get_type()
         if kind == "LOCAL_POSITION_NED":
             position = np.array([message.x, message.y, message.z], dtype=np.float64)
@@ -72,10 +72,10 @@ class PoseTracker:
         return quaternion / length if math.isfinite(length) and length > 0.5 else None
 
     def pose(self) -> tuple[float, Vector, Vector]:
-        """Stamp, s, position (3,) in the world and attitude (4,) FLU to ENU, after `take` said yes.
+        """Return stamp, s, position (3,) in the world and attitude (4,) FLU to ENU.
 
         Raises:
-            LookupError: there is none yet.
+            LookupError: There is no pose yet.
         """
         if self._position is None or self._attitude is None:
             raise LookupError("no pose yet")

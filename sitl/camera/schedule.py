@@ -1,17 +1,17 @@
-"""What is due when, by stamps alone."""
+"""Periodic schedule by stamps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-_SLACK_S = 1e-6  # stamps are sums of steps, and interval times count is not
+_SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding errors
 
 
 @dataclass(slots=True, kw_only=True)
-class Schedule:
-    """Due at once, and then every `interval_s` in phase with the first time.
+class PeriodicSchedule:
+    """Due at the first poll and then every `interval_s` in phase with it.
 
-    A poll that comes late does not shift the phase, and what was missed is not made up for.
+    A late poll does not shift the phase. Missed times are skipped.
     """
 
     interval_s: float
@@ -19,7 +19,7 @@ class Schedule:
     _count: int = 0
 
     def due(self, stamp_s: float) -> bool:
-        """Whether it is due at a stamp; answering yes takes the turn."""
+        """Return True if it is due at a stamp, and advance to the next time."""
         if self._first_s is None:
             self._first_s = stamp_s
         elapsed_s = stamp_s - self._first_s + _SLACK_S
@@ -29,5 +29,5 @@ class Schedule:
         return True
 
     def restart(self) -> None:
-        """Due at the next stamp, whatever it is."""
+        """Make it due at the next poll."""
         self._first_s, self._count = None, 0

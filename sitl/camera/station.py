@@ -1,7 +1,7 @@
-"""The depth camera on its own: it takes a foreign autopilot's pose and serves frames.
+"""Stand-alone depth camera: reads a foreign autopilot's pose and serves frames.
 
-With several links it also passes every frame on between them, so that an autopilot on the first
-and a companion on the second hear each other and the camera.
+With several links it also forwards every MAVLink frame between them, so that an autopilot on the
+first and a companion on the second receive each other's messages and the camera's.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Station:
     """Camera, pose and links of one autopilot.
 
     Args:
-        camera: serves the frames; its system id is set to the autopilot's.
-        tracker: makes poses of the autopilot's messages.
-        links: open transports; the autopilot may be on any of them.
-        signing: one of the same key for each link, or none.
-        clock: seconds that only ever grow; for asking again, never for frames.
+        camera: Camera component, whose system id is set to the autopilot's.
+        tracker: Tracker of the vehicle's pose.
+        links: Open transports. The autopilot may be on any of them.
+        signing: One object with the same key for each link, or none.
+        clock: Monotonic clock in seconds for repeated requests, never for frames.
     """
 
     def __init__(
@@ -49,15 +49,15 @@ class Station:
             (link, Codec(camera.system, COMPONENT_ID, signing=signing())) for link in links
         ]
         self._clock = clock
-        self._autopilot: int | None = None  # system id, once heard
+        self._autopilot: int | None = None  # system id; None before its first heartbeat
         self._ask_at_s = 0.0
         self._announce_at_s = 0.0
 
     def run(self, keep_on: Callable[[], bool]) -> None:
-        """Serve until `keep_on` says no.
+        """Serve until `keep_on` returns False.
 
         Raises:
-            LinkLost: a link's peer closed it.
+            LinkLost: The peer of a link closed it.
         """
         with selectors.DefaultSelector() as selector:
             for link in self._links:
@@ -67,7 +67,7 @@ class Station:
                 self.serve()
 
     def serve(self) -> None:
-        """Take everything that waits on the links, and send what is due."""
+        """Handle all waiting messages and send the due ones."""
         for link, codec in self._links:
             while data := link.receive(0.0):
                 for message in codec.decode(data, datagram=link.datagram):
@@ -84,7 +84,7 @@ class Station:
         self._send(self.camera.handle(message))
 
     def _is_autopilot(self, message: Any) -> bool:
-        """Whether the autopilot sent it; its first heartbeat tells which system it is."""
+        """Return True for a message of the autopilot, which its first heartbeat identifies."""
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return False
         if self._autopilot is None:
@@ -99,7 +99,7 @@ class Station:
         return bool(message.get_srcSystem() == self._autopilot)
 
     def _announce(self) -> None:
-        """A heartbeat to everyone while there is no pose, so that a waiting autopilot answers."""
+        """Send a heartbeat on all links while there is no pose, so that an autopilot answers."""
         if self._clock() >= self._announce_at_s and not self._has_pose():
             self._announce_at_s = self._clock() + _ANNOUNCE_S
             self._send(self.camera.idle())
@@ -108,7 +108,7 @@ class Station:
         return self._tracker.has_position and self._tracker.has_attitude
 
     def _ask(self) -> None:
-        """Ask the autopilot for attitude and position until both come."""
+        """Request attitude and position from the autopilot until both arrive."""
         if self._autopilot is None or self._clock() < self._ask_at_s:
             return
         self._ask_at_s = self._clock() + _ASK_AGAIN_S

@@ -1,4 +1,4 @@
-"""Inner loops: acceleration to thrust vector, thrust vector to body rates, rates to torque."""
+"""Inner loops from acceleration to thrust vector, to body rates, to torque."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ from sitl.control.setpoint import clip, wrap
 
 Vector = NDArray[np.float64]
 
-LEAST_LIFT = 0.25  # of gravity: below it the attitude would lose its meaning
-THRUST_RESERVE = 0.9  # of the largest thrust; the rest is kept for attitude
-HORIZONTAL_MARGIN = 0.2  # of gravity: acceleration that a climb never takes from a turn
-UNWINDING_HZ = 2.0  # how fast an integral gives way to what could not be had
+LEAST_LIFT = 0.25  # fraction of gravity; with less lift the attitude is undefined
+THRUST_RESERVE = 0.9  # fraction of the maximum thrust; the rest is reserved for attitude
+HORIZONTAL_MARGIN = 0.2  # fraction of gravity reserved for horizontal acceleration
+UNWINDING_HZ = 2.0  # rate at which an integral unwinds at a limit
 RATE_INTEGRAL_LIMIT_RADPS2 = 20.0
 
 
 @compiled
 def rotation(measurement: Vector) -> Vector:
-    """Rotation matrix (3, 3), body FRD -> NED, of the measured attitude."""
+    """Return the rotation matrix (3, 3), body FRD -> NED, of the measured attitude."""
     w, x, y, z = measurement[M_QUATERNION : M_QUATERNION + 4]
     matrix = np.empty((3, 3))
     matrix[0, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -64,10 +64,10 @@ def rotation(measurement: Vector) -> Vector:
 
 @compiled
 def specific_force(acceleration: Vector, gains: Vector) -> Vector:
-    """Thrust per mass (3,), NED m/s^2, for an acceleration; height before tilt.
+    """Return the thrust per mass (3,), NED m/s^2, for an acceleration, with priority for height.
 
-    The vertical part comes first, but for a margin; the horizontal part gives way to the tilt
-    limit and to the thrust that there is.
+    The vertical part has priority, except for a margin. The horizontal part is reduced to the tilt
+    limit and to the available thrust.
     """
     gravity = gains[G_GRAVITY]
     largest = THRUST_RESERVE * 4.0 * gains[G_ROTOR_THRUST] / gains[G_MASS]
@@ -86,7 +86,7 @@ def specific_force(acceleration: Vector, gains: Vector) -> Vector:
 
 @compiled
 def unwind(acceleration: Vector, force: Vector, state: Vector, gains: Vector) -> None:
-    """Let the velocity integrals in `state` that push into a limit give way towards zero."""
+    """Unwind the velocity integrals in `state` that push into a limit."""
     for axis in range(3):
         had = force[axis] + (gains[G_GRAVITY] if axis == 2 else 0.0)
         step = gains[G_DT] * UNWINDING_HZ * abs(had - acceleration[axis])
@@ -98,9 +98,9 @@ def unwind(acceleration: Vector, force: Vector, state: Vector, gains: Vector) ->
 
 @compiled
 def tilt_rates(force: Vector, matrix: Vector, gains: Vector) -> Vector:
-    """Body rates (3,), rad/s, that turn the rotors' axis towards the force; no yaw in it."""
+    """Return the body rates (3,), rad/s, without yaw, that turn the thrust axis to the force."""
     norm = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
-    # the wanted down axis of the body, seen from the body
+    # target down axis in body coordinates
     x = -(matrix[0, 0] * force[0] + matrix[1, 0] * force[1] + matrix[2, 0] * force[2]) / norm
     y = -(matrix[0, 1] * force[0] + matrix[1, 1] * force[1] + matrix[2, 1] * force[2]) / norm
     z = -(matrix[0, 2] * force[0] + matrix[1, 2] * force[1] + matrix[2, 2] * force[2]) / norm
@@ -118,7 +118,7 @@ def tilt_rates(force: Vector, matrix: Vector, gains: Vector) -> Vector:
 
 @compiled
 def heading_rate(clean: Vector, heading: float, state: Vector, gains: Vector) -> float:
-    """Rate of turn, rad/s round the vertical; moves the heading reference in `state` on."""
+    """Return the yaw rate round the vertical, rad/s, and advance the heading reference."""
     dt = gains[G_DT]
     limit = gains[G_YAW_RATE_LIMIT]
     wanted = clean[SP_YAW_RATE] if math.isfinite(clean[SP_YAW_RATE]) else 0.0
@@ -140,9 +140,10 @@ def heading_rate(clean: Vector, heading: float, state: Vector, gains: Vector) ->
 def torque(
     rates_wanted: Vector, measurement: Vector, state: Vector, gains: Vector, yaw_free: bool
 ) -> Vector:
-    """Body torque (3,), N m, of the rate loops; moves their integrals in `state` on.
+    """Return the body torque (3,), N m, of the rate loops, and advance their integrals.
 
-    PID with the derivative on the measurement, scaled by inertia, plus the gyroscopic term.
+    The loops are PID with the derivative of the measurement, scaled by inertia, plus the gyroscopic
+    term.
     """
     dt = gains[G_DT]
     angular = np.empty(3)

@@ -1,4 +1,4 @@
-"""One control step: setpoint and measurement to motor commands."""
+"""One control step from setpoint and measurement to motor commands."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from sitl.control.velocity import acceleration_target, velocity_target
 
 Vector = NDArray[np.float64]
 
-LIFT_OFF_MPS = 0.1  # a climb setpoint below this does not lift off the ground
+LIFT_OFF_MPS = 0.1  # minimum climb setpoint for lift-off
 
 
 @compiled
 def resting_state(measurement: Vector, matrix: Vector) -> Vector:
-    """Controller state (n,) of a vehicle that is not flying: no integrals, references at rest."""
+    """Return the controller state (n,) on the ground: zero integrals, references at rest."""
     state = np.zeros(STATE_SIZE)
     state[S_HEADING] = math.atan2(matrix[1, 0], matrix[0, 0])
     for axis in range(3):
@@ -44,10 +44,11 @@ def resting_state(measurement: Vector, matrix: Vector) -> Vector:
 def control_step(
     state: Vector, measurement: Vector, setpoint: Vector, gains: Vector, armed: bool
 ) -> tuple[Vector, Vector]:
-    """The next controller state (18,) and the motor commands (4,) in [0, 1].
+    """Return the next controller state (18,) and the motor commands (4,) in [0, 1].
 
-    Pure: `state` is not changed. Arrays as in sitl.control.layout. On the ground an armed
-    vehicle idles until the setpoint asks for a climb, and idles again after touching down.
+    The function is pure and does not change `state`. Arrays have the layout of
+    sitl.control.layout. An armed vehicle on the ground idles until the setpoint climbs, and idles
+    again after touchdown.
     """
     matrix = rotation(measurement)
     if not armed:

@@ -1,4 +1,4 @@
-"""Controller gains from the physics of a vehicle profile."""
+"""Computes controller gains from the physics of a vehicle profile."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from sitl.vehicle.profile import GRAVITY_MPS2, LEVEL_SHARE, VehicleProfile
 
 RATE_DAMPING = 0.75
 RATE_BANDWIDTH_PER_LAG = 1.6  # natural frequency of the tilt-rate loop x motor time constant
-CLIMB_SHARE = 0.6  # of the spare thrust, for climbing acceleration
+CLIMB_SHARE = 0.6  # fraction of the spare thrust for climb acceleration
 TILT_TO_RATE = 0.36  # tilt gain / natural frequency of the rate loop
 
 
 def gains_for(profile: VehicleProfile, dt_s: float) -> NDArray[np.float64]:
-    """The gain array (layout.GAINS_SIZE,) for a vehicle and a step of `dt_s`.
+    """Return the gain array (layout.GAINS_SIZE,) for a vehicle and a step of `dt_s`.
 
-    The rate loop is placed as a second-order system on the motor's lag tau: with
-    torque = I (P e - D w'), tau s^2 + (1 + D) s + P. Everything outside follows from its
-    natural frequency.
+    The rate loop is designed as a second-order system with the motor's lag tau: torque
+    I (P e - D w') gives tau s^2 + (1 + D) s + P. The outer gains follow from its natural frequency.
     """
     gains = np.zeros(layout.GAINS_SIZE)
     gains[layout.G_DT] = dt_s
@@ -79,7 +78,7 @@ def _outer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
 
 
 def _drag(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
-    """Body drag, and the thrust that climbing rotors lose: dT/dV = slope T / (J0 n D)."""
+    """Set body drag and the thrust loss of climbing rotors: dT/dV = slope T / (J0 n D)."""
     rotor, mass_kg = profile.rotor, profile.total_mass_kg
     hover_n = mass_kg * GRAVITY_MPS2 / 4.0
     speed_hz = math.sqrt(hover_n / rotor.max_thrust_n) * rotor.max_rpm / 60.0

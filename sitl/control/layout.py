@@ -1,11 +1,11 @@
-"""Where things stand in the flat arrays that the compiled loops pass round.
+"""Layout of the flat arrays of the compiled control loops.
 
-Flat float64 arrays cost a quarter of a microsecond to hand over, records several times that.
+Passing a flat float64 array to compiled code takes 0.25 us, a record several times that.
 """
 
 from __future__ import annotations
 
-# Setpoint (11,): NED, m, m/s, m/s^2, rad, rad/s; NaN is "not controlled".
+# Setpoint (11,): NED, m, m/s, m/s^2, rad, rad/s; NaN means not controlled.
 SP_POSITION = 0
 SP_VELOCITY = 3
 SP_ACCELERATION = 6
@@ -58,7 +58,7 @@ G_HEADING_P = 41
 G_HEADING_MODEL_P = 42
 G_YAW_RATE_LIMIT = 43
 G_YAW_ACCELERATION = 44
-G_ROTOR_THRUST = 45  # largest of one rotor, N
+G_ROTOR_THRUST = 45  # maximum of one rotor, N
 G_ROTOR_OFFSET = 46  # along each body axis, m
 G_TORQUE_PER_THRUST = 47  # m
 G_THROTTLE = 48  # 3: constant, linear and quadratic in relative rotor speed

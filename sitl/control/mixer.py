@@ -1,6 +1,6 @@
-"""Collective thrust and torque to four motor commands, with desaturation.
+"""Mixer from collective thrust and torque to four motor commands, with desaturation.
 
-Rotors in PX4's order for an X frame: front right, rear left, front left, rear right; the first
+Rotors are in PX4's order for an X frame: front right, rear left, front left, rear right. The first
 two turn counter-clockwise seen from above.
 """
 
@@ -22,9 +22,9 @@ from sitl.control.setpoint import clip
 
 Vector = NDArray[np.float64]
 
-LEAST_SHARE = 0.01  # of a rotor's thrust; keeps it turning
+LEAST_SHARE = 0.01  # minimum share of a rotor's thrust, which keeps it turning
 IDLE_SHARE = 0.01
-NEGLIGIBLE_SHARE = 1.0e-12  # too little to divide by
+NEGLIGIBLE_SHARE = 1.0e-12  # smallest divisor
 _FORWARD = np.array([1.0, -1.0, 1.0, -1.0])
 _RIGHT = np.array([1.0, -1.0, -1.0, 1.0])
 _SENSE = np.array([1.0, 1.0, -1.0, -1.0])
@@ -32,9 +32,9 @@ _SENSE = np.array([1.0, 1.0, -1.0, -1.0])
 
 @compiled
 def thrust_shares(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
-    """Thrust of each rotor (4,) as a share of its largest, within [LEAST_SHARE, 1].
+    """Return each rotor's thrust (4,) as a share of its maximum, within [LEAST_SHARE, 1].
 
-    Where not everything fits, roll and pitch come first, then the collective, then yaw.
+    If the rotors saturate, roll and pitch have priority, then the collective, then yaw.
     """
     unit = 4.0 * gains[G_ROTOR_THRUST]
     arm = unit * gains[G_ROTOR_OFFSET]
@@ -60,7 +60,7 @@ def thrust_shares(collective_n: float, torque_nm: Vector, gains: Vector) -> Vect
 
 @compiled
 def throttle(share: float, gains: Vector) -> float:
-    """Motor command in [0, 1] that gives a static thrust share: voltage = V(rotor speed)."""
+    """Return the motor command in [0, 1] for a static thrust share: voltage = V(rotor speed)."""
     speed = math.sqrt(share)
     command = gains[G_THROTTLE] + gains[G_THROTTLE + 1] * speed + gains[G_THROTTLE + 2] * share
     return clip(command, 0.0, 1.0)
@@ -68,7 +68,7 @@ def throttle(share: float, gains: Vector) -> float:
 
 @compiled
 def mix(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
-    """Motor commands (4,) in [0, 1] of a collective thrust, N, and a body torque (3,), N m."""
+    """Return motor commands (4,) in [0, 1] for collective thrust, N, and torque (3,), N m."""
     commands = thrust_shares(collective_n, torque_nm, gains)
     for rotor in range(4):
         commands[rotor] = throttle(commands[rotor], gains)
@@ -77,5 +77,5 @@ def mix(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
 
 @compiled
 def idle(gains: Vector) -> Vector:
-    """Motor commands (4,) of an armed vehicle that stands on the ground."""
+    """Return the motor commands (4,) of an armed vehicle on the ground."""
     return np.full(4, throttle(IDLE_SHARE, gains))

@@ -1,4 +1,4 @@
-"""Cleans a setpoint so that nothing in it can poison a controller state."""
+"""Cleans a setpoint so that it cannot corrupt the controller state."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ Vector = NDArray[np.float64]
 
 FARTHEST_M = 1.0e5
 LARGEST_ANGLE_RAD = 1.0e4
-LARGEST_INPUT = 1.0e3  # of a velocity or acceleration component, before the norm is limited
+LARGEST_INPUT = 1.0e3  # limit of a velocity or acceleration component before the norm's limit
 
 
 @compiled
 def clip(value: float, low: float, high: float) -> float:
-    """`value` within [low, high]."""
+    """Clip `value` to [low, high]."""
     return min(max(value, low), high)
 
 
 @compiled
 def wrap(angle_rad: float) -> float:
-    """The same angle in [-pi, pi), rad."""
+    """Wrap an angle into [-pi, pi), rad."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
 @compiled
 def finite_or_nan(value: float, limit: float) -> float:
-    """`value` within +-limit; NaN where it is not finite."""
+    """Clip `value` to +-limit. Return NaN if it is not finite."""
     if not math.isfinite(value):
         return math.nan
     return min(max(value, -limit), limit)
@@ -51,7 +51,7 @@ def finite_or_nan(value: float, limit: float) -> float:
 
 @compiled
 def limit_horizontal(vector: Vector, start: int, limit: float) -> None:
-    """Scale vector[start:start + 2] down to a norm of at most `limit`; NaN counts as zero."""
+    """Limit the norm of vector[start:start + 2] to `limit`. NaN counts as zero."""
     x = vector[start] if math.isfinite(vector[start]) else 0.0
     y = vector[start + 1] if math.isfinite(vector[start + 1]) else 0.0
     norm = math.sqrt(x * x + y * y)
@@ -62,10 +62,10 @@ def limit_horizontal(vector: Vector, start: int, limit: float) -> None:
 
 @compiled
 def clean_setpoint(setpoint: Vector, gains: Vector) -> Vector:
-    """A copy (11,) within the vehicle's limits: not finite becomes NaN, huge becomes the limit.
+    """Return a copy (11,) within the vehicle's limits, with NaN for values that are not finite.
 
-    Velocity is limited to the horizontal speed (norm), climb and descent limits; acceleration
-    to its limits, yaw to [-pi, pi) and yaw rate to its limit.
+    Velocity is limited to the horizontal speed (norm) and to the climb and descent limits,
+    acceleration and yaw rate to their limits, and yaw to [-pi, pi).
     """
     clean = np.empty(SETPOINT_SIZE)
     for axis in range(3):

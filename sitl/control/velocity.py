@@ -1,9 +1,9 @@
-"""Outer loops: position to velocity, velocity to acceleration through a reference model.
+"""Outer loops from position to velocity, and through a reference model to acceleration.
 
-The reference model is what the vehicle can do: it follows the velocity setpoint with limited
-acceleration and the lag of the attitude loop. Its acceleration is fed forward, and the
-feedback only sees what the vehicle does differently from it. So a step of the setpoint neither
-overshoots nor winds up the integral.
+The reference model has the vehicle's capability: it follows the velocity setpoint with limited
+acceleration and the lag of the attitude loop. Its acceleration is fed forward, and the feedback
+acts only on the difference between vehicle and model. A setpoint step therefore neither overshoots
+nor winds up the integral.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ Vector = NDArray[np.float64]
 
 @compiled
 def velocity_target(clean: Vector, measurement: Vector, gains: Vector) -> Vector:
-    """Velocity to fly (3,), NED m/s: position error times gain, plus the velocity setpoint.
+    """Return the target velocity (3,), NED m/s: gain times position error plus velocity setpoint.
 
-    An axis with neither position nor velocity has target zero, unless it has an acceleration:
-    then it is NaN, which means that the acceleration alone steers it.
+    An axis with neither position nor velocity has target zero. If it has an acceleration, the
+    target is NaN, which means that the acceleration alone controls it.
     """
     target = np.empty(3)
     for axis in range(3):
@@ -73,10 +73,10 @@ def velocity_target(clean: Vector, measurement: Vector, gains: Vector) -> Vector
 
 @compiled
 def model_acceleration(target: Vector, clean: Vector, state: Vector, gains: Vector) -> Vector:
-    """Acceleration (3,) that takes the reference model to its target, NED m/s^2, limited.
+    """Return the limited acceleration (3,) of the reference model to its target, NED m/s^2.
 
-    What the feed-forward has not yet brought because of the lag is left out of the velocity
-    error: a trajectory with its own acceleration is followed one lag late, not overtaken.
+    The velocity error excludes the part of the feed-forward that is delayed by the lag. A
+    trajectory with its own acceleration is therefore followed one lag late, without overshoot.
     """
     wanted = np.empty(3)
     for axis in range(3):
@@ -98,7 +98,7 @@ def model_acceleration(target: Vector, clean: Vector, state: Vector, gains: Vect
 
 @compiled
 def drag(velocity_mps: Vector, axis: int, gains: Vector) -> float:
-    """Deceleration by drag and inflow along one NED axis at a velocity (3,), m/s^2."""
+    """Return the deceleration by drag and inflow along a NED axis at a velocity (3,), m/s^2."""
     v: float = velocity_mps[axis]
     slowing: float = gains[G_DRAG_LINEAR + axis] + gains[G_DRAG_QUADRATIC + axis] * abs(v)
     return v * slowing
@@ -108,10 +108,10 @@ def drag(velocity_mps: Vector, axis: int, gains: Vector) -> float:
 def acceleration_target(
     target: Vector, clean: Vector, measurement: Vector, state: Vector, gains: Vector
 ) -> Vector:
-    """Acceleration to ask of the rotors (3,), NED m/s^2; moves model and integral in `state` on.
+    """Return the target acceleration of the rotors (3,), NED m/s^2, and advance `state`.
 
-    Feed-forward of the model's acceleration and of drag, P on the difference between model and
-    vehicle, and a limited integral of it.
+    It is the feed-forward of the model's acceleration and of drag, plus P and a limited I of the
+    difference between model and vehicle.
     """
     dt = gains[G_DT]
     wanted = model_acceleration(target, clean, state, gains)

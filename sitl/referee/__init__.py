@@ -1,4 +1,4 @@
-"""The referee: it alone knows the truth, and says what the vehicle hit, when and where."""
+"""The referee, which knows the true state and detects collisions."""
 
 from sitl.referee.referee import Collision, Referee
 

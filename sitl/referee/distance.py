@@ -1,8 +1,8 @@
 """Exact distance between the vehicle's oriented box and axis-aligned boxes, compiled.
 
-Two convex boxes that are apart are nearest at a corner of one and the other box, or at an edge
-of each; that they are apart is decided by the separating axes of two boxes (six face normals
-and nine cross products of edges; S. Gottschalk, M. Lin, D. Manocha, "OBBTree", 1996).
+The shortest distance of two separate convex boxes is between a corner of one and the other box, or
+between an edge of each. A separating-axis test with six face normals and nine cross products of
+edges decides if they overlap (S. Gottschalk, M. Lin, D. Manocha, "OBBTree", 1996).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PARALLEL = 1e-12
 
 @compiled
 def point_distance(point: Vector, box: Vector) -> float:
-    """Distance, m, of a point (3,) to an axis-aligned box (6,); zero inside."""
+    """Return the distance, m, of a point (3,) to an axis-aligned box (6,); zero inside."""
     total = 0.0
     for axis in range(3):
         gap = max(box[axis] - point[axis], point[axis] - box[axis + 3], 0.0)
@@ -31,10 +31,10 @@ def point_distance(point: Vector, box: Vector) -> float:
 
 @compiled
 def body_distance(centre: Vector, rotation: Vector, half: Vector, box: Vector) -> float:
-    """Distance, m, of an oriented box to an axis-aligned one; zero where they overlap.
+    """Return the distance, m, of an oriented box to an axis-aligned one; zero if they overlap.
 
-    The oriented box has its centre (3,) in the world, half sides (3,), and a rotation (3, 3)
-    from body to world; the other is (6,) xmin ymin zmin xmax ymax zmax.
+    The oriented box has a centre (3,) in the world, half sides (3,), and a rotation (3, 3) from
+    body to world. The other is (6,) xmin ymin zmin xmax ymax zmax.
     """
     if _overlap(centre, rotation, half, box):
         return 0.0
@@ -55,7 +55,7 @@ def body_distance(centre: Vector, rotation: Vector, half: Vector, box: Vector) -
 
 @compiled
 def _overlap(centre: Vector, rotation: Vector, half: Vector, box: Vector) -> bool:
-    """Separating-axis test; touching counts as overlap."""
+    """Return True if the boxes overlap or touch, by a separating-axis test."""
     offset = (
         centre[0] - 0.5 * (box[0] + box[3]),
         centre[1] - 0.5 * (box[1] + box[4]),
@@ -131,12 +131,12 @@ def _edges_squared(
     half: Vector,
     box: Vector,
 ) -> float:
-    """Squared distance of one body edge (along body `axis`) to one box edge.
+    """Return the squared distance of one body edge (along body `axis`) to one box edge.
 
-    With r the offset of the edges' middles, u and v their directions and h, k their half
-    lengths, |r + s u - t v| is least where both derivatives vanish; that point is clamped to the
-    segments one after the other. Ends of edges are corners, which are handled apart, so only
-    an interior minimum has to be right.
+    With r the offset of the edges' midpoints, u and v their directions and h, k their half
+    lengths, |r + s u - t v| is minimal where both derivatives vanish. The solution is clamped to
+    the segments one after the other. The ends of edges are corners, which are handled separately,
+    so only an interior minimum must be exact.
     """
     one, two = (axis + 1) % 3, (axis + 2) % 3
     sign_one = half[one] if edge & 1 else -half[one]

@@ -1,4 +1,4 @@
-"""When touching the ground is a landing, and when it is a crash."""
+"""Rule that tells a landing from a crash into the ground."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandingLimits:
-    """A touch within these, while landing or disarmed, is a landing.
+    """Limits of a landing, which apply while landing or disarmed.
 
-    PX4 lands at 0.7 m/s (MPC_LAND_SPEED); the limits leave room for a hard landing on level
-    legs and none for a fall or for touching down at cruise speed.
+    PX4 lands at 0.7 m/s (MPC_LAND_SPEED). The limits allow a hard landing on level legs, but
+    neither a fall nor a touchdown at cruise speed.
     """
 
     sink_mps: float = 2.0
     horizontal_mps: float = 1.5
     tilt_rad: float = math.radians(35.0)
-    airborne_m: float = 0.3  # the lowest corner above this: the vehicle is in the air
+    airborne_m: float = 0.3  # height of the lowest corner above which the vehicle is in the air
 
 
 @dataclass(slots=True, kw_only=True)
 class GroundRule:
-    """Follows the vehicle from the ground into the air and back.
+    """Classifies ground contacts from take-off to landing.
 
-    Contact before the vehicle was ever airborne is standing on the ground. Contact afterwards
-    is a crash unless the flight controller was landing (or taking off) or disarmed, and the
-    touch stayed within the limits. The speed that counts is the one just before the touch.
+    A vehicle in contact before its first take-off stands on the ground. A later contact is a crash
+    unless the flight controller was landing, taking off or disarmed, and the contact is within the
+    limits. The limits apply to the speed just before the contact.
     """
 
-    half_m: tuple[float, float, float]  # half sides of the body
+    half_m: tuple[float, float, float]  # half sides of the body box
     limits: LandingLimits
     airborne: bool = False
     _velocity_before_mps: Vector | None = None  # (3,) ENU
@@ -48,7 +48,7 @@ class GroundRule:
         on_ground: bool,
         may_land: bool,
     ) -> bool:
-        """Whether the newest pose is a crash into the ground; call it once per observation."""
+        """Return True if the newest pose is a crash. Call it once per observation."""
         lowest_m, tilt_rad = self._attitude(position_enu_m, quaternion_flu_enu)
         before = self._velocity_before_mps
         velocity = velocity_enu_mps if before is None else before
@@ -62,7 +62,7 @@ class GroundRule:
         return not (may_land and self._is_gentle(velocity, tilt_rad))
 
     def _attitude(self, position: Vector, quaternion: Vector) -> tuple[float, float]:
-        """Height of the body's lowest corner, m, and tilt of its up axis, rad."""
+        """Return the height of the body's lowest corner, m, and the tilt of its up axis, rad."""
         w, x, y, z = quaternion.tolist()
         up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
         reach = sum(abs(u) * half for u, half in zip(up, self.half_m, strict=True))

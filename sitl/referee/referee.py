@@ -1,4 +1,4 @@
-"""The referee watches every observation of the vehicle and keeps what it saw."""
+"""The referee: detects collisions and logs the true state of the vehicle."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ _DEFAULT_LIMITS = LandingLimits()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Collision:
-    """The first thing the vehicle hit."""
+    """First collision of a flight."""
 
-    stamp_s: float  # of the touch itself, between two observations
-    position_enu_m: tuple[float, float, float]  # of the vehicle at that moment
+    stamp_s: float  # time of contact, between two observations
+    position_enu_m: tuple[float, float, float]  # vehicle at the time of contact
     speed_mps: float
     box_index: int | None  # None: the ground
 
     @property
     def what(self) -> str:
-        """The ground, or which box of the world."""
+        """Name of the obstacle: the ground, or a box with its index."""
         return "ground" if self.box_index is None else f"box {self.box_index}"
 
     @property
     def text(self) -> str:
-        """One short line for a status message."""
+        """Return a short line for a status message."""
         place = " ".join(f"{c:.1f}" for c in self.position_enu_m)
         return f"Collision: {self.what} at {place}"
 
 
 class Referee:
-    """Collisions, clearance, distance flown and the truth log of one flight.
+    """Collision, clearance, flown distance and truth log of one flight.
 
     Args:
-        world: the world that is flown in.
-        body_box_m: length, width and height of the vehicle's body box, centred on its position.
-        vehicle: the vehicle's name, for the report.
-        physics: its mass and thrust, for the report.
-        limits: what is still a landing.
+        world: World of the flight.
+        body_box_m: Length, width and height of the vehicle's body box, centred on its position.
+        vehicle: Name of the vehicle, for the report.
+        physics: Mass and thrust of the vehicle, for the report.
+        limits: Limits of a landing.
     """
 
     def __init__(
@@ -72,12 +72,12 @@ class Referee:
         self.log = TruthLog()
         length, width, height = body_box_m
         self._half = np.array([length, width, height]) / 2.0
-        self._boxes = np.array(world.boxes_enu_m)  # writable: one compiled signature for all
+        self._boxes = np.array(world.boxes_enu_m)  # writable: one compiled signature
         self._ground = GroundRule(half_m=(length / 2.0, width / 2.0, height / 2.0), limits=limits)
         self._stamp_s = 0.0
         self._position: Vector | None = None
         self._quaternion = level = np.array([1.0, 0.0, 0.0, 0.0])
-        # Loads the compiled geometry now: in real time the first tick must not stall.
+        # Load the compiled geometry now, so that the first tick does not stall in real time.
         clearance(np.zeros(3), level, self._half, self._boxes)
         sweep(np.zeros(3), level, np.zeros(3), level, self._half, self._boxes, 0.0)
 
@@ -94,25 +94,25 @@ class Referee:
         power_regression_w: float = 0.0,
         power_propeller_w: float = 0.0,
     ) -> Collision | None:
-        """Judge the way from the last observation to this one, and log a row of truth.
+        """Check the motion since the last observation, and log a row of truth.
 
         Args:
-            stamp_s: simulated time.
-            position_enu_m: (3,) of the vehicle.
-            quaternion_flu_enu: (4,) unit, w x y z, body forward-left-up to ENU.
-            velocity_enu_mps: (3,).
-            armed: motors may turn.
-            on_ground: the physics feels the ground.
-            may_land: the flight controller is landing or taking off; a touch of the ground is
-                then no crash while it is gentle. Disarmed implies it.
-            power_regression_w: paper-comparable power, for the log.
-            power_propeller_w: the propellers' power, for the log.
+            stamp_s: Simulated time, s.
+            position_enu_m: Position of the vehicle (3,).
+            quaternion_flu_enu: Unit quaternion (4,) w x y z, body forward-left-up to ENU.
+            velocity_enu_mps: Velocity of the vehicle (3,).
+            armed: True if the motors may turn.
+            on_ground: True if the physics reports ground contact.
+            may_land: The flight controller is landing or taking off, so a gentle ground contact is
+                not a crash. A disarmed vehicle may always land.
+            power_regression_w: Power comparable with the paper's, for the log.
+            power_propeller_w: Power of the propellers, for the log.
 
         Returns:
-            The first collision of the flight, in the call that found it; None otherwise.
+            First collision of the flight in the call that detects it, otherwise None.
 
         Raises:
-            VehicleProcessError: the state is not finite.
+            VehicleProcessError: The state is not finite.
         """
         position = np.array(position_enu_m, dtype=np.float64)
         quaternion = np.array(quaternion_flu_enu, dtype=np.float64)
@@ -150,7 +150,7 @@ class Referee:
         on_ground: bool,
         may_land: bool = False,
     ) -> Collision | None:
-        """As `observe`, without a row in the log: for the physics steps between control ticks."""
+        """Check as `observe` without a log row, for the physics steps between control ticks."""
         position = np.array(position_enu_m, dtype=np.float64)
         quaternion = np.array(quaternion_flu_enu, dtype=np.float64)
         if not math.isfinite(float(position.sum() + quaternion.sum())):
@@ -192,7 +192,7 @@ class Referee:
         return self.collision
 
     def report(self, energies_j: Mapping[str, float] | None = None) -> dict[str, Any]:
-        """What the flight came to, ready for JSON; an infinite clearance (no boxes) is None."""
+        """Return the result of the flight for JSON. An infinite clearance (no boxes) is None."""
         world, hit = self.world, self.collision
         least = self.min_clearance_m
         return {
@@ -221,9 +221,9 @@ class Referee:
         }
 
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:
-        """Write `truth.npz` and `truth.json` into `folder`, each whole or not at all.
+        """Write `truth.npz` and `truth.json` into `folder`, each atomically.
 
         Raises:
-            RecordError: the folder cannot be written.
+            RecordError: The folder cannot be written.
         """
         save_truth(folder, self.log, self.report(energies_j))

@@ -1,13 +1,13 @@
-"""The body's motion between two poses against every box: first touch, and nearest approach.
+"""First contact and nearest approach of the moving body to all boxes between two poses.
 
-Between two poses the body's centre moves in a straight line and its attitude turns about one
-axis at a constant rate. No point of it then moves further than
+Between two poses the body's centre moves in a straight line, and its attitude turns about one axis
+at a constant rate. No point of the body then moves further than
 
     travel = |p1 - p0| + angle * half-diagonal
 
-so a clearance d excludes a touch for the share d / travel of the way (conservative
-advancement; B. Mirtich, 1996): however thin a wall, no step crosses it. The nearest approach
-is found by the same bound from both ends of an interval (S. Piyavskii, 1972).
+so a clearance d excludes contact for the fraction d / travel of the motion (conservative
+advancement; B. Mirtich, 1996). No step can cross a wall of any thickness. The same bound from both
+ends of an interval gives the nearest approach (S. Piyavskii, 1972).
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from sitl.referee.distance import body_distance, point_distance
 Vector = NDArray[np.float64]
 
 CONTACT_M = 1e-4
-"""Nearer than this is a touch."""
+"""A smaller distance counts as contact."""
 
 APPROACH_TOLERANCE_M = 1e-3
-"""The nearest approach between two poses is found to within this."""
+"""Accuracy of the nearest approach between two poses."""
 
 
 @compiled
 def pose_at(
     share: float, p0: Vector, q0: Vector, p1: Vector, q1: Vector, centre: Vector, rotation: Vector
 ) -> None:
-    """Write the pose at a share 0..1 of the way: centre (3,) and rotation (3, 3)."""
+    """Write the pose at a fraction 0..1 of the motion: centre (3,) and rotation (3, 3)."""
     for i in range(3):
         centre[i] = p0[i] + share * (p1[i] - p0[i])
     dot = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
@@ -57,7 +57,7 @@ def pose_at(
 def clearance(
     position: Vector, quaternion: Vector, half: Vector, boxes: Vector
 ) -> tuple[float, int]:
-    """Distance, m, of the body at one pose to the nearest box, and its index (-1: no box)."""
+    """Return distance, m, from the body to the nearest box, and its index (-1: no box)."""
     centre, rotation = np.empty(3), np.empty((3, 3))
     pose_at(0.0, position, quaternion, position, quaternion, centre, rotation)
     reach = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
@@ -80,20 +80,20 @@ def clearance(
 def sweep(
     p0: Vector, q0: Vector, p1: Vector, q1: Vector, half: Vector, boxes: Vector, least_m: float
 ) -> tuple[float, int, float]:
-    """First touch and nearest approach of the body on its way from pose 0 to pose 1.
+    """Compute first contact and nearest approach of the body from pose 0 to pose 1.
 
     Args:
-        p0: (3,) position at the start of the way, m.
-        q0: (4,) attitude, body to world, at the start.
-        p1: (3,) position at its end.
-        q1: (4,) attitude at its end.
-        half: (3,) half sides of the body.
-        boxes: (n, 6).
-        least_m: the nearest approach so far; only a nearer one is looked for.
+        p0: Position (3,) at the start, m.
+        q0: Attitude (4,), body to world, at the start.
+        p1: Position (3,) at the end, m.
+        q1: Attitude (4,), body to world, at the end.
+        half: Half sides of the body (3,), m.
+        boxes: Boxes (n, 6), m.
+        least_m: Nearest approach so far, m. The search ignores larger distances.
 
     Returns:
-        share of the way at the first touch (inf: none), index of the box touched (-1: none),
-        and the nearest approach, m, at most `least_m`.
+        Fraction of the motion at the first contact (inf: none), index of the box in contact (-1:
+        none), and nearest approach, m, at most `least_m`.
     """
     reach = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
     dot = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
@@ -139,7 +139,7 @@ def _approach(
     travel: float,
     least_m: float,
 ) -> float:
-    """Least distance on the way, or `least_m` where it is not nearer."""
+    """Return the smallest distance during the motion, at most `least_m`."""
     centre, rotation = np.empty(3), np.empty((3, 3))
     lows, highs, gaps_low, gaps_high = np.empty(64), np.empty(64), np.empty(64), np.empty(64)
     pose_at(0.0, p0, q0, p1, q1, centre, rotation)

@@ -1,4 +1,4 @@
-"""The truth log: what really happened, one row a control tick, and its files."""
+"""The truth log: the true state of the vehicle, one row per control tick, and its files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _WIDTH = 16
 
 
 class TruthLog:
-    """Rows of truth in one growing array."""
+    """Rows of true states in a growing array."""
 
     def __init__(self) -> None:
         self._rows = np.empty((1024, _WIDTH))
@@ -38,7 +38,7 @@ class TruthLog:
         return self._count
 
     def append(self, *parts: float | NDArray[np.float64]) -> None:
-        """Add one row: the columns in the order of `COLUMNS`."""
+        """Add one row with the columns in the order of `COLUMNS`."""
         if self._count == len(self._rows):
             self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
         row = self._rows[self._count]
@@ -47,7 +47,7 @@ class TruthLog:
         self._count += 1
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The log as named arrays, (n,) or (n, 3 or 4); flags are boolean."""
+        """Return the log as named arrays, (n,) or (n, 3 or 4). Flags are boolean."""
         rows = self._rows[: self._count]
         arrays: dict[str, NDArray[Any]] = {}
         for name, place in COLUMNS.items():
@@ -59,10 +59,10 @@ class TruthLog:
 
 
 def save_truth(folder: Path, log: TruthLog, report: Mapping[str, Any]) -> None:
-    """Write truth.npz and then truth.json into a folder, each whole or not at all.
+    """Write truth.npz and then truth.json into a folder, each atomically.
 
     Raises:
-        RecordError: the folder cannot be made or written (no space, no permission).
+        RecordError: The folder cannot be created or written (no space, no permission).
     """
     arrays: dict[str, Any] = dict(log.arrays())
     try:

@@ -13,12 +13,12 @@ from mavfi_cli.core.frames import enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.core.wall import WallClock
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.streams import TICK_US
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 from sitl.camera.component import Camera
 from sitl.referee import Referee
 from sitl.server.wreck import Wreck, has_come_down, wreck_of
 from sitl.vehicle.profile import VehicleProfile
-from sitl.vehicle.vehicle import Vehicle
+from sitl.vehicle.vehicle import Quadrotor
 from sitl.world import World
 
 STEPS_A_TICK = 5
@@ -58,7 +58,7 @@ class Simulation:
         camera_rate_hz: float = 10.0,
     ) -> None:
         to_goal = world.goal_enu_m - world.start_enu_m
-        self.vehicle = Vehicle(
+        self.vehicle = Quadrotor(
             profile,
             position_enu_m=world.start_enu_m,
             yaw_enu_rad=math.atan2(to_goal[1], to_goal[0]),
@@ -108,7 +108,7 @@ class Simulation:
 
     def _look(self) -> None:
         autopilot = self.autopilot
-        truth: Truth = self._wreck or self.vehicle.truth
+        truth: StateEstimate = self._wreck or self.vehicle.truth
         position = enu_from_ned(truth.position_ned_m)
         quaternion = flu_enu_from_frd_ned(truth.quaternion_frd_ned)
         with self.wall.measure("referee"):
@@ -117,7 +117,9 @@ class Simulation:
         with self.wall.measure("camera"):
             self.camera_due = self.camera.poll(self.stamp_us * 1e-6, position, quaternion)
 
-    def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
+    def _judge(
+        self, truth: StateEstimate, position_enu_m: Vector, quaternion_flu_enu: Vector
+    ) -> None:
         """Let the referee see this tick; a collision ends the flight where it falls to."""
         commander, powers = self.autopilot.commander, self.vehicle.truth
         moves = self._wreck is None
@@ -140,6 +142,6 @@ class Simulation:
             raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")
 
 
-def _is_believable(truth: Truth) -> bool:
+def _is_believable(truth: StateEstimate) -> bool:
     place, rates = truth.position_ned_m, truth.rates_frd_radps
     return float(place @ place) < _FARTHEST_M**2 and float(rates @ rates) < _FASTEST_RADPS**2

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sitl.autopilot.truth import Truth, Vector
+from sitl.autopilot.truth import StateEstimate, Vector
 
 _GROUND_M = 0.3  # the centre of what has fallen lies no higher than this
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wreck:
-    """A vehicle's state, at rest for good; see `sitl.autopilot.truth.Truth`."""
+    """A vehicle's state, at rest for good; see `sitl.autopilot.truth.StateEstimate`."""
 
     position_ned_m: Vector  # (3,)
     quaternion_frd_ned: Vector  # (4,)
@@ -27,12 +27,12 @@ class Wreck:
     motor_commands: Vector = field(default_factory=lambda: np.zeros(4))
 
 
-def has_come_down(truth: Truth) -> bool:
+def has_come_down(truth: StateEstimate) -> bool:
     """Whether a vehicle without motors has reached the ground."""
     return truth.on_ground or bool(truth.position_ned_m[2] > -_GROUND_M)
 
 
-def wreck_of(truth: Truth) -> Wreck:
+def wreck_of(truth: StateEstimate) -> Wreck:
     """The state of a vehicle that stays where it is from now on."""
     return Wreck(
         position_ned_m=np.array(truth.position_ned_m),

@@ -1,4 +1,4 @@
-"""Rotor power by regression, and the battery that pays for the flight."""
+"""Rotor power by regression, and the battery model."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ KMH_PER_MPS = 3.6
 GRAMS_PER_KG = 1000.0
 SECONDS_PER_HOUR = 3600.0
 
-# Charge left at which a lithium cell has its empty, nominal, middle and full voltage. The middle
+# Remaining charge at a lithium cell's empty, nominal, middle and full voltage. The middle
 # voltage lies 30 % of the way from nominal to full: 3.85 V for an ordinary 4.2 V cell.
 _KNEES = np.array([0.0, 0.1, 0.5, 1.0])
 _MIDDLE = 0.3
 
 
 def regression_coefficients(energy: EnergyRegression, payload_kg: float) -> Vector:
-    """(7,) b1..b6 and the constant with the payload's share, for `regression_power`."""
+    """Return b1..b6 and the constant, which includes the payload (7,), for `regression_power`."""
     constant = energy.b9 + energy.b7 * payload_kg * GRAMS_PER_KG
     return np.array([energy.b1, energy.b2, energy.b3, energy.b4, energy.b5, energy.b6, constant])
 
 
 def battery_parameters(battery: Battery) -> Vector:
-    """(8,) four open-circuit voltages at the knees, resistance, capacity C, efficiency, W."""
+    """Return four open-circuit voltages, resistance, capacity C, efficiency and W (8,)."""
     middle = battery.cell_nominal_v + _MIDDLE * (battery.cell_full_v - battery.cell_nominal_v)
     cells = (battery.cell_empty_v, battery.cell_nominal_v, middle, battery.cell_full_v)
     return np.array(
@@ -45,10 +45,10 @@ def battery_parameters(battery: Battery) -> Vector:
 
 @compiled
 def regression_power(velocity_mps: Vector, acceleration_mps2: Vector, b: Vector) -> float:
-    """Rotor power, W, from velocity (3,) and acceleration (3,) and coefficients (7,).
+    """Return rotor power, W, for velocity (3,), acceleration (3,) and coefficients (7,).
 
-    Tseng et al., arXiv 1703.10049, with speeds and accelerations in km/h as in AirSim's fork.
-    Never below zero.
+    The regression is that of Tseng et al., arXiv 1703.10049, with speeds and accelerations in km/h
+    as in AirSim's fork. The result is never below zero.
     """
     v = KMH_PER_MPS * math.sqrt(velocity_mps[0] ** 2 + velocity_mps[1] ** 2)
     a = KMH_PER_MPS * math.sqrt(acceleration_mps2[0] ** 2 + acceleration_mps2[1] ** 2)
@@ -62,7 +62,7 @@ def regression_power(velocity_mps: Vector, acceleration_mps2: Vector, b: Vector)
 
 @compiled
 def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
-    """Voltage of the unloaded pack, V, at a charge left in 0..1."""
+    """Return the voltage of the unloaded pack, V, at a remaining charge in 0..1."""
     for segment in range(3):
         if remaining <= _KNEES[segment + 1]:
             share: float = (remaining - _KNEES[segment]) / (_KNEES[segment + 1] - _KNEES[segment])
@@ -74,9 +74,9 @@ def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
 
 @compiled
 def battery_current(power_w: float, open_circuit_v: float, resistance_ohm: float) -> float:
-    """Current, A, at which the loaded pack delivers a power; the most it can where it cannot.
+    """Return the current, A, at which the loaded pack delivers a power, or its maximum power.
 
-    The smaller root of P = I (V - I R), in the form that does not cancel.
+    It is the smaller root of P = I (V - I R), in the form without cancellation.
     """
     if 4.0 * resistance_ohm * power_w > open_circuit_v * open_circuit_v:
         return open_circuit_v / (2.0 * resistance_ohm)

@@ -1,4 +1,4 @@
-"""Renders a vehicle profile as JSBSim files: planet, aircraft, motor and propeller."""
+"""Writes a vehicle profile as JSBSim files: planet, aircraft, motor and propeller."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 
 from sitl.vehicle.profile import GRAVITY_MPS2, Rotor, VehicleProfile
 
-# A planet that does not turn and is flat over a world: the ground falls away from the tangent
+# A planet that does not turn and is flat over a world. The ground falls below the tangent
 # plane at its (latitude, longitude) origin by 0.05 mm at 100 m. Gravity is the standard one.
 PLANET_RADIUS_M = 1.0e8
 AIRCRAFT = "quadrotor"
@@ -23,7 +23,7 @@ _METRE_PER_FOOT = 0.3048
 
 
 def write_model(profile: VehicleProfile, root: Path) -> None:
-    """Write the JSBSim files of a profile below `root`: planet.xml, aircraft/, engine/."""
+    """Write the JSBSim files of a profile below `root`: planet.xml, aircraft/ and engine/."""
     aircraft = root / "aircraft" / AIRCRAFT
     engine = root / "engine"
     aircraft.mkdir(parents=True)
@@ -45,7 +45,7 @@ def _value(parent: ET.Element, tag: str, value: float, unit: str = "") -> None:
 def _location(
     parent: ET.Element, forward_m: float, right_m: float, up_m: float, name: str = ""
 ) -> None:
-    """A structural location: x aft, y right, z up."""
+    """Add a structural location: x aft, y right, z up."""
     place = ET.SubElement(parent, "location", {"unit": "M", **({"name": name} if name else {})})
     for tag, value in zip("xyz", (-forward_m, right_m, up_m), strict=True):
         _value(place, tag, value)
@@ -130,13 +130,14 @@ def _motor(rotor: Rotor) -> ET.Element:
     return motor
 
 
-INFLOW_SLOPE = 0.35  # of the thrust share at J = 0
+INFLOW_SLOPE = 0.35  # slope of the thrust share at J = 0
 
 
 def thrust_share(relative_advance: float) -> float:
-    """C_T / static C_T at J / J(zero thrust): a shape common to fixed-pitch propellers.
+    """Return C_T / static C_T at J / J(zero thrust), a shape common to fixed-pitch propellers.
 
-    Falls slowly at first and then faster; assumption, within 5 % of published 9-inch data.
+    It falls slowly at first and then faster. This is an assumption, within 5 % of published 9-inch
+    data.
     """
     if relative_advance < 0.0:
         return 1.0 - INFLOW_SLOPE * relative_advance
@@ -144,7 +145,7 @@ def thrust_share(relative_advance: float) -> float:
 
 
 def power_share(relative_advance: float) -> float:
-    """C_P / static C_P at J / J(zero thrust); see `thrust_share`."""
+    """Return C_P / static C_P at J / J(zero thrust); see `thrust_share`."""
     if relative_advance < 0.0:
         return 1.0 - 0.2 * relative_advance
     return max(1.0 - 0.2 * relative_advance - 0.7 * relative_advance**2, 0.02)

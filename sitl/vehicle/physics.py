@@ -1,4 +1,4 @@
-"""JSBSim behind a narrow door: motor commands in, raw state out, nothing printed or written."""
+"""Wrapper of JSBSim: takes motor commands, returns the raw state, prints and writes nothing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sitl.vehicle.profile import VehicleProfile
 FOOT_M = 0.3048
 FOOT_POUND_J = 1.3558179483314004
 
-# What is read after a step, in this order. Earth-centred axes at latitude and longitude zero are
+# Properties to read after a step, in order. Earth-centred axes at latitude and longitude zero are
 # (up, east, north), so positions and velocities are those of the tangent plane itself.
 RAW_PROPERTIES = (
     "position/ecef-z-ft",
@@ -47,7 +47,7 @@ RAW_SIZE = len(RAW_PROPERTIES)
 
 
 class Physics:
-    """One JSBSim instance that flies a profile over flat, still ground."""
+    """A JSBSim instance that flies a profile over flat, fixed ground."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Physics:
         self._run = self._fdm.run
 
     def advance(self, commands: NDArray[np.float64]) -> None:
-        """One step with motor commands (4,) in 0..1."""
+        """Advance one step with motor commands (4,) in 0..1."""
         for write, command in zip(self._writers, commands.tolist(), strict=True):
             write(command)
         self._run()
@@ -106,7 +106,7 @@ def _load(profile: VehicleProfile, folder: Path, dt_s: float) -> jsbsim.FGFDMExe
 
 
 def _place(fdm: jsbsim.FGFDMExec, position_ned_m: NDArray[np.float64], heading_rad: float) -> None:
-    """Start at rest at a position (3,) and heading."""
+    """Set the initial state: at rest at a position (3,) and heading."""
     north, east, down = (float(value) for value in position_ned_m)
     up = PLANET_RADIUS_M - down
     fdm["ic/lat-geod-rad"] = math.atan2(north, math.hypot(up, east))

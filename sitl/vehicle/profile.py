@@ -1,4 +1,4 @@
-"""Vehicle profiles: one TOML file describes one quadrotor completely."""
+"""Vehicle profiles. One TOML file describes one quadrotor completely."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
 
-AIR_DENSITY_KGPM3 = 1.225  # ISA sea level, which is where the physics world lies
+AIR_DENSITY_KGPM3 = 1.225  # ISA at sea level
 GRAVITY_MPS2 = 9.80665
-MIN_THRUST_TO_WEIGHT = 1.15  # below it there is nothing left to steer and climb with
+MIN_THRUST_TO_WEIGHT = 1.15  # reserve for control and climb
 
 LARGEST_TILT_DEG = 60.0
-LEVEL_SHARE = 0.9  # of the acceleration that the tilt limit allows, which the controller asks for
+LEVEL_SHARE = 0.9  # controller's fraction of the acceleration that the tilt limit allows
 
 Triple = tuple[float, float, float]
 
@@ -33,7 +33,7 @@ _MAY_BE_ZERO = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rotor:
-    """Four equal rotors on the diagonals of an X frame, and the motors that turn them."""
+    """Four equal rotors on the diagonals of an X frame, with their motors."""
 
     arm_m: float  # from the centre to each rotor axis
     height_m: float  # rotor plane above the centre of mass
@@ -55,7 +55,7 @@ class Rotor:
 
     @property
     def torque_per_thrust_m(self) -> float:
-        """Drag torque of a rotor per newton of its thrust, m: C_P D / (2 pi C_T)."""
+        """Drag torque of a rotor per newton of thrust, m: C_P D / (2 pi C_T)."""
         return self.power_coefficient * self.diameter_m / (2.0 * math.pi * self.thrust_coefficient)
 
     @property
@@ -64,7 +64,7 @@ class Rotor:
         return 60.0 / (2.0 * math.pi * self.motor_kv_rpmpv)
 
     def hover_power_w(self, mass_kg: float) -> float:
-        """Shaft power of all four rotors when a mass hovers, W: static C_P at the speed of C_T."""
+        """Return the shaft power of all four rotors in hover, W: static C_P at the speed of C_T."""
         thrust_n = mass_kg * GRAVITY_MPS2 / 4.0
         speed_hz = math.sqrt(thrust_n / self.max_thrust_n) * self.max_rpm / 60.0
         power = self.power_coefficient * AIR_DENSITY_KGPM3 * speed_hz**3 * self.diameter_m**5
@@ -72,13 +72,13 @@ class Rotor:
 
     @property
     def full_throttle_voltage_v(self) -> float:
-        """Voltage at which the static propeller turns at `max_rpm`: what throttle 1 applies."""
+        """Voltage at which the static propeller turns at `max_rpm`, applied at throttle 1."""
         torque_nm = self.max_thrust_n * self.torque_per_thrust_m
         current_a = torque_nm / self.torque_constant_nmpa + self.motor_no_load_current_a
         return self.max_rpm / self.motor_kv_rpmpv + current_a * self.motor_resistance_ohm
 
     def time_constant_s(self, thrust_n: float) -> float:
-        """Lag of rotor speed behind voltage, s, linearised at a static thrust per rotor, N.
+        """Return the lag of rotor speed behind voltage, s, linearised at a thrust per rotor, N.
 
         J dw/dt = Kt (V - w Kt) / R - Q(w), with Q proportional to w^2.
         """
@@ -102,28 +102,28 @@ class Gear:
 
     leg_radius_m: float  # from the centre, horizontally
     height_m: float  # centre of mass above the unloaded feet
-    natural_frequency_radps: float = 40.0  # of the vehicle on its springs
+    natural_frequency_radps: float = 40.0  # vehicle on its springs
     damping_ratio: float = 0.6
     friction: float = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Battery:
-    """A lithium pack and everything between it and the shafts."""
+    """A lithium pack with the drive train up to the shafts."""
 
     cells: int
     capacity_ah: float
     cell_full_v: float = 4.2
     cell_nominal_v: float = 3.7
     cell_empty_v: float = 3.3
-    resistance_ohm: float  # of the whole pack
+    resistance_ohm: float  # resistance of the whole pack
     drive_efficiency: float  # motor and speed controller, shaft power / electrical power
     avionics_w: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """What the flight controller never asks for more of."""
+class ControlLimits:
+    """Limits of the flight controller's setpoints."""
 
     tilt_deg: float = 35.0
     horizontal_speed_mps: float = 12.0
@@ -136,11 +136,11 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnergyRegression:
-    """Coefficients of the multiple regression of rotor power; speeds in km/h, as published.
+    """Coefficients of the published multiple regression of rotor power, with speeds in km/h.
 
     P = b1 v + b2 a + b3 v a + b4 vz + b5 az + b6 vz az + b7 m + b9, with horizontal v, a and
     vertical vz, az as magnitudes in km/h and km/h/s, and m the payload in grams
-    (Tseng et al., arXiv 1703.10049). The wind term b8 is zero here: there is no wind.
+    (Tseng et al., arXiv 1703.10049). The wind term b8 is zero, because there is no wind.
     """
 
     b1: float
@@ -168,7 +168,7 @@ class VehicleProfile:
     drag: Drag
     gear: Gear
     battery: Battery
-    limits: Limits
+    limits: ControlLimits
     energy: EnergyRegression
 
     def __post_init__(self) -> None:
@@ -217,7 +217,7 @@ class VehicleProfile:
 
     @property
     def physics(self) -> dict[str, float]:
-        """What a flight's record says of the vehicle: take-off mass, static thrust, hover power."""
+        """Return take-off mass, static thrust and hover power for a flight's record."""
         return {
             "mass_kg": self.total_mass_kg,
             "rotor_pull_n": self.max_thrust_n,
@@ -231,13 +231,13 @@ class VehicleProfile:
 
     @property
     def rest_height_m(self) -> float:
-        """Height of the centre of mass above the ground when standing on its legs, m."""
+        """Height of the centre of mass above the ground when the vehicle stands on its legs, m."""
         sag_m = GRAVITY_MPS2 / self.gear.natural_frequency_radps**2
         return self.gear.height_m - sag_m
 
 
 def _numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Every number of a nested dataclass with its dotted key."""
+    """Yield every number of a nested dataclass with its dotted key."""
     for field in dataclasses.fields(record):
         value, key = getattr(record, field.name), f"{prefix}{field.name}"
         if dataclasses.is_dataclass(value):

@@ -1,4 +1,4 @@
-"""Vehicle profiles in TOML files: the ones that come with the package, or a user's own."""
+"""Loads vehicle profiles from TOML files: shipped ones, or a user's own."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ _PROFILES = Path(__file__).parent / "profiles"
 
 
 def profile_names() -> list[str]:
-    """The names of the profiles that come with the package."""
+    """Return the names of the shipped profiles."""
     return sorted(path.stem for path in _PROFILES.glob("*.toml"))
 
 
 def load_profile(name_or_path: str) -> VehicleProfile:
-    """A shipped profile by name, or any profile by the path of its TOML file.
+    """Load a shipped profile by name, or any profile by the path of its TOML file.
 
-    A file with a `base` scales a shipped profile, see `sitl.vehicle.stand_in`.
+    A file with a `base` scales a shipped profile; see `sitl.vehicle.stand_in`.
 
     Raises:
-        UnknownName: neither a shipped profile nor a TOML path.
-        ConfigError: the file cannot be read, or describes no vehicle that can fly.
+        UnknownName: It is neither a shipped profile nor a TOML path.
+        ConfigError: The file cannot be read, or its vehicle cannot fly.
     """
     if name_or_path in profile_names():
         return load_toml(_PROFILES / f"{name_or_path}.toml", VehicleProfile)

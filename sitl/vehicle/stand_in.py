@@ -1,7 +1,7 @@
-"""A shipped quadrotor that stands in for another one: what a profile with a `base` says.
+"""A shipped quadrotor scaled to stand in for another one, defined by a profile with a `base`.
 
-Mass, rotor pull, hovering power and battery become those of the other vehicle. Its size, propellers
-and drag stay those of the base.
+Mass, rotor pull, hover power and battery become those of the other vehicle. Size, propellers and
+drag stay those of the base.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from sitl.vehicle.profile import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StandIn:
-    """A profile that scales another; None leaves what the base has."""
+    """A profile that scales another. None keeps the value of the base."""
 
     name: str
-    base: str  # a shipped profile
+    base: str  # name of a shipped profile
     description: str = ""
     mass_kg: float | None = None  # ready to fly, without payload
     extra_payload_kg: float = 0.0
     rotor_pull_n: float | None = None  # static thrust of all rotors at full throttle
-    acceleration_mps2: float | None = None  # horizontal, that the tilt limit must allow
-    hover_power_w: float | None = None  # electrical, of the rotors, hovering at mass_kg
+    acceleration_mps2: float | None = None  # horizontal acceleration that the tilt limit must allow
+    hover_power_w: float | None = None  # electrical power of the rotors in hover at mass_kg
     battery_wh: float | None = None
-    avionics_w: float | None = None  # everything that draws power but the rotors
+    avionics_w: float | None = None  # power of everything except the rotors
 
     def __post_init__(self) -> None:
         for key in ("mass_kg", "rotor_pull_n", "hover_power_w", "battery_wh", "acceleration_mps2"):
@@ -41,19 +41,19 @@ class StandIn:
                 raise ValueError(f"{key}: must be above zero, is {value:g}")
 
     def profile(self, base: VehicleProfile) -> VehicleProfile:
-        """The quadrotor.
+        """Return the scaled quadrotor.
 
-        - Inertia grows with mass_kg: the same shape, more of it. Payload adds none, it is at the
-          centre of mass.
-        - The rotors turn faster for more pull: thrust ~ n^2, so n by the square root of the ratio.
-          The motors' Kv grows with it, so that the voltage at full throttle stays within the
+        - Inertia grows with mass_kg, because the shape stays the same. Payload adds none, because
+          it is at the centre of mass.
+        - The rotors turn faster for more pull. Thrust ~ n^2, so n grows with the square root of the
+          ratio. The motors' Kv grows with n, so that the voltage at full throttle stays within the
           battery's.
-        - The drive's efficiency is what makes the base's propellers take hover_power_w.
-        - The tilt limit is raised where acceleration_mps2 needs it, to LARGEST_TILT_DEG at most.
+        - The drive's efficiency is set so that the base's propellers take hover_power_w.
+        - The tilt limit is raised if acceleration_mps2 needs it, to LARGEST_TILT_DEG at most.
 
         Raises:
-            ConfigError: the profile cannot fly; says the numbers.
-            ValueError: the propellers take more power at their shafts than hover_power_w.
+            ConfigError: The profile cannot fly. Gives the numbers.
+            ValueError: The propellers take more shaft power than hover_power_w.
         """
         mass_kg = self.mass_kg or base.mass_kg
         rotor = _with_pull(base, self.rotor_pull_n or base.max_thrust_n)

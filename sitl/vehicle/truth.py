@@ -1,4 +1,4 @@
-"""What is really so: the vehicle's state at the end of a physics step."""
+"""True state of the vehicle at the end of a physics step."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ TRUTH_SIZE = 33
 
 
 class Truth:
-    """Read-only view of the newest state; refreshed in place, so copy what must last.
+    """Read-only view of the newest state. It is updated in place, so copy values to keep them.
 
-    Position is that of the centre of mass in the NED frame whose origin is the world origin
-    on the ground.
+    The position is that of the centre of mass in the NED frame at the world origin on the ground.
     """
 
     __slots__ = (
@@ -45,7 +44,7 @@ class Truth:
     def __init__(self, flat: NDArray[np.float64]) -> None:
         view = flat.view()
         view.flags.writeable = False
-        self.flat = view  # (TRUTH_SIZE,) everything, in the order of the T_ constants
+        self.flat = view  # (TRUTH_SIZE,) all values in the order of the T_ constants
         self.position_ned_m = view[T_POSITION : T_POSITION + 3]  # (3,)
         self.velocity_ned_mps = view[T_VELOCITY : T_VELOCITY + 3]  # (3,)
         self.acceleration_ned_mps2 = view[T_ACCELERATION : T_ACCELERATION + 3]  # (3,)
@@ -56,12 +55,12 @@ class Truth:
 
     @property
     def stamp_s(self) -> float:
-        """Simulated time since the vehicle was made, s."""
+        """Simulated time since the creation of the vehicle, s."""
         return float(self.flat[T_STAMP])
 
     @property
     def on_ground(self) -> bool:
-        """Whether a landing leg carries weight."""
+        """True if a landing leg carries weight."""
         return bool(self.flat[T_ON_GROUND] > 0.5)
 
     @property
@@ -71,12 +70,12 @@ class Truth:
 
     @property
     def battery_current_a(self) -> float:
-        """Current drawn, A."""
+        """Battery current, A."""
         return float(self.flat[T_CURRENT])
 
     @property
     def battery_remaining(self) -> float:
-        """Charge left, 0..1."""
+        """Remaining charge, 0..1."""
         return float(self.flat[T_REMAINING])
 
     @property

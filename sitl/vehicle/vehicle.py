@@ -1,4 +1,4 @@
-"""A quadrotor with its flight controller, stepped at a fixed rate."""
+"""A quadrotor with its flight controller, simulated at a fixed rate."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def euler_quaternion(roll: float, pitch: float, yaw: float, out: Vector) -> None
 
 @compiled
 def observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
-    """Refresh the motion and the rotors in `truth` from JSBSim's raw state."""
+    """Update motion and rotors in `truth` from JSBSim's raw state."""
     for axis in range(3):
         sign = -1.0 if axis == 2 else 1.0
         velocity = sign * raw[RAW_VELOCITY + axis] * FOOT_M
@@ -109,7 +109,7 @@ def observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
 def account_energy(
     truth: Vector, regression: Vector, battery: Vector, dt_s: float, armed: bool
 ) -> None:
-    """Refresh powers, energies and battery in `truth` after a step of `dt_s`."""
+    """Update powers, energies and battery in `truth` after a step of `dt_s`."""
     power_w = 0.0
     if armed:
         velocity = truth[T_VELOCITY : T_VELOCITY + 3]
@@ -137,7 +137,7 @@ def refresh(
     truth: Vector,
     measurement: Vector,
 ) -> None:
-    """Refresh `truth` and the controller's `measurement` in place after a step of `dt_s`."""
+    """Update `truth` and the controller's `measurement` in place after a step of `dt_s`."""
     observe_motion(raw, dt_s, truth)
     for rotor in range(4):
         truth[T_COMMANDS + rotor] = commands[rotor]
@@ -149,15 +149,15 @@ def refresh(
     measurement[M_ON_GROUND] = truth[T_ON_GROUND]
 
 
-class Vehicle:
-    """Physics and flight controller of one quadrotor; deterministic.
+class Quadrotor:
+    """Deterministic physics and flight controller of one quadrotor.
 
     Args:
-        profile: what flies.
-        position_enu_m: (3,) where it starts at rest; below its standing height it stands on the
-            ground, with the centre of mass `profile.rest_height_m` above it.
-        yaw_enu_rad: from east, counter-clockwise.
-        dt_s: physics and control step.
+        profile: Vehicle profile.
+        position_enu_m: Initial position (3,) at rest. A position below the standing height is
+            raised to it: the centre of mass is then `profile.rest_height_m` above the ground.
+        yaw_enu_rad: Yaw, counter-clockwise from east.
+        dt_s: Physics and control step, s.
     """
 
     def __init__(
@@ -191,12 +191,12 @@ class Vehicle:
         self._refresh(np.zeros(4), 0.0, armed=False)
 
     def step(self, setpoint: Vector, armed: bool) -> None:
-        """Advance one physics step, flight controller included.
+        """Advance physics and flight controller by one step.
 
         Args:
-            setpoint: (11,) x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s, m/s^2, rad,
-                rad/s; not finite means "not controlled".
-            armed: motors stand still while it is false.
+            setpoint: Setpoint (11,): x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s,
+                m/s^2, rad, rad/s. Values that are not finite are not controlled.
+            armed: False stops the motors.
         """
         self._state, commands = control_step(
             self._state, self._measurement, setpoint, self._gains, armed

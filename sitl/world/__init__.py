@@ -1,7 +1,7 @@
-"""Worlds: boxes on a flat ground, with a start and a goal; the same for the same seed.
+"""Worlds: boxes on flat ground with a start and a goal. The same seed gives the same world.
 
-`load_world` takes a name (`world_names()`), a generator spec `gen:density,size`, or the path of
-a TOML file, and gives a `World`.
+`load_world` takes a name (`world_names()`), a generator spec `gen:density,size`, or the path of a
+TOML file, and returns a `World`.
 """
 
 from sitl.world.load import load_world, world_names

@@ -1,8 +1,8 @@
-"""Whether a world can be flown: clear start and goal, and a path with a given clearance.
+"""Checks if a world is flyable: clear start and goal, and a path with a given clearance.
 
-The path is searched on a flat grid at the goal's height, 8-connected. A cell is free where its
-centre keeps the clearance from every box that reaches into the slab of that height; so the
-answer is as fine as the grid, and flying over or under an obstacle is not counted on.
+The path is searched on an 8-connected flat grid at the goal's height. A cell is free if its centre
+keeps the clearance from every box that reaches into the slab of that height. The result has the
+grid's resolution and ignores paths over or under an obstacle.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 DEFAULT_CLEARANCE_M = 2.0
-"""Half-width of the planner's drone box (reference facts, section 4.1)."""
+"""Half-width of the planner's drone box in the released code (MAVBench/MAV_apps, branch mavfi)."""
 
 _STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldCheck:
-    """What `check_world` found; lengths in m."""
+    """Result of `check_world`, lengths in m."""
 
-    clearance_m: float  # asked for
-    start_clearance_m: float  # in plan, inf where there is no box
+    clearance_m: float  # requested clearance
+    start_clearance_m: float  # horizontal distance to the nearest box; inf without boxes
     goal_clearance_m: float
-    straight_m: float  # from start to goal in plan
-    path_m: float | None  # a shortest way on the grid, straightened; None where there is none
-    path_enu_m: Vector  # (n, 3) its corners at flight height, empty where there is none
+    straight_m: float  # horizontal distance from start to goal
+    path_m: float | None  # length of a shortest path on the grid, straightened; None if none exists
+    path_enu_m: Vector  # (n, 3) its corners at flight height; empty if none exists
 
     @property
     def path_exists(self) -> bool:
-        """Whether a path with the clearance was found."""
+        """True if there is a path with the clearance."""
         return self.path_m is not None
 
 
 def check_world(
     world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M, cell_m: float = 0.5
 ) -> WorldCheck:
-    """Search a path from start to goal that keeps `clearance_m` from every box."""
+    """Search a path from start to goal with `clearance_m` to every box."""
     height = float(world.goal_enu_m[2])
     free, origin = free_grid(world, height, clearance_m, cell_m)
     cells = [_cell(p, origin, cell_m) for p in (world.start_enu_m, world.goal_enu_m)]
@@ -70,7 +70,7 @@ def check_world(
 def free_grid(
     world: World, height_m: float, clearance_m: float, cell_m: float
 ) -> tuple[Mask, Vector]:
-    """Free cells (columns, rows) at a height, and the grid's lower corner (2,), ENU m."""
+    """Return the free cells (columns, rows) at a height, and the lower corner (2,), ENU m."""
     origin = world.bounds_enu_m[:2]
     count = np.maximum(1, np.ceil((world.bounds_enu_m[3:5] - origin) / cell_m)).astype(int)
     x = origin[0] + (np.arange(count[0]) + 0.5) * cell_m
@@ -93,7 +93,7 @@ def _cell(place: Vector, origin: Vector, cell_m: float) -> tuple[int, int]:
 def _shortest(
     free: Mask, start: tuple[int, int], goal: tuple[int, int]
 ) -> list[tuple[int, int]] | None:
-    """Dijkstra with the straight line as heuristic (A*): the cells of a shortest way."""
+    """Return the cells of a shortest path, found by A* with the straight line as heuristic."""
     shape = free.shape
     start = (min(start[0], shape[0] - 1), min(start[1], shape[1] - 1))
     goal = (min(goal[0], shape[0] - 1), min(goal[1], shape[1] - 1))
@@ -132,7 +132,7 @@ def _trace(
 
 
 def _straighten(free: Mask, cells: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The same way with fewer corners: each is joined to the last one that it sees."""
+    """Remove corners: connect each to the last one in line of sight."""
     corners = [cells[0]]
     at = 0
     while at < len(cells) - 1:
@@ -147,7 +147,7 @@ def _straighten(free: Mask, cells: list[tuple[int, int]]) -> list[tuple[int, int
 
 
 def _sees(free: Mask, a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Whether every cell on the straight way between two cells is free."""
+    """Return True if every cell on the straight line between two cells is free."""
     count = 4 * max(abs(b[0] - a[0]), abs(b[1] - a[1])) + 1
     line = np.rint(np.linspace(a, b, count)).astype(int)
     return bool(free[line[:, 0], line[:, 1]].all())

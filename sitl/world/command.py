@@ -1,4 +1,4 @@
-"""The command line of worlds: list, make, check, draw."""
+"""Command line of worlds: list, make, check and draw."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import click
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_svg, write_atomically, write_text
 from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
-from sitl.world.generate import Pair
+from sitl.world.generate import GeneratorParams
 from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, world_names
 from sitl.world.scene import read_scene, scene_toml
 from sitl.world.world import World, show
@@ -25,14 +25,14 @@ _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a T
 
 
 class _Place(click.ParamType[tuple[float, ...]]):
-    """Three numbers with commas between: east, north, up in m."""
+    """Parameter type of three comma-separated numbers: east, north, up in m."""
 
     name = "x,y,z"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """(3,) finite numbers, or a usage error."""
+        """Return three finite numbers (3,), or fail with a usage error."""
         try:
             place = tuple(float(part) for part in str(value).split(","))
         except ValueError:
@@ -46,12 +46,12 @@ def _world_options(command: F) -> F:
     decorators = [
         click.argument("name", metavar="WORLD"),
         click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True),
-        click.option("--start", type=_Place(), help="Where flights start, ENU m. See --goal."),
+        click.option("--start", type=_Place(), help="Start of flights, ENU m. See --goal."),
         click.option(
             "--goal",
             type=_Place(),
-            help="Where they go, ENU m. A generated world is made round start and goal: another "
-            "place moves its bounds, and towers within 3 m of it are left out.",
+            help="Goal of flights, ENU m. A generated world is built round start and goal: a "
+            "change moves the bounds, and towers within 3 m of start and goal are left out.",
         ),
         click.option("--json", "as_json", is_flag=True, help="The result as JSON."),
     ]
@@ -64,16 +64,16 @@ def _world_options(command: F) -> F:
 def world() -> None:
     """List, make, check and draw worlds: boxes on flat ground, a start and a goal.
 
-    A generated world holds, in each cell of 10 x 10 m, with a given probability a square tower of
-    unlimited height. A fixed scene always looks the same; there the seed chooses start and goal.
-    The same seed always gives the same world.
+    Each cell of 10 x 10 m of a generated world contains a square tower of unlimited height with a
+    given probability. A fixed scene is always the same, and the seed chooses start and goal. The
+    same seed always gives the same world.
     """
 
 
 @world.command(name="list")
 @click.option("--json", "as_json", is_flag=True, help="The result as JSON.")
 def list_(as_json: bool) -> None:
-    """Every world that has a name."""
+    """List all named worlds."""
     rows = [(name, _describe(name)) for name in world_names()]
     if as_json:
         click.echo(json.dumps([{"name": n, "description": d} for n, d in rows], indent=1))
@@ -91,7 +91,7 @@ def _describe(name: str) -> str:
     return use + _describe_pair(pair)
 
 
-def _describe_pair(pair: Pair) -> str:
+def _describe_pair(pair: GeneratorParams) -> str:
     return (
         f"towers of {pair.size_m:g} x {pair.size_m:g} m in {100 * pair.density:g} % "
         "of the 10 x 10 m cells"
@@ -109,7 +109,7 @@ def make(
     as_json: bool,
     output: Path | None,
 ) -> None:
-    """Write a world as a TOML file of boxes, which every --world option takes."""
+    """Write a world as a TOML file of boxes, which every --world option accepts."""
     made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
     text = scene_toml(made)
     if output is not None:
@@ -129,9 +129,9 @@ def make(
     type=click.FloatRange(min=0.0),
     default=DEFAULT_CLEARANCE_M,
     show_default=True,
-    help="Room that the way must leave to every box, m.",
+    help="Clearance of the path from every box, m.",
 )
-@click.option("--expect", type=click.Choice(["path"]), help="Exit with 1 where there is no path.")
+@click.option("--expect", type=click.Choice(["path"]), help="Exit with 1 if there is no path.")
 def check(
     name: str,
     seed: int,
@@ -141,10 +141,10 @@ def check(
     clearance: float,
     expect: str | None,
 ) -> None:
-    """Check a world: start and goal are clear, and a path with the clearance exists.
+    """Check that start and goal are clear and that a path with the clearance exists.
 
-    The path is searched on a grid of 0.5 m at the goal's height; flying over or under an obstacle
-    is not counted on.
+    The path is searched on a grid of 0.5 m at the goal's height. Paths over or under an obstacle
+    are ignored.
     """
     made = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
     found = check_world(made, clearance_m=clearance)
@@ -159,7 +159,7 @@ def check(
 @world.command(epilog=_WORLD_HELP)
 @_world_options
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="SVG file  [WORLD-SEED.svg].")
-@click.option("--path", "with_path", is_flag=True, help="Draw the way that `check` finds, too.")
+@click.option("--path", "with_path", is_flag=True, help="Also draw the path that `check` finds.")
 def draw(
     name: str,
     seed: int,
@@ -223,7 +223,7 @@ def _world_json(made: World) -> dict[str, Any]:
 
 def _check_json(found: WorldCheck) -> dict[str, Any]:
     def finite(value: float) -> float | None:
-        """JSON knows no infinity: None."""
+        """Return None for infinity, which JSON lacks."""
         return value if math.isfinite(value) else None
 
     return {
@@ -237,7 +237,7 @@ def _check_json(found: WorldCheck) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line: 0 done, 1 a known error in one line, 2 usage."""
+    """Run the command line. Return 0 if done, 1 for a known error, 2 for wrong usage."""
     try:
         world.main(args=arguments, prog_name="mavfi world", standalone_mode=False)
     except click.ClickException as error:

@@ -1,4 +1,4 @@
-"""The top view of a world as an SVG for a page: obstacles, start, goal, scale."""
+"""Top view of a world as SVG: obstacles, start, goal and scale."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _WIDTH_IN = 5.2
 
 
 def world_svg(world: World, path_enu_m: Vector | None = None) -> bytes:
-    """The SVG of a world seen from above, east to the right and north up, axes in m.
+    """Return the SVG of a world from above, east to the right and north up, axes in m.
 
-    Boxes that end a metre or more below the goal's height are drawn green: the flight passes
-    over them. The same world gives the same bytes.
+    Boxes that end 1 m or more below the goal's height are green, because the flight passes over
+    them. The same world gives the same bytes.
 
     Args:
-        world: what to draw.
-        path_enu_m: (n, 3) a way to draw from start to goal, or None.
+        world: World to draw.
+        path_enu_m: Path (n, 3) from start to goal to draw, or None.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -72,7 +72,7 @@ def _draw_boxes(axes: Axes, world: World) -> None:
     from matplotlib.patches import Rectangle
 
     named: set[str] = set()
-    # Tall ones last, so that a hedge never hides a wall.
+    # Tall boxes last, so that a hedge never hides a wall.
     for box in sorted(world.boxes_enu_m.tolist(), key=lambda b: b[5]):
         low = box[5] <= float(world.goal_enu_m[2]) - 1.0
         label = "low obstacle" if low else "obstacle"
@@ -99,7 +99,7 @@ def _draw_places(axes: Axes, world: World) -> None:
 
 
 def _draw_scale(axes: Axes, world: World) -> None:
-    """A bar of 1, 2 or 5 times a power of ten, about a sixth of the width, in a free corner."""
+    """Draw a bar of 1, 2 or 5 times a power of ten, about 1/6 of the width, in a free corner."""
     west, south, _, east, north, _ = (float(v) for v in world.bounds_enu_m)
     width = east - west
     power = 10.0 ** np.floor(np.log10(width / 6.0))
@@ -120,7 +120,7 @@ def _draw_scale(axes: Axes, world: World) -> None:
 
 
 def _is_empty(world: World, corner: tuple[float, float], width: float, height: float) -> bool:
-    """Whether no box, start or goal lies in a rectangle of the plan."""
+    """Return True if no box, start or goal lies in a rectangle of the plan."""
     boxes = world.boxes_enu_m
     places = np.array([world.start_enu_m, world.goal_enu_m])
     footprints = np.vstack([boxes[:, [0, 1, 3, 4]], np.hstack([places[:, :2], places[:, :2]])])

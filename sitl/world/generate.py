@@ -1,10 +1,10 @@
-"""The paper's environment generator: one cuboid of side n in a 10 x 10 m cell, or none.
+"""The paper's environment generator: each 10 x 10 m cell contains one cuboid or none.
 
-Source: paper, section VI-A; reference facts, section 7.1. A pair [density, size]: each cell
-holds, with probability `density`, a `size` x `size` m cuboid of unlimited height at its centre.
+The generator has two numbers (paper, section VI-A). With probability `density`, a cell contains a
+`size` x `size` m cuboid of unlimited height at its centre.
 
-Each cell draws from a stream of its own (seed, family, pair, cell), so a larger area only adds
-obstacles and never moves those that were there.
+Each cell draws from its own random stream (seed, family, density, size, cell), so a larger area
+only adds obstacles and never moves the others.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Vector = NDArray[np.float64]
 CELL_M = 10.0
 MARGIN_M = 20.0
 CLEAR_RADIUS_M = 3.0
-"""No obstacle stands nearer than this, in plan, to start or goal."""
+"""Minimum horizontal distance of an obstacle from start and goal."""
 
 UNLIMITED_HEIGHT_M = 1000.0
-"""Stands for "unlimited": beyond what a 300 s mission can climb at 3 m/s (900 m)."""
+"""Height of an unlimited obstacle; a 300 s mission can climb 900 m at 3 m/s."""
 
 CEILING_M = 50.0
 MAX_SPAN_M = 1000.0
@@ -37,12 +37,12 @@ DEFAULT_GOAL_ENU_M = (30.0, 40.0, 5.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pair:
-    """The generator's two numbers, and the family of seeds they are drawn from."""
+class GeneratorParams:
+    """The generator's two numbers and the family of the random streams."""
 
-    density: float  # probability that a cell holds an obstacle
+    density: float  # probability that a cell contains an obstacle
     size_m: float  # side of the cuboid
-    family: str = "evaluation"  # or "training": no world of one family is one of the other
+    family: str = "evaluation"  # or "training"; the families have no world in common
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.density <= 1.0:
@@ -51,13 +51,15 @@ class Pair:
             raise WorldError(f"size {self.size_m:g} m does not fit a cell (above 0, to {CELL_M:g})")
 
 
-def generate(name: str, pair: Pair, seed: int, start_enu_m: Vector, goal_enu_m: Vector) -> World:
-    """The world of a pair and a seed between a start (3,) and a goal (3,), ENU m.
+def generate(
+    name: str, pair: GeneratorParams, seed: int, start_enu_m: Vector, goal_enu_m: Vector
+) -> World:
+    """Generate the world of a pair and a seed between a start (3,) and a goal (3,), ENU m.
 
-    The area is start and goal with a margin of at least 20 m, in whole cells.
+    The area contains start and goal with a margin of at least 20 m, in whole cells.
 
     Raises:
-        WorldError: start and goal are more than 1000 m apart along an axis, or unusable.
+        WorldError: Start and goal are more than 1000 m apart along an axis, or unusable.
     """
     bounds = _area(start_enu_m, goal_enu_m)
     boxes = np.array(
@@ -96,7 +98,7 @@ def _cells(low_m: float, high_m: float) -> range:
     return range(math.floor(low_m / CELL_M), math.ceil(high_m / CELL_M))
 
 
-def _occupied(pair: Pair, seed: int, i: int, j: int) -> bool:
+def _occupied(pair: GeneratorParams, seed: int, i: int, j: int) -> bool:
     stream = generator(
         seed, Stream.WORLD, pair.family, f"{pair.density:g}", f"{pair.size_m:g}", i, j
     )

@@ -1,4 +1,4 @@
-"""From a name, a generator spec or a file to a world."""
+"""Loads a world by name, generator spec or file."""
 
 from __future__ import annotations
 
@@ -8,28 +8,30 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.core.errors import UnknownName, WorldError
-from sitl.world.generate import DEFAULT_GOAL_ENU_M, DEFAULT_START_ENU_M, Pair, generate
+from sitl.world.generate import DEFAULT_GOAL_ENU_M, DEFAULT_START_ENU_M, GeneratorParams, generate
 from sitl.world.scene import read_scene, world_of_scene
 from sitl.world.world import Vector, World
 
 SCENE_FOLDER = Path(__file__).parent / "scenes"
 
-GENERATED: dict[str, Pair] = {
-    "sparse": Pair(density=0.05, size_m=3.0),
-    "dense": Pair(density=0.2, size_m=5.0),
+GENERATED: dict[str, GeneratorParams] = {
+    "sparse": GeneratorParams(density=0.05, size_m=3.0),
+    "dense": GeneratorParams(density=0.2, size_m=5.0),
     **{
-        f"train-{density:g}-{size:g}": Pair(density=density, size_m=size, family="training")
+        f"train-{density:g}-{size:g}": GeneratorParams(
+            density=density, size_m=size, family="training"
+        )
         for density in (0.05, 0.2)
         for size in (3.0, 5.0)
     },
 }
-"""The paper's pairs (section VI-A): two to evaluate on, four to train on."""
+"""Pairs of the paper (section VI-A): two for evaluation, four for training."""
 
 SCENES: tuple[str, ...] = ("factory", "farm")
 
 
 def world_names() -> list[str]:
-    """Every world that has a name, evaluation worlds first."""
+    """Return the names of all worlds, evaluation worlds first."""
     trained = [name for name in GENERATED if name.startswith("train-")]
     return [*(name for name in GENERATED if name not in trained), *SCENES, *trained]
 
@@ -41,18 +43,18 @@ def load_world(
     start_enu_m: Sequence[float] | Vector | None = None,
     goal_enu_m: Sequence[float] | Vector | None = None,
 ) -> World:
-    """The world of a name, of `gen:density,size`, or of a TOML file, for one seed.
+    """Load a world by name, `gen:density,size` or TOML file for one seed.
 
     Args:
-        name_or_path: one of `world_names()`, a generator spec, or a path ending in `.toml`.
-        seed: non-negative; with the same seed the same world, always.
-        start_enu_m: (3,) where the flight starts, m; default: the world's own.
-        goal_enu_m: (3,) where it goes, m; default: the world's own.
+        name_or_path: One of `world_names()`, a generator spec, or a path ending in `.toml`.
+        seed: Non-negative seed. The same seed always gives the same world.
+        start_enu_m: Start of the flight (3,), m; default: the world's own.
+        goal_enu_m: Goal of the flight (3,), m; default: the world's own.
 
     Raises:
-        UnknownName: no such world; names the nearest.
-        WorldError: start or goal outside or blocked, or a generator spec that makes no world.
-        ConfigError: a file that cannot be used; with file, line and key.
+        UnknownName: No world has this name. Suggests the nearest.
+        WorldError: Start or goal is outside or blocked, or the generator spec is invalid.
+        ConfigError: The file cannot be used. Names file, line and key.
     """
     if seed < 0:
         raise WorldError(f"seed {seed} is negative")
@@ -84,12 +86,12 @@ def _is_path(text: str) -> bool:
     return text.endswith(".toml") or "/" in text
 
 
-def _pair_of_spec(text: str) -> Pair | None:
-    """The pair of `gen:density,size`, or None where the text is no such spec."""
+def _pair_of_spec(text: str) -> GeneratorParams | None:
+    """Parse `gen:density,size`. Return None if the text is not such a spec."""
     if not text.startswith("gen:"):
         return None
     try:
         density, size = (float(part) for part in text.removeprefix("gen:").split(","))
     except ValueError:
         raise WorldError(f"{text!r}: expected gen:density,size, such as gen:0.2,5") from None
-    return Pair(density=density, size_m=size)
+    return GeneratorParams(density=density, size_m=size)

@@ -1,6 +1,6 @@
-"""Fixed scenes: a TOML file of boxes, ours (`factory`, `farm`) or a user's.
+"""Fixed scenes: TOML files of boxes, shipped (`factory`, `farm`) or a user's own.
 
-    name = "yard"                          # optional, else the file's name
+    name = "yard"                          # optional, default: the file's name
     bounds_enu_m = [-20, -20, 0, 40, 40, 50]
     start_enu_m = [0, 0, 0]                # optional
     goal_enu_m = [30, 30, 5]               # optional
@@ -9,9 +9,9 @@
     min_enu_m = [10, 10, 0]
     max_enu_m = [12, 20, 8]
 
-Where start or goal is not given, the seed chooses it: a place with nothing within 3 m in plan,
-the goal at `flight_height_m` and within `goal_distance_m` of the start. So each seed of a fixed
-scene is a mission of its own.
+The seed chooses start and goal if they are not given. They have no obstacle within 3 m
+horizontally. The goal is at `flight_height_m` and within `goal_distance_m` of the start. Each seed
+of a fixed scene thus gives a different mission.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _TRIES = 2000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Box:
-    """One obstacle; corners in ENU, m."""
+    """One obstacle with its corners in ENU, m."""
 
     min_enu_m: list[float]
     max_enu_m: list[float]
@@ -50,7 +50,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """What a world file says."""
+    """Contents of a world file."""
 
     bounds_enu_m: list[float]
     name: str = ""
@@ -58,7 +58,7 @@ class Scene:
     start_enu_m: list[float] | None = None
     goal_enu_m: list[float] | None = None
     flight_height_m: float = 5.0
-    goal_distance_m: list[float] | None = None  # least and most, start to goal, in plan
+    goal_distance_m: list[float] | None = None  # horizontal limits, start to goal
     box: list[Box] | None = None
 
 
@@ -66,8 +66,9 @@ def read_scene(path: Path) -> Scene:
     """Read a world file.
 
     Raises:
-        ConfigError: unreadable, malformed, a missing or unknown key, a wrong number of
-            coordinates, or a box whose max is not beyond its min; with file, line and key.
+        ConfigError: The file is unreadable or malformed, a key is missing or unknown, the number
+            of coordinates is wrong, or the max of a box is not beyond its min. Names file, line and
+            key.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -119,10 +120,10 @@ def _line_of_box(text: str, index: int) -> int | None:
 def world_of_scene(
     scene: Scene, name: str, seed: int, start_enu_m: Vector | None, goal_enu_m: Vector | None
 ) -> World:
-    """The world of a scene; a start or goal that is given wins over the scene's own.
+    """Return the world of a scene. A given start or goal replaces the scene's own.
 
     Raises:
-        WorldError: start or goal is unusable, or the seed finds no clear place for it.
+        WorldError: Start or goal is unusable, or the seed finds no clear position for it.
     """
     boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box or []]).reshape(-1, 6)
     bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
@@ -161,7 +162,7 @@ def _choose(
     start: Vector | None,
     goal: Vector | None,
 ) -> tuple[Vector, Vector]:
-    """Draw what is not given until the pair is clear and as far apart as the scene asks."""
+    """Draw missing start and goal until they are clear and at the scene's distance."""
     stream = generator(seed, Stream.WORLD, "places", scene.name)
     least, most = scene.goal_distance_m or [45.0, 55.0]
     low, high = bounds[:2] + CLEAR_RADIUS_M, bounds[3:5] - CLEAR_RADIUS_M
@@ -186,7 +187,7 @@ def _is_clear(boxes: Vector, bounds: Vector, place: Vector) -> bool:
 
 
 def scene_toml(world: World) -> str:
-    """A world as the text of a world file; reading it back gives the same world."""
+    """Return a world as the text of a world file, which reads back as the same world."""
     lines = [
         f"name = {_quoted(world.name)}",
         f"bounds_enu_m = {_numbers(world.bounds_enu_m)}",

@@ -1,4 +1,4 @@
-"""A world: axis-aligned boxes on flat ground, where the flight starts, and where it goes."""
+"""A world: axis-aligned boxes on flat ground with a start and a goal."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from mavfi_cli.core.errors import WorldError
 Vector = NDArray[np.float64]
 
 START_CLEAR_M = 0.5
-"""A start nearer than this to a box is blocked: the vehicle could not stand there."""
+"""Minimum distance of a start from a box, as the vehicle must be able to stand there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class World:
-    """Boxes, bounds, start and goal in ENU; the ground is the plane z = 0.
+    """Boxes, bounds, start and goal in ENU. The ground is the plane z = 0.
 
     Raises:
-        WorldError: start or goal is outside the bounds or blocked, or a box has no volume.
+        WorldError: Start or goal is outside the bounds or blocked, or a box has no volume.
     """
 
     name: str
@@ -54,7 +54,7 @@ def _refuse_bad_places(world: World) -> None:
 
 
 def refuse_bad_start(name: str, boxes: Vector, bounds: Vector, start: Vector) -> None:
-    """Raise WorldError where a start (3,) is outside the bounds (6,) or too near a box (n, 6)."""
+    """Raise WorldError if a start (3,) is outside the bounds (6,) or too near a box (n, 6)."""
     _refuse_outside(name, bounds, "start", start)
     gaps = distance_to_boxes(boxes, start)
     if gaps.size and gaps.min() < START_CLEAR_M:
@@ -65,7 +65,7 @@ def refuse_bad_start(name: str, boxes: Vector, bounds: Vector, start: Vector) ->
 
 
 def refuse_bad_goal(name: str, boxes: Vector, bounds: Vector, goal: Vector) -> None:
-    """Raise WorldError where a goal (3,) is outside the bounds (6,) or inside a box (n, 6)."""
+    """Raise WorldError if a goal (3,) is outside the bounds (6,) or inside a box (n, 6)."""
     _refuse_outside(name, bounds, "goal", goal)
     gaps = distance_to_boxes(boxes, goal)
     if gaps.size and gaps.min() <= 0.0:
@@ -83,17 +83,17 @@ def _refuse_outside(name: str, bounds: Vector, what: str, place: Vector) -> None
 
 
 def show(place: Vector) -> str:
-    """A point as a person writes it: (30, 40, 5)."""
+    """Format a point like (30, 40, 5)."""
     return "(" + ", ".join(f"{float(c):g}" for c in place) + ")"
 
 
 def inside(bounds_enu_m: Vector, place_enu_m: Vector) -> bool:
-    """Whether a point (3,) is within the bounds (6,), their faces included; NaN is outside."""
+    """Return True if a point (3,) is within the bounds (6,) or on a face; NaN is outside."""
     return bool((place_enu_m >= bounds_enu_m[:3]).all() and (place_enu_m <= bounds_enu_m[3:]).all())
 
 
 def distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector) -> Vector:
-    """Distance (n,), m, from a point (3,) to each box (n, 6); zero inside."""
+    """Return the distance (n,), m, from a point (3,) to each box (n, 6); zero inside."""
     below = boxes_enu_m[:, :3] - place_enu_m
     above = place_enu_m - boxes_enu_m[:, 3:]
     gaps: Vector = np.linalg.norm(np.maximum(0.0, np.maximum(below, above)), axis=1)
@@ -101,7 +101,7 @@ def distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector) -> Vector:
 
 
 def plan_distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector) -> Vector:
-    """Horizontal distance (n,), m, from a point to each box's footprint; zero above or inside."""
+    """Return the horizontal distance (n,), m, from a point to each box; zero above or inside."""
     flat = boxes_enu_m.copy()
     flat[:, 2], flat[:, 5] = -np.inf, np.inf
     place = np.array([place_enu_m[0], place_enu_m[1], 0.0])

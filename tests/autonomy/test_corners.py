@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.corners import Limits, motion, polyline, squared_corner_speeds
+from mavfi_cli.autonomy.corners import MotionLimits, motion, polyline, squared_corner_speeds
 
-LIMITS = Limits(speed_mps=2.0, climb_mps=1.0, descent_mps=0.5, acceleration_mps2=2.0)
+LIMITS = MotionLimits(speed_mps=2.0, climb_mps=1.0, descent_mps=0.5, acceleration_mps2=2.0)
 
 
 def bent(angle_rad, leg_m=20.0):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavfi_cli.autonomy.orders import Mode, PlanFailure
+from mavfi_cli.autonomy.orders import PilotMode, PlanFailure
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.core.types import CollisionReport, Trajectory, VehicleState
 
@@ -76,7 +76,7 @@ class Driver:
         plan = straight(self.requests[-1], speed, **changes)
         self.pilot.on_plan(plan)
         self.tick(ticks)
-        assert self.pilot.mode is Mode.FLYING
+        assert self.pilot.mode is PilotMode.FLYING
         return plan
 
     def foresee(self, time_s, seq=1, age_s=0.0):
@@ -99,7 +99,7 @@ def driver():
 
 def test_it_hovers_where_it_is_and_asks_for_a_plan_once(driver):
     directive = driver.tick(10, at=state(3.0, 4.0, 5.0))
-    assert directive.mode is Mode.WAITING
+    assert directive.mode is PilotMode.WAITING
     assert directive.trajectory is None
     np.testing.assert_array_equal(directive.hold_enu_m, [3.0, 4.0, 5.0])
     (request,) = driver.requests
@@ -117,7 +117,7 @@ def test_a_plan_from_a_hover_may_be_late_and_begins_at_its_beginning(driver):
     driver.pilot.on_plan(plan)
     directive = driver.tick()
     assert directive.trajectory is plan
-    assert directive.mode is Mode.FLYING
+    assert directive.mode is PilotMode.FLYING
     assert directive.rate == 1.0
     assert 0.0 <= directive.time_s <= TICK_S
 
@@ -130,7 +130,7 @@ def test_the_clock_of_the_trajectory_runs_with_time(driver):
 
 def test_a_trajectory_that_ends_short_of_the_goal_asks_for_the_next(driver):
     plan = driver.fly(count=4)
-    driver.until(lambda d: d.mode is Mode.WAITING)
+    driver.until(lambda d: d.mode is PilotMode.WAITING)
     assert driver.now_s == pytest.approx(1.02 + plan.duration_s, abs=0.05)
     assert len(driver.requests) == 2
     assert driver.last.hold_enu_m[0] == pytest.approx(4.0)  # the end: 3 m + 0.5 s at 2 m/s
@@ -142,12 +142,12 @@ def test_arrival_within_the_tolerance_ends_everything(driver):
     just_out = state(GOAL[0] - P.goal_tolerance_m - 1e-6, GOAL[1], GOAL[2])
     far_driver = Driver(tracking_error_max_m=100.0)
     far_driver.fly()
-    assert far_driver.tick(at=just_out).mode is Mode.FLYING
+    assert far_driver.tick(at=just_out).mode is PilotMode.FLYING
     directive = far_driver.tick(at=near)
-    assert directive.mode is Mode.ARRIVED
+    assert directive.mode is PilotMode.ARRIVED
     assert directive.trajectory is None
     np.testing.assert_array_equal(directive.hold_enu_m, GOAL)
-    assert far_driver.tick(100, at=state()).mode is Mode.ARRIVED
+    assert far_driver.tick(100, at=state()).mode is PilotMode.ARRIVED
     assert len(far_driver.requests) == 1
 
 
@@ -155,8 +155,8 @@ def test_after_arrival_no_message_moves_it(driver):
     driver.tick()
     driver.tick(at=state(*GOAL))
     driver.pilot.on_plan(PlanFailure(stamp_s=driver.now_s, reason="too late"))
-    assert driver.foresee(0.0, seq=9) is Mode.ARRIVED
-    assert driver.tick(10).mode is Mode.ARRIVED
+    assert driver.foresee(0.0, seq=9) is PilotMode.ARRIVED
+    assert driver.tick(10).mode is PilotMode.ARRIVED
 
 
 # Collisions foreseen -------------------------------------------------------------------------
@@ -168,15 +168,15 @@ SLOW_S = BRAKE_S + P.plan_lead_s + P.late_plan_s
 @pytest.mark.parametrize(
     ("time_s", "mode"),
     [
-        (math.inf, Mode.EVADING),
-        (math.nextafter(SLOW_S, math.inf), Mode.EVADING),
-        (SLOW_S, Mode.SLOWING),
-        (math.nextafter(BRAKE_S, math.inf), Mode.SLOWING),
-        (BRAKE_S, Mode.STOPPING),
-        (0.0, Mode.STOPPING),
-        (-5.0, Mode.STOPPING),
-        (-math.inf, Mode.STOPPING),
-        (math.nan, Mode.STOPPING),
+        (math.inf, PilotMode.EVADING),
+        (math.nextafter(SLOW_S, math.inf), PilotMode.EVADING),
+        (SLOW_S, PilotMode.SLOWING),
+        (math.nextafter(BRAKE_S, math.inf), PilotMode.SLOWING),
+        (BRAKE_S, PilotMode.STOPPING),
+        (0.0, PilotMode.STOPPING),
+        (-5.0, PilotMode.STOPPING),
+        (-math.inf, PilotMode.STOPPING),
+        (math.nan, PilotMode.STOPPING),
     ],
 )
 def test_go_on_slow_down_or_stop_to_the_last_bit(driver, time_s, mode):
@@ -186,11 +186,11 @@ def test_go_on_slow_down_or_stop_to_the_last_bit(driver, time_s, mode):
 
 def test_the_time_since_the_report_is_taken_off(driver):
     driver.fly(speed=2.0)
-    assert driver.foresee(SLOW_S + 0.05, age_s=0.1) is Mode.SLOWING
+    assert driver.foresee(SLOW_S + 0.05, age_s=0.1) is PilotMode.SLOWING
 
 
 def test_faster_flight_stops_earlier():
-    for speed, mode in ((1.0, Mode.SLOWING), (3.0, Mode.STOPPING)):
+    for speed, mode in ((1.0, PilotMode.SLOWING), (3.0, PilotMode.STOPPING)):
         driver = Driver()
         driver.fly(speed=speed)
         assert driver.foresee(1.0) is mode
@@ -199,7 +199,13 @@ def test_faster_flight_stops_earlier():
 def test_it_only_gets_more_careful(driver):
     driver.fly()
     modes = [driver.foresee(t) for t in (9.0, 1.5, 9.0, 0.1, 9.0)]
-    assert modes == [Mode.EVADING, Mode.SLOWING, Mode.SLOWING, Mode.STOPPING, Mode.STOPPING]
+    assert modes == [
+        PilotMode.EVADING,
+        PilotMode.SLOWING,
+        PilotMode.SLOWING,
+        PilotMode.STOPPING,
+        PilotMode.STOPPING,
+    ]
     counters = driver.pilot.counters
     assert (counters.collisions_foreseen, counters.slowdowns, counters.stops) == (1, 1, 1)
 
@@ -232,7 +238,7 @@ def test_stopping_stands_within_the_braking_distance_then_plans_from_there(drive
     begun_m = driver.vehicle().position_enu_m[0]
     driver.foresee(0.0)
     begun_s = driver.now_s
-    driver.until(lambda d: d.mode is Mode.WAITING)
+    driver.until(lambda d: d.mode is PilotMode.WAITING)
     assert driver.now_s - begun_s == pytest.approx(2.0 / P.brake_mps2, abs=2 * TICK_S)
     way_m = driver.last.hold_enu_m[0] - begun_m
     assert way_m == pytest.approx(2.0**2 / (2.0 * P.brake_mps2), abs=0.05)
@@ -247,7 +253,7 @@ def test_no_plan_is_asked_for_while_braking(driver):
     driver.fly(speed=2.0)
     driver.foresee(0.0)
     asked = len(driver.requests)
-    while driver.tick().mode is Mode.STOPPING:
+    while driver.tick().mode is PilotMode.STOPPING:
         assert len(driver.requests) == asked
     assert len(driver.requests) == asked + 1
 
@@ -255,7 +261,7 @@ def test_no_plan_is_asked_for_while_braking(driver):
 def test_a_stale_report_is_ignored(driver):
     driver.fly()
     driver.foresee(9.0, seq=5)
-    assert driver.foresee(0.0, seq=4) is Mode.EVADING
+    assert driver.foresee(0.0, seq=4) is PilotMode.EVADING
     assert driver.pilot.counters.reports_ignored == 1
 
 
@@ -265,7 +271,7 @@ def test_a_report_without_a_collision_changes_nothing(driver):
         CollisionReport(stamp_s=driver.now_s, collision=False, time_to_collision_s=0.0,
                         future_collision_seq=7)
     )  # fmt: skip
-    assert driver.tick().mode is Mode.FLYING
+    assert driver.tick().mode is PilotMode.FLYING
     assert len(driver.requests) == 1
 
 
@@ -289,7 +295,7 @@ def test_the_next_plan_takes_over_at_its_own_stamp_without_a_jump(driver):
         before = driver.last
         driver.tick()
     assert driver.now_s - TICK_S < request.stamp_s <= driver.now_s
-    assert driver.last.mode is Mode.FLYING
+    assert driver.last.mode is PilotMode.FLYING
     old_x = before.trajectory.waypoints[0, 0] + 2.0 * before.time_s
     assert plan.waypoints[0, 0] + 2.0 * driver.last.time_s == pytest.approx(old_x + 2.0 * TICK_S)
     assert driver.pilot.counters.replans == 1
@@ -334,11 +340,11 @@ def test_a_plan_that_is_too_late_is_not_flown_and_it_stops(driver):
     request = evading(driver)
     driver.until(lambda _d: driver.now_s - request.stamp_s > P.late_plan_s)
     driver.pilot.on_plan(straight(request))
-    assert driver.pilot.mode is Mode.STOPPING
+    assert driver.pilot.mode is PilotMode.STOPPING
     assert driver.pilot.counters.plans_ignored == 1
     assert driver.pilot.counters.stops == 1
     driver.until(lambda d: d.plan is not None)
-    assert driver.last.mode is Mode.WAITING
+    assert driver.last.mode is PilotMode.WAITING
 
 
 @pytest.mark.parametrize(
@@ -374,7 +380,7 @@ def test_the_answer_to_an_abandoned_request_is_not_taken_for_the_new_one(driver)
     """The old plan begins in motion, and elsewhere: from a hover it would jump there."""
     old = straight(evading(driver))
     driver.foresee(0.0)
-    driver.until(lambda d: d.mode is Mode.WAITING)
+    driver.until(lambda d: d.mode is PilotMode.WAITING)
     assert len(driver.requests) == 3
     driver.pilot.on_plan(old)
     assert driver.tick().trajectory is None
@@ -420,7 +426,7 @@ def test_the_first_plan_that_is_flown_is_no_replan_however_many_failed(driver):
 def test_a_failed_plan_in_flight_stops_it(driver):
     evading(driver)
     fail(driver)
-    assert driver.pilot.mode is Mode.STOPPING
+    assert driver.pilot.mode is PilotMode.STOPPING
     assert driver.pilot.counters.stops == 1
 
 
@@ -439,11 +445,11 @@ def test_three_failures_look_all_round_once(driver):
 def test_it_gives_up_after_the_last_attempt_and_not_before():
     driver = Driver(attempts_max=5)
     for attempt in range(1, 6):
-        assert driver.pilot.mode is not Mode.GAVE_UP
+        assert driver.pilot.mode is not PilotMode.GAVE_UP
         driver.until(lambda d: d.plan is not None)
         assert driver.last.plan.attempt == attempt
         fail(driver)
-    assert driver.tick(100).mode is Mode.GAVE_UP
+    assert driver.tick(100).mode is PilotMode.GAVE_UP
     assert len(driver.requests) == 5
     assert driver.pilot.counters.plans_failed == 5
 
@@ -451,7 +457,7 @@ def test_it_gives_up_after_the_last_attempt_and_not_before():
 def test_the_failure_of_an_abandoned_request_is_not_taken_for_the_new_one_s(driver):
     old = evading(driver)
     driver.foresee(0.0)
-    driver.until(lambda d: d.mode is Mode.WAITING)
+    driver.until(lambda d: d.mode is PilotMode.WAITING)
     driver.pilot.on_plan(PlanFailure(stamp_s=old.stamp_s, reason="no way"))
     assert driver.pilot.counters.plans_failed == 0
     driver.tick(20)
@@ -483,7 +489,7 @@ def test_a_success_forgives_the_failures_before_it():
         driver.until(lambda d: d.plan is not None)
         driver.pilot.on_plan(straight(driver.requests[-1], count=2))
         driver.tick()
-    assert driver.pilot.mode is not Mode.GAVE_UP
+    assert driver.pilot.mode is not PilotMode.GAVE_UP
 
 
 # Off the path --------------------------------------------------------------------------------
@@ -494,7 +500,7 @@ def test_too_far_from_the_reference_it_stops_and_plans_from_where_it_is(driver, 
     driver.fly()
     here = driver.vehicle().position_enu_m
     directive = driver.tick(at=state(here[0] + 2.0 * TICK_S, off_m, 5.0))
-    assert directive.mode is Mode.WAITING
+    assert directive.mode is PilotMode.WAITING
     assert directive.trajectory is None
     assert directive.plan is not None
     np.testing.assert_array_equal(directive.plan.position_enu_m[1], off_m)
@@ -504,7 +510,7 @@ def test_within_the_tracking_error_it_flies_on(driver):
     driver.fly()
     here = driver.vehicle().position_enu_m
     at = state(here[0] + 2.0 * TICK_S, P.tracking_error_max_m - 1e-6, 5.0)
-    assert driver.tick(at=at).mode is Mode.FLYING
+    assert driver.tick(at=at).mode is PilotMode.FLYING
 
 
 # Anything at all -----------------------------------------------------------------------------
@@ -567,8 +573,8 @@ def test_no_sequence_of_messages_breaks_it(plan):
             driver.tick(ticks, at=state(*place, yaw=yaw))
         assert 0.0 <= driver.last.rate <= 1.0
         assert driver.last.time_s >= 0.0
-        hovers = driver.pilot.flown.trajectory is None
-        assert hovers or driver.pilot.mode not in (Mode.WAITING, Mode.ARRIVED)
+        hovers = driver.pilot.active.trajectory is None
+        assert hovers or driver.pilot.mode not in (PilotMode.WAITING, PilotMode.ARRIVED)
 
 
 @given(st.lists(corrupted_plans() | st.just("failure"), max_size=8))
@@ -585,10 +591,10 @@ def test_it_never_waits_for_ever_without_asking(plans):
         asked = len(driver.requests)
         for _ in range(60):
             driver.tick(at=state())
-            if driver.pilot.mode in (Mode.FLYING, Mode.ARRIVED, Mode.GAVE_UP):
+            if driver.pilot.mode in (PilotMode.FLYING, PilotMode.ARRIVED, PilotMode.GAVE_UP):
                 break
-        assert len(driver.requests) > asked or driver.pilot.mode is not Mode.WAITING
-        if driver.pilot.mode is not Mode.WAITING:
+        assert len(driver.requests) > asked or driver.pilot.mode is not PilotMode.WAITING
+        if driver.pilot.mode is not PilotMode.WAITING:
             return
 
 
@@ -623,8 +629,8 @@ def test_a_corrupted_time_to_collision_puts_the_stop_off_for_ever(time_s):
     driver.fly(count=200)
     driver.foresee(time_s)
     driver.tick(200)
-    assert driver.pilot.mode is Mode.FLYING
-    assert driver.foresee(math.nan, seq=2) is Mode.FLYING
+    assert driver.pilot.mode is PilotMode.FLYING
+    assert driver.foresee(math.nan, seq=2) is PilotMode.FLYING
     assert driver.tick().trajectory is None  # a NaN is no time at all
 
 
@@ -635,11 +641,11 @@ def test_it_hovers_where_it_has_braked_and_only_then_plans():
     driver.tick(at=moving(10.0, 2.0))
     for x, speed in [(10.4, 1.0), (10.5, 0.4)]:
         directive = driver.tick(at=moving(x, speed))
-        assert directive.mode is Mode.STOPPING
+        assert directive.mode is PilotMode.STOPPING
         assert directive.hold_enu_m[0] == x
         assert len(driver.requests) == 1
     directive = driver.tick(at=moving(10.6, 0.2))
-    assert directive.mode is Mode.WAITING
+    assert directive.mode is PilotMode.WAITING
     assert driver.requests[-1].position_enu_m[0] == 10.6
     np.testing.assert_array_equal(driver.requests[-1].velocity_enu_mps, np.zeros(3))
 
@@ -648,7 +654,7 @@ def test_a_larger_number_makes_it_reject_what_is_older_at_a_bounded_rate():
     driver = Driver(**PAPER)
     driver.tick()
     driver.pilot.on_plan(straight(driver.requests[-1], count=4, trajectory_seq=2**30))
-    driver.until(lambda d: d.mode is Mode.FLYING)
+    driver.until(lambda d: d.mode is PilotMode.FLYING)
     driver.until(lambda d: d.trajectory is None)
     begun_s = driver.now_s
     for number in range(2, 8):
@@ -662,8 +668,8 @@ def test_a_larger_number_makes_it_reject_what_is_older_at_a_bounded_rate():
 def test_a_plan_that_knows_of_a_later_collision_makes_it_ignore_reports():
     driver = Driver(**PAPER)
     driver.fly(future_collision_seq=1000, count=400)
-    assert driver.foresee(0.0, seq=5) is Mode.FLYING
-    assert driver.tick(20).mode is Mode.FLYING
+    assert driver.foresee(0.0, seq=5) is PilotMode.FLYING
+    assert driver.tick(20).mode is PilotMode.FLYING
     assert driver.pilot.counters.reports_ignored == 1
 
 
@@ -672,7 +678,7 @@ def test_it_has_arrived_only_at_rest_and_only_without_a_plan():
     driver.fly(speed=2.0, count=40)  # the trajectory ends at the goal
     driver.until(lambda d: d.trajectory is None)
     assert driver.now_s > 20.0
-    assert driver.pilot.mode is Mode.ARRIVED
+    assert driver.pilot.mode is PilotMode.ARRIVED
 
 
 def test_the_turn_before_departure_looks_all_round_and_asks_for_nothing():
@@ -692,7 +698,7 @@ def test_a_plan_never_begins_at_a_corrupted_waypoint(place):
     plan = driver.fly()
     corrupted = plan.waypoints.copy()
     corrupted[:, 0] = place
-    driver.pilot.flown.trajectory = replace(plan, waypoints=corrupted)
+    driver.pilot.active.trajectory = replace(plan, waypoints=corrupted)
     driver.foresee(30.0)
     driver.tick(at=moving(5.0, 2.0))
     assert driver.requests[-1].position_enu_m[0] == 5.0

@@ -6,7 +6,7 @@ import pytest
 
 from mavfi_cli.cli.progress import progress_view
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.progress import Progress
+from mavfi_cli.mission.progress import FlightProgress
 from mavfi_cli.mission.record.events import Event
 
 
@@ -16,7 +16,7 @@ def tell(config, events=(), quiet=False):
             watcher.on_event(Event(stamp_s=1.5, kind=kind, text=text))
         for stamp_s in range(25):
             watcher.on_progress(
-                Progress(stamp_s=float(stamp_s), phase="flying", speed_mps=2.5,
+                FlightProgress(stamp_s=float(stamp_s), phase="flying", speed_mps=2.5,
                          goal_distance_m=30.0 if stamp_s < 15 else None, replans=3)
             )  # fmt: skip
 

@@ -14,10 +14,13 @@ import pytest
 pytestmark = pytest.mark.slow
 
 # Fields of reports that depend on the host, on the clock or on the code's own files; a struck
-# register may hold an address, and where the stack begins depends on the length of paths.
+# register may hold an address, and where the stack begins depends on the length of paths. A
+# corrupted pointer reads whatever lies there, which moves with every change of a docstring, so the
+# size of a silent corruption is not compared.
 _PASSING = {
     *("attempts", "build_ids", "cpu_s", "host", "injections_per_core_hour", "path", "prepare_s"),
-    *("sources", "struck_after_hex", "struck_before_hex", "timeline", "versions", "wall_s"),
+    *("sdc_relative", "sources", "struck_after_hex", "struck_before_hex", "timeline"),
+    *("versions", "wall_s"),
 }
 CAMPAIGN = """
 name = "hashed"
@@ -87,7 +90,7 @@ COMMANDS = {
     ),
     "plan": ("6aa389c6388b46f8", ["campaign", "plan", "fig7", "--json"]),
     # Its inputs_sha256 is of a pickle that names our modules: renewed when those moved to attack/.
-    "kernels": ("e59b9efdaddc930c", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
+    "kernels": ("ef8718aa0b404e26", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
     "compare": (
         "eac34e35e3c1cd54",
         [

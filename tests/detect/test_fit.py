@@ -7,7 +7,7 @@ from detect_builders import STACK
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import fit, model, registry, train_autoencoder
-from mavfi_cli.detect.dataset import Dataset, Flight
+from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import COUNT, NAMES, PreprocessParams
 from mavfi_cli.detect.watch import EXTENDED
 
@@ -23,7 +23,7 @@ def flight(world, seed, rows=120):
     new = (np.arange(rows) % 25 == 1) & ~reports
     deltas[~new, 2:9] = 0
     stamps = np.arange(rows) * 0.02
-    return Flight(
+    return FlightSamples(
         world=world,
         seed=seed,
         stamps_s=stamps,
@@ -139,7 +139,7 @@ def test_components_of_a_vector_share_their_scale(dataset):
     (one,) = [each for each in dataset.flights if each.seed == 0]
     deltas = one.deltas.copy()
     deltas[5, NAMES.index("command_vz")] = -4
-    changed = Flight(
+    changed = FlightSamples(
         world="w", seed=99, stamps_s=one.stamps_s, reports=one.reports,
         plan_steps=one.plan_steps, new_waypoint=one.new_waypoint, deltas=deltas,
         extended=one.extended,
@@ -164,8 +164,8 @@ def test_training_is_deterministic_and_tells_what_it_did(dataset, quick):
 def test_trained_weights_reconstruct_better_than_the_first_ones(quick):
     rows = fit.mirrored(flight("w", 1, 400).deltas).astype(float)
     trained = train_autoencoder.train(rows, rows, seed=1)
-    curve = np.array(trained.told["loss_curve"]["rows"])
-    assert trained.told["validation_error"] < curve[0, 2]
+    curve = np.array(trained.provenance["loss_curve"]["rows"])
+    assert trained.provenance["validation_error"] < curve[0, 2]
 
 
 def test_without_torch_only_the_autoencoder_is_missing(dataset, monkeypatch):

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from typing import Any
 
-from mavfi_cli.link.autopilots import ARDUCOPTER, PX4, Autopilot
+from mavfi_cli.link.autopilots import ARDUCOPTER, PX4, AutopilotProfile
 from mavfi_cli.link.codec import Codec, Message, dialect
 
 DT_S = 0.02
@@ -22,7 +22,7 @@ _GROUND, _AIR, _TAKEOFF, _LANDING = 1, 2, 3, 4
 class FakeAutopilot(ABC):
     """What both have in common; a subclass answers commands its own way."""
 
-    autopilot: Autopilot
+    autopilot: AutopilotProfile
     mav_autopilot: int
     streams_unasked: bool
 

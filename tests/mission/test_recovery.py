@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.detect.gate import Alarm
@@ -63,23 +63,23 @@ class Desk:
         self.pilot = Pilot(PilotParams(), np.array([40.0, 0.0, 5.0]))
         self.pilot.update(1.0, STATE)
         self.plan = a_plan()
-        self.pilot.flown.begin(self.plan, time_s=0.7, rate=1.0)
-        self.pilot.mode = Mode.FLYING
+        self.pilot.active.begin(self.plan, time_s=0.7, rate=1.0)
+        self.pilot.mode = PilotMode.FLYING
         self.exchanged = []
         self.follower = Follower()
         self.looks = 0
         self.recovery = Recovery(
-            protection, self.pilot, self.follower, self.exchange, self.look_anew
+            protection, self.pilot, self.follower, self.exchange, self.recompute_perception
         )
         self.recovery.state = STATE
 
-    def look_anew(self):
+    def recompute_perception(self):
         self.looks += 1
 
     def exchange(self, flown, changed):
         self.exchanged.append((flown, changed))
-        if self.pilot.flown.trajectory is flown:
-            self.pilot.flown.trajectory = changed
+        if self.pilot.active.trajectory is flown:
+            self.pilot.active.trajectory = changed
 
     def command(self, attempt=0):
         directive = self.pilot.update(1.0, STATE)
@@ -94,7 +94,7 @@ def test_what_passes_changes_nothing(answer):
     desk = Desk(Told(answer))
     assert desk.recovery.admit_report(REPORT, 1.0)
     assert desk.command() == (True, None)
-    assert desk.pilot.flown.trajectory is desk.plan
+    assert desk.pilot.active.trajectory is desk.plan
     assert desk.exchanged == []
 
 
@@ -103,14 +103,14 @@ def test_perception_looks_anew_only_where_the_alarm_is_its_own(stage, looks):
     desk = Desk(Told(Response.RECOMPUTE, stage))
     assert not desk.recovery.admit_report(REPORT, 1.0)
     assert desk.looks == looks
-    assert desk.pilot.flown.trajectory is desk.plan
+    assert desk.pilot.active.trajectory is desk.plan
 
 
 def test_to_hold_is_to_give_up_the_plan_and_hover():
     desk = Desk(Told(Response.HOLD))
     assert not desk.recovery.admit_report(REPORT, 1.0)
-    assert desk.pilot.flown.trajectory is None
-    assert desk.pilot.mode is Mode.WAITING
+    assert desk.pilot.active.trajectory is None
+    assert desk.pilot.mode is PilotMode.WAITING
 
 
 def test_a_command_is_first_computed_again_as_before():
@@ -129,7 +129,7 @@ def test_then_without_its_waypoint_and_from_the_last_command_on(stage, attempt):
     assert not passes
     ((flown, bridged),) = desk.exchanged
     assert flown is desk.plan
-    assert retry.directive.trajectory is bridged is desk.pilot.flown.trajectory
+    assert retry.directive.trajectory is bridged is desk.pilot.active.trajectory
     assert bridged.waypoints[1, 0:3].tolist() == [1.0, 0.0, 0.0]  # as waypoint 2 comes from
     assert (retry.fresh.yaw_rad, retry.fresh.stamp_s) == (LAST.yaw_rad, LAST.stamp_s)
     assert retry.attempt == attempt + 1
@@ -145,7 +145,7 @@ def test_every_bad_waypoint_ahead_is_dropped():
     desk.recovery.look_ahead(1.0)
     assert len(desk.exchanged) == 2
     assert desk.exchanged[0][1] is desk.exchanged[1][0]
-    assert desk.pilot.flown.trajectory is desk.exchanged[1][1]
+    assert desk.pilot.active.trajectory is desk.exchanged[1][1]
 
 
 def test_between_waypoints_a_plan_that_was_seen_is_not_looked_through_again():
@@ -154,9 +154,9 @@ def test_between_waypoints_a_plan_that_was_seen_is_not_looked_through_again():
     desk.recovery.look_round(1.0, desk.plan)
     desk.recovery.look_round(1.02, desk.plan)
     assert gate.looked == [(desk.plan, None)]
-    desk.pilot.flown.trajectory = struck = a_plan()
+    desk.pilot.active.trajectory = struck = a_plan()
     desk.recovery.look_round(1.04, desk.plan)
     assert gate.looked[1:] == [(struck, 1)]  # a strike: only the waypoint that is followed
-    desk.pilot.flown.time_s = 1.2
+    desk.pilot.active.time_s = 1.2
     desk.recovery.look_round(1.06, struck)
     assert gate.looked[2:] == [(struck, None)]

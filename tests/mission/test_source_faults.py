@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.golden import paired_golden
@@ -103,11 +103,13 @@ def test_a_flip_in_a_flown_plan_causes_no_check_by_itself(struck):
 def test_a_phase_between_two_reports_is_not_missed(evaded):
     """In this flight every report comes before the pilot is evading, or after it."""
     evading = next(
-        row["stamp_s"] for row in evaded.trace.to_pylist() if row["phase"] == Mode.EVADING.value
+        row["stamp_s"]
+        for row in evaded.trace.to_pylist()
+        if row["phase"] == PilotMode.EVADING.value
     )
     (strike,) = evaded.result["fault"]["strikes"]
     assert evading < strike["stamp_s"] < evading + 0.5
-    assert strike["phase"] != Mode.EVADING.value
+    assert strike["phase"] != PilotMode.EVADING.value
 
 
 def test_a_time_to_a_collision_that_is_foreseen_is_read(troubled, tmp_path):
@@ -122,7 +124,7 @@ def test_a_time_to_a_collision_that_is_foreseen_is_read(troubled, tmp_path):
 def test_the_document_lists_the_phases():
     text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
     (listed,) = re.findall(r"`phase=slowing` \|.*?: (.*?) \(", text)
-    assert listed.split(", ") == [mode.value for mode in Mode]
+    assert listed.split(", ") == [mode.value for mode in PilotMode]
 
 
 def test_a_trigger_that_never_comes_is_not_injected(struck):

@@ -31,10 +31,10 @@ def test_the_figures_are_those_of_the_record(result):
         f"{quality['flight_time_s']:.1f} s, ",
         f"{quality['distance_m']:.1f} m flown",
         f"{quality['goal_distance_m']:.2f} m from the goal",
-        f"{quality['min_clearance_m']:.2f} m at the closest",
+        f"{quality['min_clearance_m']:.2f} m minimum",
         f"{quality['energy_regression_j'] / 1e3:.1f} kJ (paper's regression)",
         f"{quality['energy_propeller_j'] / 1e3:.1f} kJ (propeller shafts)",
-        f"{result['pilot']['plans_requested']} asked for",
+        f"{result['pilot']['plans_requested']} requested",
         f"{result['response_time_s']['median'] * 1e3:.0f} ms from depth frame",
         f"{result['simulated_s'] / result['host']['flight_wall_s']:.0f} times real time",
         "solo in farm, seed 5; planner rrtstar, platform x86",
@@ -53,7 +53,7 @@ def test_the_plans_add_up(result, troubled_flight):
     for run in (result, json.loads(troubled_flight.result.read_text())):
         text = "\n".join(summary_lines(run))
         found = re.search(
-            r"(\d+) asked for: (\d+) flown \((\d+) replans\), (\d+) failed, (\d+) not used", text
+            r"(\d+) requested: (\d+) flown \((\d+) replans\), (\d+) failed, (\d+) not used", text
         )
         asked, flown, replans, failed, unused = map(int, found.groups())
         assert asked == flown + failed + unused == run["pilot"]["plans_requested"]

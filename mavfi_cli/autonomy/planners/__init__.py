@@ -1,4 +1,4 @@
-"""Planners: each one a `Planner`, found by name; others plug in by entry point."""
+"""Path planners, found by name. Other packages add planners by entry point."""
 
 from mavfi_cli.autonomy.planners.base import (
     Planner,

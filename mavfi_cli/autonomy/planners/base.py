@@ -1,4 +1,4 @@
-"""What every planner gets and gives."""
+"""Interface of a path planner: parameters, problem and result."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from mavfi_cli.core.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningParams:
-    """How far to stay from obstacles.
+    """Clearance from obstacles.
 
-    The planning radius is larger than the collision check's, so that a plan is not found blocked
-    by what the next frame adds at its edges (depth is quantised to 0.1 m).
+    The planning radius is larger than the collision check's. A plan thus stays free when the next
+    frame adds voxels at the edges of obstacles (depth is quantised to 0.1 m).
     """
 
     radius_m: float = 1.1
-    escape_radius_m: float = 2.2  # near a start that is too close to an obstacle, less will do
+    escape_radius_m: float = 2.2  # within this distance of a blocked start, the radius may shrink
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningProblem:
-    """From where to where, through what."""
+    """Start, goal and obstacles of a planning problem."""
 
     start_enu_m: FloatArray  # (3,)
     goal_enu_m: FloatArray  # (3,)
-    grid: ObstacleGrid  # bounds, and where the vehicle's centre must not be
+    grid: ObstacleGrid  # bounds and blocked voxels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanResult:
-    """A path, or an honest failure: an approximate path is none."""
+    """A path or a failure. A path that ends short of the goal is a failure."""
 
     found: bool
-    path_enu_m: FloatArray  # (n, 3) from start to goal; (0, 3) where none was found
-    reason: str = ""  # why there is none
-    nearest_m: float = 0.0  # how near to the goal the search came
+    path_enu_m: FloatArray  # (n, 3) from start to goal; (0, 3) if none was found
+    reason: str = ""  # cause of a failure
+    nearest_m: float = 0.0  # shortest distance to the goal that the search reached
     iterations: int = 0
 
     @property
@@ -52,22 +52,22 @@ class PlanResult:
 
 
 class Planner(Protocol):
-    """A path planner whose result is a function of problem and seed alone."""
+    """A path planner whose result depends on problem and seed only."""
 
     @property
     def name(self) -> str:
-        """What the planner is found by."""
+        """Name by which the planner is found."""
 
     def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
         """Find a path from the problem's start to its goal.
 
-        The result must repeat for the same problem and seed, whatever was planned before in the
-        process, and must come after a bounded number of steps, not of seconds.
+        The result must be the same for the same problem and seed, whatever the process planned
+        before. The number of steps must be bounded; a time limit is not allowed.
         """
 
 
 def failure(problem: PlanningProblem, reason: str) -> PlanResult:
-    """No path, and nothing was searched."""
+    """Return a failure without a search."""
     gap_m = math.dist(problem.goal_enu_m, problem.start_enu_m)
     return PlanResult(found=False, path_enu_m=np.empty((0, 3)), reason=reason, nearest_m=gap_m)
 
@@ -79,12 +79,12 @@ def pose_problem(
     bounds_enu_m: FloatArray,
     params: PlanningParams,
 ) -> PlanningProblem:
-    """The problem of flying from start to goal (3,) inside the bounds (6,) on this map.
+    """Build the problem of flying from start to goal, each (3,), inside the bounds (6,).
 
-    The bounds are widened to hold the start, as in the reference. Where the start is too close
-    to an obstacle, the planning radius shrinks stepwise (3/4, 1/2, 1/4, 0) within
-    `escape_radius_m` of it until it is free, so that the vehicle can leave. A goal that is too
-    close to an obstacle stays blocked.
+    The bounds are widened to hold the start, as in MAVBench. If the start is too close to an
+    obstacle, the planning radius within `escape_radius_m` of it shrinks stepwise (3/4, 1/2, 1/4,
+    0) until the start is free, so that the vehicle can leave. A goal too close to an obstacle
+    stays blocked.
     """
     bounds = np.array(bounds_enu_m, np.float64)
     if np.isfinite(start_enu_m).all():
@@ -103,7 +103,7 @@ def pose_problem(
 def _escape(
     snapshot: MapSnapshot, grid: ObstacleGrid, start: FloatArray, params: PlanningParams
 ) -> ObstacleGrid:
-    """The grid with a smaller radius around the start; unchanged where even none would do."""
+    """Reduce the radius around the start. Return the grid unchanged if even radius 0 is blocked."""
     for share in (0.75, 0.5, 0.25, 0.0):
         smaller = grids.build(snapshot, grid.bounds_enu_m, share * params.radius_m)
         if smaller.point_free(start):
@@ -113,7 +113,7 @@ def _escape(
 
 
 def refuse(problem: PlanningProblem) -> PlanResult | None:
-    """A failure where start or goal cannot be flown at all, else None."""
+    """Return a failure if start or goal is blocked, else None."""
     if not problem.grid.point_free(problem.start_enu_m):
         return failure(problem, "start blocked")
     if not problem.grid.point_free(problem.goal_enu_m):

@@ -1,4 +1,4 @@
-"""Planners by name: ours, and those that other packages register under `mavfi.planners`."""
+"""Registry of planners: ours, and those that other packages register under `mavfi.planners`."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ _OURS: dict[str, Callable[[], Planner]] = dict(zip(OURS, (RRTStar, RRT, RRTConne
 
 
 def names() -> list[str]:
-    """Names of all planners that are there, ours first."""
+    """Return the names of all installed planners, ours first."""
     others = {entry.name for entry in entry_points(group=ENTRY_POINT_GROUP)}
     return [*_OURS, *sorted(others - set(_OURS))]
 
 
 def find(name: str) -> Planner:
-    """The planner of that name with its default settings.
+    """Return the planner of that name with its default settings.
 
-    Spellings of our own do not matter: `planner_names.canonical`.
+    Names of our own planners may be spelt differently; see `planner_names.canonical`.
 
     Raises:
-        UnknownName: there is none; names the nearest.
+        UnknownName: No planner has this name. Suggests the nearest.
     """
     plain = canonical(name)
     if plain in _OURS:

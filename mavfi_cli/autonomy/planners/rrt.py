@@ -1,4 +1,4 @@
-"""RRT (LaValle 1998), from OMPL; stops at the first solution."""
+"""RRT (LaValle 1998) from OMPL. Stops at the first solution."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavfi_cli.autonomy.planners.search import Search, run
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RRT:
-    """Goal bias as OMPL ships it; the longest step is shorter, for maps full of obstacles."""
+    """RRT with OMPL's default goal bias, and a shorter maximum step for dense maps."""
 
     name: ClassVar[str] = "rrt"
 

@@ -1,4 +1,4 @@
-"""RRTConnect (Kuffner and LaValle 2000), from OMPL; stops at the first solution."""
+"""RRTConnect (Kuffner and LaValle 2000) from OMPL. Stops at the first solution."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavfi_cli.autonomy.planners.search import Search, run
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RRTConnect:
-    """Two trees that grow towards each other."""
+    """RRTConnect, which grows two trees towards each other."""
 
     name: ClassVar[str] = "rrtconnect"
 

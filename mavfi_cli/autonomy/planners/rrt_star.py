@@ -1,4 +1,4 @@
-"""RRT* (Karaman and Frazzoli 2011), from OMPL; improves until its iterations are used up."""
+"""RRT* (Karaman and Frazzoli 2011) from OMPL. Optimises until its iterations are used up."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mavfi_cli.autonomy.planners.search import Search, run
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RRTStar:
-    """Goal bias and rewiring factor as OMPL ships them.
+    """RRT* with OMPL's default goal bias and rewiring factor.
 
-    Once there is a solution, only states that could shorten it are sampled (Gammell et al. 2014);
-    300 iterations then give shorter paths than 500 without, at half the cost.
+    After the first solution it samples only states that could shorten the path (Gammell et al.
+    2014). 300 iterations with this restriction give shorter paths than 500 without, at half the
+    cost.
 
-    Most maps are easy, and only hard ones shall cost more: where the iterations end without a
-    solution, a second search with shorter steps and up to `patience` iterations stops at its
-    first.
+    If the iterations end without a solution, a second search takes shorter steps and up to
+    `patience` iterations, and stops at its first solution. Only hard maps incur this cost.
     """
 
     name: ClassVar[str] = "rrtstar"

@@ -1,9 +1,9 @@
-"""One OMPL search: space, validity, seed and stop condition, the same for all its planners.
+"""One OMPL search: state space, validity check, seed and stop condition for all OMPL planners.
 
-Repeatability: OMPL's generators take their seeds from a process-wide sequence when they are
-made. Setting that sequence anew before each search, and making every generator afterwards, makes
-the search a function of problem and seed; OMPL warns that generators made earlier stay as they
-are, but none of those is used. The search stops after a count of iterations, never by time.
+OMPL's random generators take their seeds from a process-wide sequence when they are created. Each
+search resets that sequence first and creates its generators afterwards, so its result depends on
+problem and seed only. OMPL warns that earlier generators keep their seeds; none of them is used.
+The search stops after a number of iterations, never after a time.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ MAX_SEED = 0x7FFF_FFFF
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
-    """How to run an OMPL planner."""
+    """Settings of an OMPL search."""
 
     make: Callable[[Any], Any]  # space information -> configured OMPL planner
     iterations: int
-    optimise: bool = False  # go on after the first solution until the iterations are used up
+    optimise: bool = False  # continue after the first solution until the iterations are used up
 
 
 class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
-    """Segment test on the obstacle grid; holds no reference to OMPL objects."""
+    """Segment test on the obstacle grid. Holds no reference to OMPL objects."""
 
     def __init__(self, information: Any, grid: ObstacleGrid) -> None:
         super().__init__(information)
         self._arguments = (grid.blocked, grid.origin_enu_m, grid.resolution_m, grid.bounds_enu_m)
 
     def checkMotion(self, a: Any, b: Any) -> bool:  # noqa: N802
-        """True where the straight motion from state a to state b is free."""
+        """Return True if the straight motion from state a to state b is free."""
         free: bool = segment_free(*self._arguments, a[0], a[1], a[2], b[0], b[1], b[2])
         return free
 
 
 def run(problem: PlanningProblem, seed: int, search: Search) -> PlanResult:
-    """Search from start to goal; a straight line where that is free."""
+    """Search a path from start to goal. Return a straight line if that is free."""
     refused = refuse(problem)
     if refused is not None:
         return refused
@@ -72,7 +72,7 @@ def run(problem: PlanningProblem, seed: int, search: Search) -> PlanResult:
 
 
 class _Counter:
-    """Stop condition: true once it was asked more than `limit` times."""
+    """Stop condition that becomes true after `limit` calls."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -94,7 +94,7 @@ def _space(grid: ObstacleGrid) -> tuple[Any, Any]:
     arguments = (grid.blocked, grid.origin_enu_m, grid.resolution_m, grid.bounds_enu_m)
 
     def valid(state: Any) -> bool:
-        """Whether a state (east, north, up, m) lies in free space."""
+        """Return True if a state (east, north, up, m) lies in free space."""
         x, y, z = state[0], state[1], state[2]
         free: bool = segment_free(*arguments, x, y, z, x, y, z)
         return free

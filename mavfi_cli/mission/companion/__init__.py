@@ -1,1 +1,1 @@
-"""The companion computer: nodes in simulated time, their kernels, and the gate that guards them."""
+"""The companion computer: nodes in simulated time, their kernels, and the detector's gate."""

@@ -1,11 +1,11 @@
-"""The companion computer: the pipeline's nodes wired together, one control tick at a time.
+"""The companion computer: connects the nodes of the pipeline and runs one control tick at a time.
 
     depth frame -> point cloud -> OctoMap -> collision check -> pilot -> tracking -> setpoint
                                      |                            |  ^
                                      +------------> planner <-----+--+
 
-Every message that one kernel hands to the next passes through one of the `_take_...` methods.
-What the detector gate withholds there, and what follows, is in `mission.recovery`.
+Every message between two kernels passes through one of the `_take_...` methods. `recovery` decides
+what follows if the detector's gate withholds a message there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.autonomy import occupancy
-from mavfi_cli.autonomy.orders import Directive, Mode, PlanFailure
+from mavfi_cli.autonomy.orders import Directive, PilotMode, PlanFailure
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.trajectory import waypoint_index
@@ -46,15 +46,16 @@ from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.platform import PlatformProfile, latency_model
 from mavfi_cli.mission.stack import Stack
 
-# A command computed within one physics step of the vehicle goes out in the tick of its state:
-# a shorter delay is below what the simulation resolves.
+# A command computed within one physics step of the vehicle is sent in the tick of its state,
+# because
+# the simulation does not resolve shorter delays.
 SAME_TICK_S = 0.004
 VERDICT_STATES = {state.name for state in of_stage(Stage.PERCEPTION)}
 FOLLOWED_STATES = {s.name for s in of_stage(Stage.PLANNING) if s.name.startswith("waypoint_")}
 PLAN_STATES = {s.name for s in of_stage(Stage.PLANNING)} - FOLLOWED_STATES
 CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 COMMAND_STATES = {state.name for state in of_stage(Stage.CONTROL)}
-BRAKE_SHARE = 0.6  # of a_max that stopping counts on, as planned motion does
+BRAKE_SHARE = 0.6  # fraction of a_max assumed for stopping, as in planned motion
 
 
 class Companion:
@@ -97,7 +98,7 @@ class Companion:
             briefing.goal_enu_m,
         )
         self._recovery = Recovery(
-            protection, self.pilot, injection.follower, self._exchange, self._look_anew
+            protection, self.pilot, injection.follower, self._exchange, self._recompute_perception
         )
         self._latency = latency_model(platform, config.seed, wall)
         self.executor = Executor(
@@ -121,8 +122,8 @@ class Companion:
             self.executor.on_start = self._on_start
         self._snapshot: occupancy.MapSnapshot | None = None
         self._checked: Trajectory | None = None
-        self._queued: Trajectory | None = None  # the plan that control has
-        self._heard_seq = 0  # newest future_collision_seq that the planner has heard of
+        self._queued: Trajectory | None = None  # control's copy of the plan
+        self._heard_seq = 0  # newest future_collision_seq known to the planner
         self._commands: deque[Setpoint] = deque()
         self._frame: DepthFrame | None = None
         self._state: VehicleState | None = None
@@ -137,13 +138,13 @@ class Companion:
 
     @property
     def measured(self) -> dict[str, Any] | None:
-        """Factor and medians of a platform that is measured; None of any other."""
+        """Return factor and medians of a measured platform; None for any other."""
         return self._latency.summary()
 
-    # Messages as they take effect
+    # Handlers of messages that take effect
 
     def take_frame(self, frame: DepthFrame) -> None:
-        """A new depth image has arrived."""
+        """Handle a new depth image."""
         self._frame = frame
         self.executor.submit("point_cloud", frame)
 
@@ -169,8 +170,8 @@ class Companion:
             states = VERDICT_STATES if timely else VERDICT_STATES - {"time_to_collision"}
             self._injection.follower.read(report, "mission logic", stamp_s, states)
 
-    def _look_anew(self) -> None:
-        """Point cloud, OctoMap and collision check once more, of the newest frame."""
+    def _recompute_perception(self) -> None:
+        """Run point cloud, OctoMap and collision check again on the newest frame."""
         if self._frame is not None:
             self.executor.submit("point_cloud", self._frame)
 
@@ -189,31 +190,31 @@ class Companion:
         self.pilot.on_plan(result)
 
     def _planner_is_up(self, planner: Node) -> None:
-        """It died over a request; unless a newer one waits for it, the mission asks again."""
+        """Handle the planner's restart: repeat the lost request unless a newer one is waiting."""
         self._heard_seq = 0
         if planner.pending is None:
             self.pilot.plan_lost()
 
     def _octomap_is_up(self, octomap: Node) -> None:
-        """Who shares its process had no copy of the map."""
+        """Handle OctoMap's restart: nodes in its process have lost the map."""
         if octomap.mates:
             self._snapshot = occupancy.empty_snapshot(self._config.map_resolution_m)
 
     def _control_is_up(self, _control: Node) -> None:
-        """A queue of its own is lost: the pilot plans anew."""
+        """Handle control's restart: if control owned its queue, the pilot requests a new plan."""
         if self._stack.control_owns_queue and self._state is not None:
             self._queued = None
             self.pilot.control_lost(self._state)
 
     def _on_start(self, node: str, value: Any, start_s: float) -> None:
-        """A node begins to work on its input: it has read it."""
+        """Note that a node has read its input at the start of an invocation."""
         if node == "collision_check" and self._injection.follower is not None:
             self._injection.follower.read(value.trajectory, node, start_s, CHECKED_STATES)
 
     def _check(self, stamp_s: float) -> None:
-        """Have the present trajectory checked against the newest map."""
+        """Submit the present trajectory and the newest map to the collision check."""
         self._recovery.look_ahead(stamp_s)
-        trajectory = self.pilot.flown.trajectory
+        trajectory = self.pilot.active.trajectory
         if self._snapshot is None or trajectory is None:
             return
         self._checked = trajectory
@@ -222,13 +223,13 @@ class Companion:
             CheckInput(
                 snapshot=self._snapshot,
                 trajectory=trajectory,
-                time_s=self.pilot.flown.time_s,
+                time_s=self.pilot.active.time_s,
                 position_enu_m=self._front(),
             ),
         )
 
     def _front(self) -> FloatArray | None:
-        """Where the check moves the path to; None where it stays."""
+        """Return the position to which the check moves the path; None if it does not move."""
         if not self._stack.shifts_path_to_vehicle or self._state is None:
             return None
         return self._state.position_enu_m
@@ -237,13 +238,13 @@ class Companion:
 
     @property
     def sees(self) -> bool:
-        """Whether a map of what is ahead is there, so that planning makes sense."""
+        """True once there is a map, which planning needs."""
         return self._snapshot is not None
 
     def tick(self, stamp_s: float, state: VehicleState) -> Command | None:
-        """One control tick in flight: the command that goes out now.
+        """Run one control tick in flight and return the command to send now.
 
-        `executor.advance(stamp_s)` comes before it and `executor.compute()` after it.
+        The caller must call `executor.advance(stamp_s)` before and `executor.compute()` after it.
         """
         if self._takeover_s is None:
             self._takeover_s = stamp_s
@@ -253,8 +254,8 @@ class Companion:
         self._state = self._recovery.state = state
         self._injection.strike_memory(self._moment(stamp_s))
         copy = None
-        if self.pilot.flown.trajectory is not None:
-            flown = self.pilot.flown.trajectory
+        if self.pilot.active.trajectory is not None:
+            flown = self.pilot.active.trajectory
             copy = self._strike_latched(flown, stamp_s)
             self._recovery.look_round(stamp_s, flown)
         if self._injection.follower is not None:
@@ -272,23 +273,24 @@ class Companion:
         if copy is not None and directive.trajectory is not None:
             directive = replace(directive, trajectory=copy)
         setpoint = self._track(stamp_s, state, directive)
-        if setpoint is not None:  # else the last one stays in force: the node is busy, or down
+        if setpoint is not None:  # otherwise the node is busy or down, and the last command holds
             self._commands.append(setpoint)
         while self._commands and self._commands[0].due_s <= stamp_s:
             self._take_command(stamp_s, self._commands.popleft())
         return self.command
 
     def _strike_latched(self, flown: Trajectory, stamp_s: float) -> Trajectory | None:
-        """A fault in the memory of the flown trajectory, or in control's copy of it.
+        """Apply a fault to the memory of the active trajectory or to control's copy of it.
 
-        Where control owns its queue, its copy is the flown trajectory: it tells the others what is
-        left of it. Else the copy is replaced in the next tick.
+        If control owns its queue, its copy is the active trajectory, and control passes the rest of
+        it to the other nodes. Otherwise the next tick replaces the copy.
 
         Returns:
-            What control has in this tick instead of the flown trajectory; None where nothing else.
+            Trajectory that control uses in this tick instead of the active one; None if it is the
+            same.
         """
         struck = self._injection.strike_latched(
-            flown, self._moment(stamp_s), self.pilot.flown.waypoint
+            flown, self._moment(stamp_s), self.pilot.active.waypoint
         )
         if self._injection.in_queue and not self._stack.control_owns_queue:
             return None if struck is flown else struck
@@ -296,19 +298,19 @@ class Companion:
         return None
 
     def _exchange(self, flown: Trajectory, changed: Trajectory) -> None:
-        """Fly a changed version of a plan; nobody is told, so no check follows."""
-        if self.pilot.flown.trajectory is flown:
-            self.pilot.flown.trajectory = changed
+        """Replace the active plan by a changed version without a new collision check."""
+        if self.pilot.active.trajectory is flown:
+            self.pilot.active.trajectory = changed
         if self._checked is flown:
             self._checked = changed
 
     def _follow(self, follower: Follower, stamp_s: float, copy: Trajectory | None) -> None:
-        """Mission logic and control are about to read the followed waypoint, and the next yaw."""
+        """Note that mission logic and control read the present waypoint and the next yaw."""
         if not follower.waits:
             return
-        flown = copy or self.pilot.flown.trajectory
+        flown = copy or self.pilot.active.trajectory
         if flown is not None:
-            at = self.pilot.flown.waypoint
+            at = self.pilot.active.waypoint
             follower.read(flown, "control", stamp_s, FOLLOWED_STATES, at)
             follower.read(flown, "control", stamp_s, {"waypoint_yaw"}, at + 1)
         follower.settle(lambda m: m is self.report or m is copy or self.pilot.holds(m))
@@ -320,7 +322,7 @@ class Companion:
         directive: Directive,
         retry: Retry | None = None,
     ) -> Setpoint | None:
-        """Have control compute a command, due when its latency has passed."""
+        """Start control's computation of a command, which is due after its latency."""
         fresh, attempt = (None, 0) if retry is None else (retry.fresh, retry.attempt)
         inputs = tracking_inputs(stamp_s, state, directive)
         goes_on = self._stack.control_owns_queue and directive.trajectory is self._queued
@@ -344,22 +346,22 @@ class Companion:
         )
 
     def _take_command(self, stamp_s: float, setpoint: Setpoint) -> None:
-        """A command is due: through the gate, and out.
+        """Pass a due command through the gate and send it.
 
-        One that is withheld is computed again, at once where the platform is fast enough.
+        A withheld command is computed again, in the same tick if the platform is fast enough.
         """
         command = self._injection.pass_on(setpoint.command, self._moment(stamp_s))
         passes, retry = self._recovery.admit_command(command, setpoint, self.command, stamp_s)
         if not passes and self._fresh_frame_s is None:
-            self._fresh_frame_s = setpoint.frame_s  # still unanswered
+            self._fresh_frame_s = setpoint.frame_s  # still without a setpoint
         if retry is not None:
             self._compute_again(stamp_s, retry)
         if not passes:
             return
         self.command = command
-        self.pilot.flown.pace = command.pace
-        if command.skips_waypoint and setpoint.directive.trajectory is self.pilot.flown.trajectory:
-            self.pilot.flown.skip_waypoint()
+        self.pilot.active.pace = command.pace
+        if command.skips_waypoint and setpoint.directive.trajectory is self.pilot.active.trajectory:
+            self.pilot.active.skip_waypoint()
         if self._injection.follower is not None:
             self._injection.follower.read(command, "setpoint", stamp_s, COMMAND_STATES)
         if setpoint.frame_s is not None:
@@ -389,17 +391,17 @@ class Companion:
 
     @property
     def tracked(self) -> tuple[Trajectory, int] | None:
-        """The tracked trajectory and the index of its present waypoint."""
-        trajectory = self.pilot.flown.trajectory
+        """Return the tracked trajectory and the index of its present waypoint."""
+        trajectory = self.pilot.active.trajectory
         if trajectory is None or not len(trajectory.waypoints):
             return None
-        return trajectory, self.pilot.flown.waypoint
+        return trajectory, self.pilot.active.waypoint
 
     @property
-    def mode(self) -> Mode:
-        """What the pilot is doing."""
+    def mode(self) -> PilotMode:
+        """Present mode of the pilot."""
         return self.pilot.mode
 
     def goal_distance_m(self, state: VehicleState) -> float:
-        """Distance to the goal, m."""
+        """Return the distance to the goal, m."""
         return float(np.linalg.norm(state.position_enu_m - self.pilot.goal_enu_m))

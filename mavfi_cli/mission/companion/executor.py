@@ -1,17 +1,17 @@
-"""Nodes that work side by side in simulated time, as ROS nodes do.
+"""Executor of nodes that run concurrently in simulated time, like ROS nodes.
 
-A node runs one kernel. It has a queue of one: a newer input replaces a waiting older one. An
-invocation that starts at `t` occupies the node, and one core of the platform, until `t` plus
-its latency; only then is its output published. The real computation is done at any host time
-in between, so the vehicle's simulation need not wait for it.
+A node runs one kernel. Its input queue has length one: a newer input replaces a waiting one. An
+invocation that starts at `t` occupies the node and one core of the platform until `t` plus its
+latency. Its output is published at that time. The computation itself happens at any host time in
+between, so the vehicle's simulation need not wait for it.
 
-Nodes that share a process work one after the other, each with its newest input, in the order in
-which they are listed. They end together, and what waits for any of them is lost.
+Nodes that share a process run one after the other in the listed order, each with its newest input.
+They end together, and all their waiting inputs are lost.
 
-A node in a process of its own may die, of a signal or of an error in its kernel. The input that it
-worked on is lost, and it starts anew, with fresh state, a restart time after its output was due. A
-node that hangs works on until the watchdog kills it. Both are decided by *what* became of the
-process, never by when the host noticed, so they repeat.
+A node in its own process may die from a signal or from an error in its kernel. Its present input is
+lost. It restarts with fresh state one restart time after its output was due. A node that hangs
+stays busy until the watchdog kills it. Both depend only on how the process ended, never on when the
+host noticed it, so they are repeatable.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ _SAME_S = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loss:
-    """One end of a node's process."""
+    """Loss of a node's process."""
 
     node: str
-    stamp_s: float  # when the output was due, or the watchdog acted
+    stamp_s: float  # due time of the output, or time of the watchdog's kill
     hung: bool
     how: str
-    traceback: str = ""  # of an error in the kernel
+    traceback: str = ""  # traceback of an error in the kernel
 
 
 @dataclass(slots=True, eq=False)
 class Node:
-    """One node: a kernel, what to do with its output, and its queue of one."""
+    """A node: its kernel, the consumer of its output, and its queue of length one."""
 
     name: str
     run: Run
@@ -53,30 +53,30 @@ class Node:
     pending: Any = None
     busy: bool = False
     invocations: int = 0
-    dropped: int = 0  # inputs that a newer one replaced before they were looked at
+    dropped: int = 0  # inputs replaced by a newer one before they were read
     busy_s: float = 0.0
-    process: NodeProcess | None = None  # where the real work is done; None: here
+    process: NodeProcess | None = None  # process that runs the kernel; None for this one
     losses: list[Loss] = field(default_factory=list)
     restarts: int = 0
-    finished: int = 0  # invocations that are over, well or not
-    free_s: float = 0.0  # end of the newest work outside the queue
-    mates: list[Node] = field(default_factory=list)  # in its process: those after it, then before
+    finished: int = 0  # completed or failed invocations
+    free_s: float = 0.0  # end of the newest invocation outside the queue
+    mates: list[Node] = field(default_factory=list)  # others in its process, in cyclic order
 
 
 @dataclass(slots=True, eq=False)
 class _Job:
-    """One invocation between its start and the moment its output takes effect."""
+    """An invocation between its start and the publication of its output."""
 
     node: Node
     start_s: float
     input: Any
-    order: int | None = None  # number of the order in the node's process
+    order: int | None = None  # number of the request to the node's process
     done: bool = False
-    cancelled: bool = False  # its process was killed before the output was due
+    cancelled: bool = False  # True if its process was killed before the output was due
     output: Any = None
 
     def begin(self, wall: WallClock) -> None:
-        """Do the real work, or have the node's process do it."""
+        """Run the kernel, or send the input to the node's process."""
         if self.done or self.order is not None:
             return
         process = self.node.process
@@ -89,13 +89,13 @@ class _Job:
         self.input = None
 
     def settle(self, wall: WallClock) -> None:
-        """Wait for the work that a process was given, whatever comes of it."""
+        """Wait until the node's process has answered or died."""
         if self.order is not None and not self.done:
             with contextlib.suppress(NodeLost):
                 self.result(wall)
 
     def result(self, wall: WallClock) -> Any:
-        """The output, waiting for it where it is not there yet."""
+        """Return the output and wait for it if necessary."""
         self.begin(wall)
         if not self.done:
             assert self.node.process is not None
@@ -108,7 +108,7 @@ class _Job:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Invocation:
-    """A line of the time table: which node worked from when to when."""
+    """A row of the timetable: node, start and end of an invocation."""
 
     node: str
     start_s: float
@@ -120,14 +120,14 @@ class Executor:
     """Runs nodes in simulated time on a number of cores.
 
     Attributes:
-        draw_latency_s: latency of the next invocation of a node, by its name.
-        cores: how many nodes can work at the same time; the rest wait in the order of asking.
-        compute_first: an invocation's latency is asked for after its real work is done.
-        restart_s: from a node's end until its successor is ready, simulated.
-        watchdog_s: an invocation that has not ended after so long is killed, simulated.
-        losses: of all nodes, in order.
-        timetable: every invocation, in the order in which they started.
-        on_start: hears of every invocation: node, input, start stamp.
+        draw_latency_s: Function from a node's name to the latency of its next invocation, s.
+        cores: Maximum number of concurrent nodes; the others wait in the order of their requests.
+        compute_first: Draw an invocation's latency after its computation.
+        restart_s: Simulated time from a node's end until its successor is ready, s.
+        watchdog_s: Simulated time after which an unfinished invocation is killed, s.
+        losses: Losses of all nodes, in order.
+        timetable: All invocations in the order of their starts.
+        on_start: Callback for every invocation with node, input and start stamp.
     """
 
     draw_latency_s: Callable[[str], float]
@@ -144,7 +144,7 @@ class Executor:
     _events: list[tuple[float, int, _Event]] = field(default_factory=list)  # heap: time, order
     _waiting: list[Node] = field(default_factory=list)
     _uncomputed: list[_Job] = field(default_factory=list)
-    _jobs: dict[str, _Job] = field(default_factory=dict)  # whose output is not due yet
+    _jobs: dict[str, _Job] = field(default_factory=dict)  # jobs with a pending output
     _working: int = 0
     _count: int = 0
 
@@ -158,32 +158,33 @@ class Executor:
         """Add a node.
 
         Args:
-            name: selects its latency.
-            run: the kernel.
-            publish: takes its output, when it is due.
-            on_restart: hears that it is up again after its end, before it takes its next input.
+            name: Name of the node, which selects its latency.
+            run: Kernel of the node.
+            publish: Consumer of its output at the due time.
+            on_restart: Callback after a restart, before the node reads its next input.
         """
         node = Node(name=name, run=run, publish=publish, on_restart=on_restart)
         self._nodes[name] = node
         return node
 
     def share_process(self, names: Sequence[str]) -> None:
-        """Let nodes share a process, as one thread in it: the order is that of its loop."""
+        """Let nodes share one single-threaded process whose loop runs them in this order."""
         nodes = [self._nodes[name] for name in names]
         for place, node in enumerate(nodes):
             node.mates = nodes[place + 1 :] + nodes[:place]
 
     def process_of(self, name: str) -> dict[str, Run]:
-        """What the process of a node runs: its kernel and those of its mates, by name."""
+        """Return the kernels in the process of a node, by node name."""
         node = self._nodes[name]
         return {each.name: each.run for each in (node, *node.mates)}
 
     def isolate(self, name: str, process: NodeProcess | None = None) -> None:
-        """Let a node do its real work in a process apart from now on; `close` ends it.
+        """Run a node's kernel in a separate process from now on, until `close`.
 
         Args:
-            name: of the node; its mates move with it.
-            process: one that serves them; default a fork of this one, to which their state moves.
+            name: Name of the node. Nodes that share its process move with it.
+            process: Process that serves them; by default a fork of this one with a copy of their
+                state.
         """
         node = self._nodes[name]
         node.process = process or NodeProcess.fork(self.process_of(name))
@@ -191,33 +192,33 @@ class Executor:
             mate.process = node.process
 
     def settle(self) -> None:
-        """Wait for work under way: what a fault does there must not depend on the host's pace."""
+        """Wait for pending computations, so that a fault does not depend on the host's speed."""
         for job in self._jobs.values():
             if job.node.process is not None:
                 job.settle(self.wall)
         self._jobs.clear()
 
     def kill(self, name: str, stamp_s: float) -> None:
-        """End the process of a node as a signal would; nothing is left to kill where it is down.
+        """Kill the process of a node as a signal would. Does nothing if the node is down.
 
-        What it works on is lost, and so is what waits for it.
+        Its present and waiting inputs are lost.
 
         Args:
-            name: of a node that works in a process apart.
-            stamp_s: now.
+            name: Name of a node in a separate process.
+            stamp_s: Present stamp, s.
         """
         node = self._nodes[name]
         together = (node, *node.mates)
         jobs = [self._jobs.pop(each.name) for each in together if each.name in self._jobs]
         if not jobs and any(each.busy for each in together):
             return
-        for job in jobs:  # how far it came on this host must not matter
+        for job in jobs:  # the result must not depend on the host's progress
             job.settle(self.wall)
             job.cancelled = True
             self._working -= 1
         node.busy, node.pending = True, None
         self._note_loss(node, stamp_s, NodeLost(hung=False, how="killed by SIGKILL"))
-        self._at(stamp_s + self.restart_s, lambda up_s: self._revive(node, up_s))
+        self._at(stamp_s + self.restart_s, lambda up_s: self._restart(node, up_s))
         self._start_waiting()
 
     def close(self) -> None:
@@ -230,14 +231,13 @@ class Executor:
     def call(
         self, name: str, value: Any, stamp_s: float, *, again: bool = False
     ) -> tuple[Any, float] | None:
-        """Have a node work at once, outside the queue and on no core of the platform's.
+        """Run a node at once, outside the queue and without using a core of the platform.
 
         Args:
-            again: its newest work anew; else it takes nothing before the end of that.
+            again: Repeat the newest invocation; otherwise the node waits until its end.
 
         Returns:
-            Its output, and the latency after which that takes effect, s; None while the node is
-            still at work or down, or if it is lost.
+            Output, and latency until it takes effect, s; None if the node is busy, down or lost.
         """
         node = self._nodes[name]
         if node.busy or (stamp_s < node.free_s - _SAME_S and not again):
@@ -260,16 +260,16 @@ class Executor:
         node.busy = True
         gone_s = stamp_s + self.watchdog_s if lost.hung else stamp_s
         self._note_loss(node, gone_s, lost)
-        self._at(gone_s + self.restart_s, lambda stamp_s: self._revive(node, stamp_s))
+        self._at(gone_s + self.restart_s, lambda stamp_s: self._restart(node, stamp_s))
         return None
 
     @property
     def nodes(self) -> dict[str, Node]:
-        """All nodes by name, in the order in which they were added."""
+        """All nodes by name, in the order of their addition."""
         return self._nodes
 
     def submit(self, name: str, value: Any) -> None:
-        """Give a node its newest input at the present simulated time; `value` is not None."""
+        """Submit an input, which must not be None, to a node at the present simulated time."""
         node = self._nodes[name]
         if node.pending is not None:
             node.dropped += 1
@@ -277,7 +277,7 @@ class Executor:
         self._start_if_free(node)
 
     def advance(self, stamp_s: float) -> None:
-        """Publish every output that takes effect up to `stamp_s`, in the order of time."""
+        """Publish all outputs that are due up to `stamp_s`, in the order of time."""
         while self._events and self._events[0][0] <= stamp_s:
             due_s, _, event = heapq.heappop(self._events)
             self.now_s = max(self.now_s, due_s)
@@ -285,12 +285,12 @@ class Executor:
         self.now_s = max(self.now_s, stamp_s)
 
     def compute(self) -> None:
-        """Begin the real work of every invocation that has started; safe to call at any time."""
+        """Begin the computation of all started invocations. May be called at any time."""
         while self._uncomputed:
             self._uncomputed.pop(0).begin(self.wall)
 
     def _book(self, name: str, start_s: float, latency_s: float) -> None:
-        """Put an invocation into the time table."""
+        """Add an invocation to the timetable."""
         self._nodes[name].busy_s += latency_s
         end_s = start_s + latency_s
         self.timetable.append(Invocation(node=name, start_s=start_s, end_s=end_s))
@@ -331,13 +331,13 @@ class Executor:
             self._lose(job, end_s, loss)
             return
         job.node.busy = False
-        job.node.publish(output, end_s)  # its core is still taken: what this starts asks last
+        job.node.publish(output, end_s)  # its core is still busy, so new invocations queue last
         self._start_next(job.node)
         self._working -= 1
         self._start_waiting()
 
     def _start_next(self, node: Node) -> None:
-        """A node is free: the next of its process that has an input works."""
+        """Start the next node of the process that has an input."""
         for each in (*node.mates, node):
             self._start_if_free(each)
 
@@ -346,11 +346,11 @@ class Executor:
             self._start_if_free(self._waiting.pop(0))
 
     def _lose(self, job: _Job, end_s: float, loss: NodeLost) -> None:
-        """The output will never come: the node stays busy until it is dead, then until it is up."""
+        """Handle a lost output: the node stays busy until its death, then until its restart."""
         gone_s = max(end_s, job.start_s + self.watchdog_s) if loss.hung else end_s
         job.node.busy_s += gone_s - end_s
         self._note_loss(job.node, gone_s, loss)
-        self._at(gone_s, lambda stamp_s: self._bury(job.node, stamp_s))
+        self._at(gone_s, lambda stamp_s: self._end_process(job.node, stamp_s))
 
     def _note_loss(self, node: Node, gone_s: float, loss: NodeLost) -> None:
         entry = Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how,
@@ -360,13 +360,13 @@ class Executor:
         for mate in node.mates:
             mate.pending = None
 
-    def _bury(self, node: Node, stamp_s: float) -> None:
+    def _end_process(self, node: Node, stamp_s: float) -> None:
         self._working -= 1
-        self._at(stamp_s + self.restart_s, lambda up_s: self._revive(node, up_s))
+        self._at(stamp_s + self.restart_s, lambda up_s: self._restart(node, up_s))
         self._start_waiting()
 
-    def _revive(self, node: Node, _stamp_s: float) -> None:
-        """A new process with fresh state: this one's copy of the nodes has never worked."""
+    def _restart(self, node: Node, _stamp_s: float) -> None:
+        """Start a new process with fresh state, as the nodes' copies in this process never ran."""
         if node.process is not None:
             node.process.close(kill=True)
         process = NodeProcess.fork(self.process_of(node.name))

@@ -1,6 +1,6 @@
-"""The kernels as the mission's nodes run them, each with the state that it keeps.
+"""The kernels of the mission's nodes with their state between invocations.
 
-A node may live in a process of its own: then its part of the state lives there, too.
+If a node runs in its own process, its state is there, too.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from mavfi_cli.mission.stack import Stack
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckInput:
-    """What the collision check works on."""
+    """Input of the collision check."""
 
     snapshot: occupancy.MapSnapshot
     trajectory: Trajectory | None
     time_s: float
-    position_enu_m: FloatArray | None = None  # (3,) of the vehicle, where the path is shifted to it
+    position_enu_m: FloatArray | None = None  # (3,) vehicle; None if the path is not shifted to it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlInput:
-    """What the controller works on.
+    """Input of the controller.
 
     Attributes:
-        goes_on: control follows the plan that it has; that of `inputs` is left out.
+        goes_on: Control follows its own plan and ignores that of `inputs`.
     """
 
     inputs: tracking.TrackingInputs
     goes_on: bool = False
-    fresh: tracking.TrackingState | None  # compute from this state instead of one's own
-    yaw_rad: float  # the vehicle's, for a controller that begins
+    fresh: tracking.TrackingState | None  # state to compute from instead of the controller's own
+    yaw_rad: float  # vehicle's yaw, for the first invocation of the controller
 
 
 def tracking_inputs(
     stamp_s: float, state: VehicleState, directive: Directive
 ) -> tracking.TrackingInputs:
-    """What the controller works on, as the pilot directs it in the tick of that state."""
+    """Build the controller's inputs from the pilot's directive in the tick of a state."""
     return tracking.TrackingInputs(
         stamp_s=stamp_s,
         position_enu_m=state.position_enu_m,
@@ -68,7 +68,7 @@ def tracking_inputs(
 
 
 class Kernels:
-    """Every method is what one node does: (input, start stamp) -> output."""
+    """Kernels of all nodes. Each public method is one kernel: (input, start stamp) -> output."""
 
     def __init__(
         self, config: MissionConfig, stack: Stack, planner: Planner, briefing: Briefing
@@ -106,20 +106,20 @@ class Kernels:
             skips_endless_slices=stack.skips_endless_slices,
         )
         self._tracking_state: tracking.TrackingState | None = None
-        self._queue: Trajectory | None = None  # control's own
-        self._plans = 0  # of the planner
+        self._queue: Trajectory | None = None  # control's own copy of the plan
+        self._plans = 0  # plans counted by the planner
 
     def point_cloud(self, frame: DepthFrame, _stamp_s: float) -> PointCloud:
-        """A depth frame's points in the world."""
+        """Compute the world points of a depth frame."""
         return point_cloud.generate(frame, self._cloud_params)
 
     def octomap(self, cloud: PointCloud, _stamp_s: float) -> occupancy.MapSnapshot:
-        """The map with one more cloud in it."""
+        """Integrate a cloud into the map and return a snapshot."""
         self._map.insert(cloud)
         return self._map.snapshot()
 
     def collision_check(self, check: CheckInput, stamp_s: float) -> tuple[CollisionReport, float]:
-        """The verdict on a trajectory, and the stamp of the frame that its map is of."""
+        """Check a trajectory. Return the report and the stamp of its map's frame."""
         inputs = collision.CollisionInputs(
             stamp_s=stamp_s,
             snapshot=check.snapshot,
@@ -135,7 +135,7 @@ class Kernels:
     def planner(
         self, job: tuple[PlanRequest, occupancy.MapSnapshot], _stamp_s: float
     ) -> Trajectory | PlanFailure:
-        """A trajectory that answers a request, or the reason why there is none."""
+        """Plan a trajectory for a request, or return the reason for a failure."""
         request, snapshot = job
         newest = request.trajectory_seq
         if self._stack.owns_sequence_numbers:
@@ -165,7 +165,7 @@ class Kernels:
         return found.trajectory
 
     def control(self, job: ControlInput, _stamp_s: float) -> Command:
-        """One control tick."""
+        """Run one control tick."""
         state = job.fresh or self._tracking_state
         if state is None:
             state = tracking.TrackingState(yaw_rad=job.yaw_rad, stamp_s=job.inputs.stamp_s)
@@ -179,7 +179,7 @@ class Kernels:
         return command
 
     def _as_read(self, trajectory: Trajectory | None) -> Trajectory | None:
-        """A plan as its readers take it: without accelerations where nobody feeds them forward."""
+        """Return a plan as its readers use it, without accelerations if feed-forward is off."""
         if trajectory is None or self._stack.feeds_acceleration_forward:
             return trajectory
         waypoints = trajectory.waypoints.copy()
@@ -188,5 +188,5 @@ class Kernels:
 
 
 def _next_int32(value: int) -> int:
-    """The next number of a 32-bit counter, which a fault may have driven to its end."""
+    """Return the next value of a 32-bit counter with wrap-around, which a fault can cause."""
     return (value + 1 + 2**31) % 2**32 - 2**31

@@ -1,8 +1,8 @@
-"""A process in which nodes do their real work, beside the one that talks to the vehicle.
+"""A process that runs the kernels of nodes, separate from the process of the mission.
 
-The process is a fork of the companion, so every kernel is loaded in it and every node's state is
-its own copy. Inputs and outputs travel as pickles over a socket pair; numbers arrive to the bit,
-so where a node runs changes nothing in the record of a mission.
+The process is a fork of the companion, so it has every kernel loaded and its own copy of every
+node's state. Inputs and outputs are sent as pickles over a socket pair. Numbers stay exact, so the
+process of a node does not change the record of a mission.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from mavfi_cli.core.channel import receive, send
 
 Run = Callable[[Any, float], Any]
 
-# A node hangs when one invocation takes this much of the processor, or of the wall clock where it
-# waits for something. The slowest healthy one takes well under half a second; what the limits are
-# does not enter the record, only whether they were passed.
+# A node hangs if one invocation exceeds this CPU time, or this wall time while it waits. A healthy
+# invocation takes well under half a second. The record does not depend on the limits themselves,
+# but only on whether they were exceeded.
 HANG_CPU_S = 5.0
 HANG_WALL_S = 120.0
 _LOOK_S = 0.25
@@ -43,35 +43,35 @@ class _Order:
 
 @dataclass(frozen=True, slots=True)
 class _Rehearse:
-    """Instead of an order: have a fork work on the order that comes next."""
+    """Request to let a fork process the next order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Answer:
     number: int
     output: Any
-    host_s: float  # what the kernel took on this machine
+    host_s: float  # host time of the kernel
     error: str | None = None
 
 
 class NodeLost(Exception):
-    """A node's process is gone, or had to be killed: what the executor makes the best of."""
+    """A node's process has ended or had to be killed. The executor handles this."""
 
     def __init__(self, *, hung: bool, how: str, traceback: str = "") -> None:
         super().__init__(how)
         self.hung = hung
         self.how = how
-        self.traceback = traceback  # of an error in the kernel
+        self.traceback = traceback  # traceback of an error in the kernel
 
 
 class NodeProcess:
-    """Runs kernels for the executor: hand in orders, later take the answers.
+    """Runs kernels for the executor: `order` sends an input, `take` returns its output.
 
     Args:
-        connection: our end of the socket pair.
-        pid: of the process, a child of ours.
-        ending: tells how the process ended where somebody else heard of it first, else None.
-        patient: a debugger may hold it, so it never hangs.
+        connection: Our end of the socket pair.
+        pid: Process id of the child.
+        ending: Returns how the process ended if another waiter reaped it, else None.
+        patient: Never treat the process as hung, because a debugger may hold it.
     """
 
     def __init__(
@@ -87,17 +87,17 @@ class NodeProcess:
         self._ending = ending
         self._patient = patient
         if not patient:
-            connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in the middle of a word
+            connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in mid-message
         self._answers: dict[int, _Answer] = {}
         self._count = 0
-        self._gone = False  # and reaped: its number may belong to another process by now
+        self._gone = False  # True after it was reaped, as its id may then be reused
 
     @classmethod
     def fork(cls, runs: Mapping[str, Run]) -> NodeProcess:
-        """A fork of this process.
+        """Fork this process.
 
         Args:
-            runs: kernel by node name; the child uses its own copies.
+            runs: Kernels by node name; the child uses its own copies.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         pid = os.fork()
@@ -109,13 +109,13 @@ class NodeProcess:
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process id of the child."""
         return self._pid
 
     def order(self, node: str, value: Any, start_s: float) -> int:
-        """Have an input worked on; the number under which to ask for the output.
+        """Send an input. Return the number to pass to `take`.
 
-        A process that is gone already is noticed when the output is asked for.
+        If the process has already ended, `take` reports it.
         """
         self._count += 1
         order = _Order(number=self._count, node=node, input=value, start_s=start_s)
@@ -124,25 +124,25 @@ class NodeProcess:
         return order.number
 
     def rehearse(self) -> int:
-        """Fork the process; the fork works on the next order, ends, and never answers.
+        """Fork the process. The fork processes the next order and ends without an answer.
 
-        The process goes on, as if nothing had been, once the fork has ended.
+        The process continues unchanged once the fork has ended.
 
         Returns:
-            Process id of the fork, which waits for its order.
+            Process id of the fork, which waits for an order.
 
         Raises:
-            OSError, EOFError: the process is gone.
+            OSError, EOFError: The process has ended.
         """
         send(self._socket, _Rehearse())
         fork: int = receive(self._socket)
         return fork
 
     def take(self, number: int) -> tuple[Any, float]:
-        """Wait for the output of an order; the output and the host seconds it took.
+        """Wait for the output of an order. Return it with its host time in seconds.
 
         Raises:
-            NodeLost: the process ended, hung and was killed, or its kernel raised an error.
+            NodeLost: The process ended, hung and was killed, or its kernel raised an error.
         """
         begun_s, used_s = time.monotonic(), self._cpu_s()
         try:
@@ -159,7 +159,7 @@ class NodeProcess:
             raise NodeLost(hung=False, how=self._end()) from None
         except NodeLost:
             raise
-        except Exception:  # whatever a corrupted node's words make of the one who reads them
+        except Exception:  # a corrupted pickle can raise any error
             raise NodeLost(hung=False, how="garbled its output") from None
         answer = self._answers.pop(number)
         if answer.error is not None:
@@ -168,16 +168,14 @@ class NodeProcess:
         return answer.output, answer.host_s
 
     def _cpu_s(self) -> float:
-        """Processor seconds that the process has used; 0 once it is gone."""
+        """Return the CPU time of the process in seconds; 0 after its end."""
         try:
-            return time.clock_gettime(
-                ~self._pid << 3 | 2
-            )  # the clock that clock_getcpuclockid names
+            return time.clock_gettime(~self._pid << 3 | 2)  # clock id of clock_getcpuclockid
         except OSError:
             return 0.0
 
     def _end(self) -> str:
-        """How the process ended, in words."""
+        """Return in words how the process ended."""
         told = self._ending()
         self._gone = True
         if told is not None:
@@ -190,7 +188,7 @@ class NodeProcess:
         return "ended"
 
     def close(self, *, kill: bool = False) -> None:
-        """End the process: it ends itself when the connection closes, unless it cannot hear."""
+        """End the process, which exits by itself when the connection closes unless it is stuck."""
         self._socket.close()
         if self._gone:
             return
@@ -204,9 +202,9 @@ class NodeProcess:
 
 
 def serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
-    """The child's whole life: work on orders until the parent closes. Does not return."""
+    """Process orders in the child until the parent closes the connection. Does not return."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # the parent decides when it is over
+        signal.signal(number, signal.SIG_IGN)  # only the parent ends this process
     faulthandler.disable()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:

@@ -1,9 +1,10 @@
-"""The detector gate in a mission: what is withheld, what is computed again, and when that ends.
+"""The detector's gate in a mission: decides whether to withhold, recompute or accept a message.
 
-A message that raises an alarm is withheld and its stage computes again (paper, section V-E). That
-is bounded: the `alarms_max`-th alarm of a stage in a row makes the vehicle hold and plan anew, and
-what comes after it passes, because so many computations agree. What passes while the vehicle hovers
-does not end the row: it says nothing about the waypoints that raised the alarms.
+A message that raises an alarm is withheld and its stage is recomputed (paper, section V-E). The
+number of recomputations is bounded: at the `alarms_max`-th consecutive alarm of a stage the vehicle
+holds and plans anew. The next message passes, because so many computations agree. Messages accepted
+while the vehicle hovers do not end the series, because they do not test the waypoints that raised
+the alarms.
 """
 
 from __future__ import annotations
@@ -24,24 +25,24 @@ from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.mission.detector_config import DetectorConfig, detector_of, watch_of
 
 MAX_LISTED_ALARMS = 100
-TOLD_EVERY_S = 1.0  # alarms of one stage are told to people no more often
+TOLD_EVERY_S = 1.0  # minimum time between two announced alarms of one stage
 
 
 class Response(Enum):
-    """What happens with a message at the gate."""
+    """The gate's decision about a message with an alarm."""
 
     PASS = "pass"
-    RECOMPUTE = "recompute"  # withheld, its stage computes again
-    HOLD = "hold"  # withheld, the vehicle holds and plans anew
-    ACCEPT = "accept"  # passes in spite of the alarm: recomputing confirmed it
+    RECOMPUTE = "recompute"  # withheld; its stage is recomputed
+    HOLD = "hold"  # withheld; the vehicle holds and plans anew
+    ACCEPT = "accept"  # accepted in spite of the alarm, because recomputation confirmed it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmRecord:
-    """One alarm as the record of the run tells it."""
+    """One alarm in the record of the run."""
 
     stamp_s: float
-    message: str  # report, plan, ahead (the flown plan, before it is checked), tick
+    message: str  # report, plan, ahead (active plan before its collision check) or tick
     stage: str
     score: float
     states: tuple[str, ...]
@@ -50,7 +51,7 @@ class AlarmRecord:
 
 @dataclass(slots=True)
 class _Recovery:
-    """How often and how long a stage was without an accepted message after an alarm."""
+    """Number and duration of the phases in which a stage had no accepted message."""
 
     count: int = 0
     total_s: float = 0.0
@@ -59,7 +60,7 @@ class _Recovery:
 
 
 class NoProtection:
-    """The null object: everything passes."""
+    """Null object that lets every message pass."""
 
     gate: Gate | None = None
 
@@ -72,7 +73,7 @@ class NoProtection:
         return Response.PASS
 
     def lose_plan(self) -> None:
-        """Nothing to judge."""
+        """Do nothing."""
 
     def ahead(
         self, plan: Trajectory, first: int, only: int | None, stamp_s: float
@@ -87,11 +88,11 @@ class NoProtection:
         return Response.PASS, Stage.CONTROL
 
     def news(self) -> list[str]:
-        """Nothing to tell."""
+        """Return no news."""
         return []
 
     def summary(self) -> dict[str, Any] | None:
-        """No record."""
+        """Return no record."""
         return None
 
 
@@ -99,9 +100,9 @@ class Protection(NoProtection):
     """A gate with its counters.
 
     Args:
-        config: which detector, which stages.
-        stack: of the mission, as `load_stack` takes it.
-        wall: gets the host time of all checks, under "gate".
+        config: Detector and stages.
+        stack: Stack of the mission, as for `load_stack`.
+        wall: Clock for the host time of all checks, under "gate".
     """
 
     def __init__(self, config: DetectorConfig, stack: str, wall: WallClock) -> None:
@@ -120,7 +121,7 @@ class Protection(NoProtection):
         self._told_s: dict[Stage, float] = {}
 
     def report(self, report: CollisionReport, stamp_s: float) -> tuple[Response, Stage]:
-        """Judge perception's message on its arrival; and which stage is to compute again."""
+        """Judge a collision report on its arrival. Return the stage to recompute, too."""
         alarm = self._judge("report", self.gate.judge_report, report)
         if alarm is None:
             self._recovered(Stage.PERCEPTION, stamp_s, proven=True)
@@ -142,13 +143,13 @@ class Protection(NoProtection):
         return response
 
     def lose_plan(self) -> None:
-        """The planner has answered, and nobody waits for a plan of it."""
+        """Note that the planner has answered without a usable plan."""
         self.gate.lose_plan()
 
     def ahead(
         self, plan: Trajectory, first: int, only: int | None, stamp_s: float
     ) -> tuple[Response, Alarm | None]:
-        """Look through the flown plan, from the present waypoint on; or look at one waypoint."""
+        """Judge the active plan from the present waypoint on, or a single waypoint."""
         alarm = self._judge("ahead", self.gate.judge_ahead, plan, first)
         if alarm is None or only not in (None, alarm.waypoint):
             return Response.PASS, None
@@ -157,7 +158,7 @@ class Protection(NoProtection):
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> tuple[Response, Stage]:
-        """Judge the followed waypoint and the command that would go out; and who is to blame."""
+        """Judge the present waypoint and the command. Return the stage at fault, too."""
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         if alarm is None:
             flown = Stage.PLANNING in self.gate.fresh
@@ -215,12 +216,12 @@ class Protection(NoProtection):
         self._news.append(f"{alarm.detector} alarm in {stage.value}: {where}; {response.value}")
 
     def _recovered(self, stage: Stage, stamp_s: float, *, proven: bool) -> None:
-        """A message passed.
+        """Note an accepted message.
 
         Args:
-            proven: all that its stage's alarms are raised for was in it. Nothing less ends the row
-                of a vehicle that holds: the steps within a plan, or the commands of a hover, pass
-                whatever the first waypoint of the next plan is compared with.
+            proven: The message contained all states for which its stage raises alarms. Only such a
+                message ends the series of a holding vehicle, because the steps within a plan and
+                the commands of a hover always pass.
         """
         recovery = self._recoveries[stage]
         if proven or recovery.in_a_row < self._config.alarms_max:
@@ -234,12 +235,12 @@ class Protection(NoProtection):
             recovery.since_s = None
 
     def news(self) -> list[str]:
-        """What was noticed since the last call, a line each."""
+        """Return the lines to announce since the last call."""
         told, self._news = self._news, []
         return told
 
     def summary(self) -> dict[str, Any]:
-        """Checks, alarms and recoveries, as plain values."""
+        """Return checks, alarms and recoveries as plain values."""
         return {
             "detector": self._config.name,
             "protect": list(self._config.protect),
@@ -256,7 +257,7 @@ class Protection(NoProtection):
 
 
 def _warm_up(gate: Gate) -> None:
-    """Have everything loaded and compiled before the flight; the gate is of no use afterwards."""
+    """Load and compile everything before the flight. Afterwards the gate is unusable."""
     report = CollisionReport(
         stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
     )
@@ -276,15 +277,15 @@ def _warm_up(gate: Gate) -> None:
 
 
 def protection_of(config: DetectorConfig | None, stack: str, wall: WallClock) -> NoProtection:
-    """The protection that a mission asks for; the null object where it asks for none."""
+    """Create the protection of a mission, or the null object if it has no detector."""
     return NoProtection() if config is None else Protection(config, stack, wall)
 
 
 def gate_of(protection: NoProtection) -> Gate:
-    """The gate of a protection, to attack it.
+    """Return the gate of a protection as a fault target.
 
     Raises:
-        FaultSpecError: there is none.
+        FaultSpecError: There is no gate.
     """
     if protection.gate is None:
         raise FaultSpecError("a fault in the detector needs one: --detector NAME")

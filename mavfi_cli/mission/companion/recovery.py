@@ -1,20 +1,20 @@
-"""What follows an alarm: a message is withheld, computed again, or the vehicle holds.
+"""Recovery after an alarm: withholds or recomputes a message, or holds the vehicle.
 
-`Protection` judges a message and counts; this is what its answer does to the mission.
+`Protection` judges and counts messages. This module applies its response to the mission.
 
-    answer      report             plan               plan that is flown   command
-    RECOMPUTE   look anew          ask for another    drop the waypoint    compute it again
-    HOLD        look anew, hold    hold               hold                 hold
+    response    report                       plan              active plan          command
+    RECOMPUTE   recompute perception         request another   drop the waypoint    recompute it
+    HOLD        recompute perception, hold   hold              hold                 hold
 
-Perception looks anew where the alarm is its own. That of a detector over all stages recomputes
-control (section V-D), which it does in the next tick, without the report.
+Perception recomputes only if the alarm names it. A detector over all stages recomputes control
+(paper, section V-D), which happens in the next tick without the report.
 
-Where a number of the flown plan has changed, and not a waypoint, the plan gets back the number that
-was accepted, and another one is asked for. The mission logic and the collision check never see it.
+If a sequence number of the active plan has changed, but no waypoint, the plan gets its accepted
+number back, and a new plan is requested. Mission logic and collision check never see the change.
 
-To hold is to give the plan up, hover, and plan anew from there. PASS and ACCEPT let the message
-take effect. Where computing a command again did not help, or its waypoint is to blame, control
-drops that waypoint, takes the next, and begins afresh (paper, section V-E).
+A vehicle that holds drops the plan, hovers, and plans anew from there. PASS and ACCEPT let the
+message take effect. If recomputing a command did not help, or its waypoint is at fault, control
+drops that waypoint, takes the next, and resets its state (paper, section V-E).
 """
 
 from __future__ import annotations
@@ -31,43 +31,43 @@ from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, Ve
 from mavfi_cli.fi.source.activation import Follower
 from mavfi_cli.mission.companion.protection import NoProtection, Response
 
-ATTEMPTS = 2  # a command is computed again in one tick
+ATTEMPTS = 2  # maximum recomputations of a command in one tick
 WITHHELD = (Response.RECOMPUTE, Response.HOLD)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setpoint:
-    """A command on its way, and what it was computed from."""
+    """A pending command and its inputs."""
 
-    due_s: float  # when control has computed it
+    due_s: float  # end of control's computation
     command: Command
     directive: Directive
-    waypoint: int  # of the directive's trajectory
-    attempt: int = 0  # how often it was computed again
-    frame_s: float | None = None  # of a depth frame whose verdict no earlier command knew
+    waypoint: int  # index in the directive's trajectory
+    attempt: int = 0  # number of recomputations
+    frame_s: float | None = None  # stamp of a depth frame that no earlier command has used
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Retry:
-    """How control computes a withheld command again."""
+    """Inputs for recomputing a withheld command."""
 
     directive: Directive
-    fresh: TrackingState | None  # the controller begins from this; None: from its own state
+    fresh: TrackingState | None  # initial state of the controller; None for its own
     attempt: int
 
 
 class Recovery:
-    """Lets messages pass or has them computed again.
+    """Accepts messages or has them recomputed.
 
     Args:
-        protection: judges; the null object lets everything pass.
-        pilot: whose plan is dropped, changed or asked for.
-        follower: is told which message was withheld; None where no fault is followed.
-        exchange: puts a changed version of a plan in the place of the one that is flown.
-        look_anew: has perception compute again, from the newest frame.
+        protection: Judges messages; the null object accepts all.
+        pilot: Pilot whose plan is dropped, changed or requested.
+        follower: Gets withheld messages; None without a fault.
+        exchange: Replaces the active plan by a changed version.
+        recompute_perception: Has perception recompute from the newest frame.
 
     Attributes:
-        state: the vehicle's newest state, from which a vehicle that holds plans anew.
+        state: Newest vehicle state, from which a holding vehicle plans anew.
     """
 
     def __init__(
@@ -76,30 +76,30 @@ class Recovery:
         pilot: Pilot,
         follower: Follower | None,
         exchange: Callable[[Trajectory, Trajectory], None],
-        look_anew: Callable[[], None],
+        recompute_perception: Callable[[], None],
     ) -> None:
         self._protection = protection
         self._pilot = pilot
         self._follower = follower
         self._exchange = exchange
-        self._look_anew = look_anew
+        self._recompute_perception = recompute_perception
         self._looked: tuple[Trajectory | None, int] = (None, -1)
         self.state: VehicleState | None = None
 
     def admit_report(self, report: CollisionReport, stamp_s: float) -> bool:
-        """Whether perception's message takes effect."""
+        """Return True if a collision report takes effect."""
         response, stage = self._protection.report(report, stamp_s)
         if response not in WITHHELD:
             return True
         self._withhold(report)
         if stage is Stage.PERCEPTION:
-            self._look_anew()
+            self._recompute_perception()
         if response is Response.HOLD:
             self._hold()
         return False
 
     def admit_plan(self, plan: Trajectory, stamp_s: float) -> bool:
-        """Whether an awaited plan takes effect; else another one has been asked for."""
+        """Return True if a requested plan takes effect. Otherwise request another."""
         response = self._protection.plan(plan, stamp_s)
         if response not in WITHHELD:
             return True
@@ -112,14 +112,14 @@ class Recovery:
     def admit_command(
         self, command: Command, setpoint: Setpoint, last: Command | None, stamp_s: float
     ) -> tuple[bool, Retry | None]:
-        """Whether a command goes out, and if not, how control tries again in this tick.
+        """Return True if a command is sent, and otherwise the inputs to recompute it in this tick.
 
-        What raises an alarm ATTEMPTS times leaves the last command in force until the next tick.
+        After ATTEMPTS alarms the last command holds until the next tick.
 
         Args:
-            command: as it would go out.
-            setpoint: what control computed it from.
-            last: the command that is in force.
+            command: Command to send.
+            setpoint: Inputs of the command.
+            last: Command in force.
         """
         flown = setpoint.directive.trajectory
         response, stage = self._protection.tick(flown, setpoint.waypoint, command, stamp_s)
@@ -137,7 +137,7 @@ class Recovery:
         return False, self._retry(setpoint, last if drop else None, drop=drop)
 
     def _retry(self, setpoint: Setpoint, last: Command | None, *, drop: bool) -> Retry:
-        """Compute again as before; or without the waypoint, from the last command on."""
+        """Return the inputs to recompute, unchanged or without the waypoint."""
         directive = setpoint.directive
         if drop and directive.trajectory is not None:
             bridged = self._drop(directive.trajectory, setpoint.waypoint)
@@ -146,33 +146,35 @@ class Recovery:
         return Retry(directive=directive, fresh=fresh, attempt=setpoint.attempt + 1)
 
     def look_round(self, stamp_s: float, unharmed: Trajectory) -> None:
-        """Before the mission logic works with the flown plan: what has changed since the last tick?
+        """Judge changes of the active plan since the last tick, before the mission logic uses it.
 
-        With a new plan, or a waypoint that is begun, the whole way ahead is looked through. In
-        between only the waypoint that is followed is watched, in every tick: looking through the
-        whole plan 50 times a second would be another order of cost.
+        A new plan or a new waypoint triggers a check of the whole plan ahead. In between, each tick
+        checks the present waypoint only, because 50 checks of the whole plan per second would cost
+        an order of magnitude more.
 
         Args:
-            unharmed: the plan before this tick's strike; the gate has seen that one already.
+            stamp_s: Present stamp, s.
+            unharmed: Plan before this tick's strike, which the gate has already judged.
         """
-        if self._pilot.flown.trajectory is None:
+        if self._pilot.active.trajectory is None:
             return
-        at, (seen, seen_at) = self._pilot.flown.waypoint, self._looked
-        if self._pilot.flown.trajectory is not seen or at != seen_at:
+        at, (seen, seen_at) = self._pilot.active.waypoint, self._looked
+        if self._pilot.active.trajectory is not seen or at != seen_at:
             known = unharmed is seen and at == seen_at
             self.look_ahead(stamp_s, at if known else None)
-        self._looked = (self._pilot.flown.trajectory, at)
+        self._looked = (self._pilot.active.trajectory, at)
 
     def look_ahead(self, stamp_s: float, only: int | None = None) -> None:
-        """Drop what the gate finds wrong on the way ahead, before others take it for true.
+        """Drop anomalous waypoints of the plan ahead before other nodes use them.
 
         Args:
-            only: nothing but this waypoint is dropped.
+            stamp_s: Present stamp, s.
+            only: Drop this waypoint only.
         """
         pilot = self._pilot
-        while pilot.flown.trajectory is not None:
-            flown = pilot.flown.trajectory
-            response, alarm = self._protection.ahead(flown, pilot.flown.waypoint, only, stamp_s)
+        while pilot.active.trajectory is not None:
+            flown = pilot.active.trajectory
+            response, alarm = self._protection.ahead(flown, pilot.active.waypoint, only, stamp_s)
             if response is Response.HOLD:
                 self._hold()
             elif response is Response.RECOMPUTE and alarm is not None:
@@ -183,12 +185,12 @@ class Recovery:
                     self._drop(flown, alarm.waypoint)
                 if alarm.stage is Stage.PLANNING:
                     pilot.want_plan()
-                if pilot.flown.trajectory is not flown:
+                if pilot.active.trajectory is not flown:
                     continue
             return
 
     def _drop(self, flown: Trajectory, waypoint: int) -> Trajectory:
-        """The plan without a waypoint, which is flown from now on."""
+        """Drop a waypoint from the active plan and return the new plan."""
         bridged = without_waypoint(flown, waypoint)
         self._replace(flown, bridged)
         return bridged

@@ -1,4 +1,4 @@
-"""How long the pipeline takes from a depth frame to a setpoint."""
+"""Response time of the pipeline from a depth frame to a setpoint."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reaction:
-    """How long a depth frame took to reach a setpoint: the pipeline's response time."""
+    """Response of the pipeline to one depth frame."""
 
     frame_stamp_s: float
     setpoint_stamp_s: float
 
 
 def response_times(reactions: list[Reaction]) -> dict[str, float | None]:
-    """Median and 95th percentile of the time from a depth frame to a setpoint, s."""
+    """Return median and 95th percentile of the response time, s."""
     if not reactions:
         return {"median": None, "p95": None, "count": 0}
     times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])

@@ -1,1 +1,1 @@
-"""What a flight leaves: the run folder, its tables, its events, and what is counted from them."""
+"""Record of a flight: run folder, tables, events and statistics."""

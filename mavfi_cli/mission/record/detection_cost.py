@@ -1,8 +1,8 @@
-"""What detection and recovery cost one flight, from its record.
+"""Cost of detection and recovery in a flight, computed from its record.
 
-As in the paper's Table V, "the total detection and recomputation time for each mission". The checks
-take what they took on the host that flew; what is computed again takes its latency on the flight's
-platform, in simulated time.
+The cost is "the total detection and recomputation time for each mission" (paper, Table V). Checks
+count with their time on the host of the flight. Recomputations count with their latency on the
+flight's platform, in simulated time.
 """
 
 from __future__ import annotations
@@ -14,30 +14,31 @@ from typing import Any
 
 from mavfi_cli.core.types import Stage
 
-# What is computed again when a stage raises an alarm: from its first kernel to its last.
+# Kernels that are recomputed after an alarm of a stage, from first to last.
 RECOMPUTED = {
     Stage.PERCEPTION.value: ("point_cloud", "octomap", "collision_check"),
     Stage.PLANNING.value: ("planner",),
     Stage.CONTROL.value: ("control",),
 }
 KERNELS = tuple(kernel for kernels in RECOMPUTED.values() for kernel in kernels)
-# Said wherever the checks stand beside simulated time: no factor between hosts is known.
+# Note for every comparison of checks with simulated time, as no factor between hosts is known.
 HOST_CHECKS = "checks take the time of the host that flew, not scaled to the platform"
-_AGAIN = ("recompute", "hold")  # responses to an alarm after which something is computed again
+_AGAIN = ("recompute", "hold")  # responses to an alarm that cause a recomputation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectionCost:
-    """What a detector cost in one flight.
+    """Cost of a detector in one flight.
 
     Attributes:
-        checks: messages that passed the gate, looks through plans included.
-        checks_host_s: all of them together, host time.
-        flight_s: flight time; where that is not known, the simulated time of the whole mission.
-        recomputations: of each stage. The record lists the first alarms one by one and counts the
-            others, which are shared among the stages as those are; so these may be fractions.
-        recovery_s: of each stage, simulated: its recomputations, each at the mean latency that its
-            kernels had in this flight.
+        checks: Number of checks by the gate, including checks of whole plans.
+        checks_host_s: Total host time of the checks, s.
+        flight_s: Flight time, or simulated time of the whole mission if that is unknown, s.
+        recomputations: Number of recomputations per stage. The record lists the first alarms and
+            only counts the others, which are distributed over the stages in the same ratio.
+            Numbers may therefore be fractions.
+        recovery_s: Simulated time of the recomputations per stage, each at the mean latency of its
+            kernels in this flight, s.
     """
 
     detector: str
@@ -49,33 +50,33 @@ class DetectionCost:
 
     @property
     def check_host_s(self) -> float:
-        """Mean host time of a check."""
+        """Mean host time of a check, s."""
         return self.checks_host_s / self.checks
 
     @property
     def detection_share(self) -> float:
-        """Host time of all checks over the flight time; 0.01 is one per cent."""
+        """Ratio of the checks' host time to the flight time."""
         return self.checks_host_s / self.flight_s
 
     @property
     def recovered_s(self) -> float:
-        """Simulated seconds that all recomputations took."""
+        """Simulated time of all recomputations, s."""
         return math.fsum(self.recovery_s.values())
 
     @property
     def recovery_share(self) -> float:
-        """Simulated time of all recomputations over the flight time."""
+        """Ratio of the recomputations' simulated time to the flight time."""
         return self.recovered_s / self.flight_s
 
 
 def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
-    """The cost of detection and recovery in a flight.
+    """Compute the cost of detection and recovery in a flight.
 
     Args:
-        result: result.json.
+        result: Contents of result.json.
 
     Returns:
-        None where no detector watched, or where the flight ended before anything was checked.
+        Cost; None without a detector or without any check.
     """
     detection = result.get("detection")
     checks_host_s = ((result.get("host") or {}).get("stage_wall_s") or {}).get("gate")
@@ -102,7 +103,7 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
 
 
 def _recomputations(detection: Mapping[str, Any]) -> dict[str, float]:
-    """How often each stage computed again; the alarms beyond the listed ones are shared alike."""
+    """Return the recomputations per stage; unlisted alarms are distributed in the same ratio."""
     listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _AGAIN]
     total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
     return {
@@ -111,5 +112,5 @@ def _recomputations(detection: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _mean_s(kernel: Mapping[str, Any] | None) -> float:
-    """Mean latency of an invocation, s."""
+    """Return the mean latency of an invocation, s."""
     return kernel["busy_s"] / kernel["invocations"] if kernel and kernel["invocations"] else 0.0

@@ -1,4 +1,4 @@
-"""What happened in a mission, in order: the list that a person reads after the flight."""
+"""Event log of a mission."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """One line of the flight's story."""
+    """One event of a flight."""
 
     stamp_s: float
     kind: str  # phase, autopilot, plan, collision, outcome
@@ -16,18 +16,18 @@ class Event:
     position_enu_m: tuple[float, float, float] | None = None
 
 
-class Listener(Protocol):
-    """Hears of every event as it happens."""
+class EventListener(Protocol):
+    """Receiver of events."""
 
     def on_event(self, event: Event) -> None:
-        """Called for every event."""
+        """Handle an event."""
 
 
 @dataclass(slots=True)
 class EventLog:
     """Collects events and passes them on."""
 
-    listener: Listener
+    listener: EventListener
     events: list[Event] = field(default_factory=list)
 
     def add(
@@ -37,11 +37,11 @@ class EventLog:
         text: str,
         position_enu_m: tuple[float, float, float] | None = None,
     ) -> None:
-        """Note one event."""
+        """Add an event."""
         event = Event(stamp_s=stamp_s, kind=kind, text=text, position_enu_m=position_enu_m)
         self.events.append(event)
         self.listener.on_event(event)
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Plain values, for the record of the run."""
+        """Return plain values for the record of the run."""
         return [asdict(event) for event in self.events]

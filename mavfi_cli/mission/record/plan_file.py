@@ -1,4 +1,4 @@
-"""The plans of a mission, whole, as the mission logic got them: plans.parquet."""
+"""Writes and reads plans.parquet: all plans of a mission, as received by the mission logic."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _COLUMNS = ("stamp_s", "trajectory_seq", "future_collision_seq", *WAYPOINT_FIELD
 
 
 def write_plans(path: Path, plans: Sequence[Trajectory]) -> None:
-    """Write plans atomically as Parquet, one row a waypoint; equal plans give equal bytes."""
+    """Write plans as Parquet, atomically, one row per waypoint. Equal plans give equal bytes."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -38,10 +38,10 @@ def write_plans(path: Path, plans: Sequence[Trajectory]) -> None:
 
 
 def read_plans(path: Path) -> list[Trajectory]:
-    """Read plans back; a plan without waypoints is not among them.
+    """Read plans. The file does not contain plans without waypoints.
 
     Raises:
-        RecordError: missing, damaged, or not of this shape.
+        RecordError: The file is missing, damaged, or of another format.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -1,7 +1,7 @@
-"""Quality of flight (QoF): time, distance, energy, clearance, as the paper's section IV uses them.
+"""Quality of flight (QoF): time, distance, energy and clearance (paper, section IV).
 
-Flight time runs from the moment the companion takes over at take-off height to the end of the
-mission, as in the paper, where take-off precedes the measurement.
+Flight time runs from the companion's take-over at take-off height to the end of the mission, as in
+the paper, where take-off precedes the measurement.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ Truth = dict[str, np.ndarray]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QualityOfFlight:
-    """What a flight cost. None: not known (a foreign autopilot has no referee)."""
+    """Quality of a flight. Unknown values are None, because a foreign autopilot has no referee."""
 
     flight_time_s: float | None = None
     distance_m: float | None = None
     mean_speed_mps: float | None = None
     max_speed_mps: float | None = None
     min_clearance_m: float | None = None
-    goal_distance_m: float | None = None  # at the end
-    energy_regression_j: float | None = None  # MAVBench regression, facts/vpm.md section 5
-    energy_propeller_j: float | None = None  # JSBSim propeller shaft power, all rotors
+    goal_distance_m: float | None = None  # at the end of the mission
+    energy_regression_j: float | None = None  # MAVBench's regression, see docs/flight.md
+    energy_propeller_j: float | None = None  # from JSBSim's propeller shaft power, all rotors
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the record of the run."""
+        """Return plain values for the record of the run."""
         return asdict(self)
 
 
 def from_truth(
     truth: Truth, start_s: float, end_s: float, goal_enu_m: np.ndarray
 ) -> QualityOfFlight:
-    """Quality of flight between two stamps, from the referee's log.
+    """Compute the quality of flight between two stamps from the referee's log.
 
     Args:
-        truth: columns of one row a control tick, see `sitl.referee`.
-        start_s: when the companion took over.
-        end_s: when the mission ended.
-        goal_enu_m: (3,), m.
+        truth: Columns with one row per control tick, see `sitl.referee`.
+        start_s: Stamp of the companion's take-over, s.
+        end_s: Stamp of the mission's end, s.
+        goal_enu_m: Goal (3,), m.
     """
     stamps = truth["stamp_s"]
     window = (stamps >= start_s - 1e-9) & (stamps <= end_s + 1e-9)
@@ -67,7 +67,7 @@ def from_truth(
 def from_states(
     stamps: np.ndarray, positions_enu_m: np.ndarray, velocities: np.ndarray, goal: np.ndarray
 ) -> QualityOfFlight:
-    """The part of it that the companion itself can know, from the states that it received.
+    """Compute the part of the quality of flight that follows from received states.
 
     Args:
         stamps: (n,) s, positions_enu_m: (n, 3), velocities: (n, 3) m/s, goal: (3,) m.

@@ -1,4 +1,4 @@
-"""The folder of one run: result.json, flight.svg, flight.tlog, and tables.
+"""The folder of one run: result.json, flight.svg, flight.tlog and tables.
 
 The tables are trace.parquet, plans.parquet and kernels.parquet.
 """
@@ -32,43 +32,43 @@ _NEEDED = ("outcome", "config", "quality_of_flight", "pilot", "events", "simulat
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """Paths of one run."""
+    """Paths in a run folder."""
 
     path: Path
 
     @property
     def result(self) -> Path:
-        """Outcome, quality of flight, seeds, versions, resolved configuration."""
+        """Path of result.json: outcome, quality of flight, seeds, versions, configuration."""
         return self.path / RESULT
 
     @property
     def trace(self) -> Path:
-        """States at every control tick."""
+        """Path of trace.parquet: states at every control tick."""
         return self.path / TRACE
 
     @property
     def plans(self) -> Path:
-        """Every waypoint of every plan."""
+        """Path of plans.parquet: every waypoint of every plan."""
         return self.path / PLANS
 
     @property
     def kernels(self) -> Path:
-        """When which kernel ran."""
+        """Path of kernels.parquet: start and end of every invocation."""
         return self.path / KERNELS
 
     @property
     def tlog(self) -> Path:
-        """Every MAVLink packet of both directions."""
+        """Path of flight.tlog: every MAVLink frame of both directions."""
         return self.path / TLOG
 
     @property
     def picture(self) -> Path:
-        """Top view of the flight."""
+        """Path of flight.svg: top view of the flight."""
         return self.path / PICTURE
 
     @property
     def fault(self) -> Path:
-        """The fault record, on disk before the fault strikes."""
+        """Path of the fault record, which is on disk before the fault strikes."""
         return self.path / FAULT
 
     def write_result(self, result: dict[str, Any]) -> None:
@@ -77,16 +77,16 @@ class RunFolder:
 
 
 def stem_of(world: str) -> str:
-    """What a world's runs are called: its name, or its file's, without what paths do not like."""
+    """Return the prefix of a world's run folders: its name without characters unfit for paths."""
     name = world.removesuffix(".toml").rpartition("/")[2]
     return "".join(c if c.isalnum() or c in "-_." else "-" for c in name) or "world"
 
 
 def new_run_folder(parent: Path, stem: str) -> RunFolder:
-    """A new, empty folder `<stem>-<number>` below `parent`; safe among parallel missions.
+    """Create an empty folder `<stem>-<number>` below `parent`; safe for parallel missions.
 
     Raises:
-        RecordError: it cannot be made.
+        RecordError: The folder cannot be created.
     """
     try:
         parent.mkdir(parents=True, exist_ok=True)
@@ -106,7 +106,7 @@ def new_run_folder(parent: Path, stem: str) -> RunFolder:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run as read back."""
+    """A run read from its folder."""
 
     folder: RunFolder
     result: dict[str, Any]
@@ -114,10 +114,10 @@ class Run:
 
 
 def load_run(path: Path) -> Run:
-    """Read a run folder, or the folder that its result.json lies in.
+    """Read a run from its folder or from the path of its result.json.
 
     Raises:
-        RecordError: no run there, cut off before its end, or damaged.
+        RecordError: There is no run, or it was cut off before its end or is damaged.
     """
     folder = RunFolder(path.parent if path.name == RESULT else path)
     if not folder.path.is_dir():
@@ -138,6 +138,6 @@ def load_run(path: Path) -> Run:
     missing = [key for key in _NEEDED if key not in result]
     if missing:
         raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")
-    # Records of before there were stacks flew the one that there was.
+    # Records from before the introduction of stacks flew the stack FIRST.
     result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}
     return Run(folder, result, trace)

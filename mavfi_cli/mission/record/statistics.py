@@ -1,4 +1,4 @@
-"""What a mission counted, as plain values for its record."""
+"""Counters of a mission as plain values for its record."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavfi_cli.mission.companion.executor import Node
 
 
 def mission_statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:
-    """Counters of pilot, kernels, nodes and camera link; empty where nothing was flown."""
+    """Return the counters of pilot, kernels, nodes and camera link; empty without a flight."""
     if companion is None:
         return {"pilot": None, "kernels": {}, "nodes": {}, "images": {}}
     nodes = companion.executor.nodes
@@ -26,7 +26,7 @@ def mission_statistics(companion: Companion | None, images: ImageReceiver) -> di
 
 
 def plan_lines(companion: Companion | None) -> list[dict[str, Any]]:
-    """The planned trajectories: when each begins and its waypoints, to the millimetre."""
+    """Return start and waypoints, rounded to 1 mm, of the planned trajectories."""
     plans = [] if companion is None else companion.plans
     return [
         {
@@ -46,7 +46,7 @@ def _work(node: Node) -> dict[str, Any]:
 
 
 def _ends(node: Node) -> dict[str, Any]:
-    """How often a node died, and of what."""
+    """Return the crashes and hangs of a node."""
     crashes = [
         {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}
         for loss in node.losses

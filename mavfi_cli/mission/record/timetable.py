@@ -1,4 +1,4 @@
-"""When which kernel ran in a mission, in simulated time: kernels.parquet."""
+"""Timetable of the kernels in simulated time: kernels.parquet."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mavfi_cli.mission.companion.response import Reaction
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timetable:
-    """What the kernels of one mission did when.
+    """Timetable of one mission.
 
     Attributes:
-        invocations: in the order in which they started. An output takes effect at the end; that of
-            a node that died then, or was killed, never does.
-        reactions: from a depth frame to the first setpoint that knows of it.
+        invocations: Invocations in the order of their starts. An output takes effect at the end,
+            unless the node died or was killed.
+        reactions: Responses from a depth frame to the first setpoint that depends on it.
     """
 
     invocations: Sequence[Invocation]
@@ -28,7 +28,7 @@ class Timetable:
 
 
 def timetable_of(companion: Companion | None) -> Timetable:
-    """The time table of a flight; empty where nothing was flown."""
+    """Return the timetable of a flight; empty without a flight."""
     if companion is None:
         return Timetable(invocations=(), reactions=())
     return Timetable(
@@ -36,13 +36,14 @@ def timetable_of(companion: Companion | None) -> Timetable:
     )
 
 
-_RESPONSE = "response"  # the rows of reactions: from the frame's stamp to the setpoint's
+_RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's
 
 
 def write_timetable(path: Path, timetable: Timetable) -> None:
-    """Write it atomically as Parquet, a row an invocation or reaction; equal ones, equal bytes.
+    """Write a timetable as Parquet, atomically, one row per invocation or reaction.
 
-    Columns: `kernel`, `start_s`, `end_s`. Rows of the kernel `response` are the reactions.
+    The columns are `kernel`, `start_s` and `end_s`. Reactions have the kernel `response`. Equal
+    timetables give equal bytes.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -60,10 +61,10 @@ def write_timetable(path: Path, timetable: Timetable) -> None:
 
 
 def read_timetable(path: Path) -> Timetable:
-    """Read a time table back.
+    """Read a timetable.
 
     Raises:
-        RecordError: missing, damaged, or not of this shape.
+        RecordError: The file is missing, damaged, or of another format.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -1,4 +1,4 @@
-"""The trace of a mission: one row a control tick, written as Parquet."""
+"""Trace of a mission: one row per control tick, written as Parquet."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _GROUPS: dict[type, tuple[State, ...]] = {
 
 
 class Trace:
-    """Collects rows in memory; some 200 bytes a tick, so an hour of flight is 36 MB."""
+    """Collects rows in memory, about 200 bytes per tick or 36 MB per hour of flight."""
 
     def __init__(self) -> None:
         self._stamps: list[float] = []
@@ -50,10 +50,10 @@ class Trace:
         trajectory: tuple[Trajectory, int] | None,
         command: Command | None,
     ) -> None:
-        """One tick: what the companion knew and what it had decided.
+        """Add a tick: the companion's inputs and decisions.
 
         Args:
-            trajectory: the tracked trajectory and the index of its present waypoint.
+            trajectory: Tracked trajectory and index of its present waypoint.
         """
         self._stamps.append(stamp_s)
         self._phases.append(phase)
@@ -75,15 +75,15 @@ class Trace:
         return len(self._stamps)
 
     def motion(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stamps (n,) s, positions (n, 3) m and velocities (n, 3) m/s that were received, ENU."""
+        """Return received stamps (n,) s, positions (n, 3) m and velocities (n, 3) m/s, ENU."""
         vehicle = np.array(self._vehicle, dtype=np.float64).reshape(-1, len(_STATE_COLUMNS))
         return np.array(self._stamps), vehicle[:, 0:3], vehicle[:, 3:6]
 
     def table(self, truth: dict[str, np.ndarray] | None) -> pa.Table:
-        """The columns: stamp, phase, vehicle, every monitored state, and the referee's truth.
+        """Return a table of stamp, phase, vehicle, monitored states and the referee's truth.
 
-        Also from which messages the states are: stamps of report and trajectory, index of the
-        waypoint. A state that no message carried yet is null. Truth is joined by stamp.
+        The stamps of report and trajectory and the index of the waypoint identify the messages of
+        the states. A state is null before its first message. Truth is joined by stamp.
         """
         import pyarrow as pa
 
@@ -123,14 +123,14 @@ class Trace:
 
 
 def write_trace(path: Path, table: pa.Table) -> None:
-    """Write the trace atomically as Parquet, zstd; equal tables give equal bytes."""
+    """Write the trace as zstd-compressed Parquet, atomically. Equal tables give equal bytes."""
     import pyarrow.parquet as pq
 
     write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
 
 
 def read_trace(path: Path) -> pa.Table:
-    """Read a trace back."""
+    """Read a trace."""
     import pyarrow.parquet as pq
 
     return pq.read_table(path)

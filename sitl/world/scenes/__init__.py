@@ -1,1 +1,1 @@
-"""World files that come with mavfi."""
+"""Shipped world files."""

@@ -5,8 +5,8 @@ import struct
 import pytest
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.commander import LandedState, Result, SystemStatus
-from sitl.autopilot.modes import Mode
+from sitl.autopilot.commander import FlightState, Result, SystemStatus
+from sitl.autopilot.modes import FlightMode
 
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
 MODE = dialect.MAV_CMD_DO_SET_MODE
@@ -21,7 +21,7 @@ def prearm(bench):
 
 
 def test_boots_into_loiter_and_becomes_ready(bench):
-    assert bench.mode is Mode.LOITER
+    assert bench.mode is FlightMode.LOITER
     assert bench.commander.system_status is SystemStatus.UNINIT
     bench.command(ARM, 1)
     assert bench.acks() == [(ARM, Result.TEMPORARILY_REJECTED)]
@@ -88,7 +88,7 @@ def test_offboard_on_the_ground_needs_setpoints_to_arm(bench, velocity_target):
     bench.run(4.5)
     bench.command(MODE, *OFFBOARD)
     assert bench.acks() == [(MODE, Result.ACCEPTED), (MODE, Result.ACCEPTED)]
-    assert bench.mode is Mode.OFFBOARD
+    assert bench.mode is FlightMode.OFFBOARD
     assert bench.commander.system_status is SystemStatus.UNINIT
     assert not prearm(bench)
     bench.command(ARM, 1)
@@ -103,20 +103,20 @@ def test_offboard_in_the_air_without_setpoints_is_accepted_first_and_then_refuse
     flying.command(MODE, *OFFBOARD)
     assert flying.acks() == [(MODE, Result.ACCEPTED), (MODE, Result.TEMPORARILY_REJECTED)]
     assert flying.texts() == [(2, "Switching to Offboard is currently not available")]
-    assert flying.mode is Mode.LOITER
+    assert flying.mode is FlightMode.LOITER
 
 
 @pytest.mark.parametrize("parameters", [(1, 77, 0), (0, 6, 0), (1, 4, 99)])
 def test_impossible_mode_is_accepted_first_too(flying, parameters):
     flying.command(MODE, *parameters)
     assert flying.acks() == [(MODE, Result.ACCEPTED), (MODE, Result.TEMPORARILY_REJECTED)]
-    assert flying.mode is Mode.LOITER
+    assert flying.mode is FlightMode.LOITER
 
 
 def test_set_mode_message_is_answered_once(flying):
-    flying.send(dialect.MAVLink_set_mode_message(1, 1, Mode.LAND.custom_mode))
+    flying.send(dialect.MAVLink_set_mode_message(1, 1, FlightMode.LAND.custom_mode))
     assert flying.acks() == [(MODE, Result.ACCEPTED)]
-    assert flying.mode is Mode.LAND
+    assert flying.mode is FlightMode.LAND
 
 
 @pytest.fixture
@@ -124,16 +124,16 @@ def offboard(flying, velocity_target):
     flying.run(0.5, velocity_target)
     flying.command(MODE, *OFFBOARD)
     flying.run(0.5, velocity_target)
-    assert flying.mode is Mode.OFFBOARD
+    assert flying.mode is FlightMode.OFFBOARD
     flying.received.clear()
     return flying
 
 
 def test_losing_the_stream_triggers_return_after_its_time(offboard):
     offboard.run(0.96)
-    assert offboard.mode is Mode.OFFBOARD
+    assert offboard.mode is FlightMode.OFFBOARD
     offboard.run(0.1)
-    assert offboard.mode is Mode.RTL
+    assert offboard.mode is FlightMode.RTL
     assert offboard.commander.system_status is SystemStatus.CRITICAL
     texts = offboard.texts()
     assert texts[0] == (2, "Failsafe activated")
@@ -143,28 +143,30 @@ def test_losing_the_stream_triggers_return_after_its_time(offboard):
 
 def test_stream_that_returns_gives_offboard_back(offboard, velocity_target):
     offboard.run(1.5)
-    assert offboard.mode is Mode.RTL
+    assert offboard.mode is FlightMode.RTL
     offboard.run(0.5, velocity_target)
-    assert offboard.mode is Mode.RTL
+    assert offboard.mode is FlightMode.RTL
     offboard.run(1.5, velocity_target)
-    assert offboard.mode is Mode.OFFBOARD
+    assert offboard.mode is FlightMode.OFFBOARD
     assert offboard.commander.system_status is SystemStatus.ACTIVE
 
 
 def test_one_setpoint_a_second_is_just_enough(offboard, velocity_target):
     offboard.run(10.0, velocity_target, every=50)
-    assert set(offboard.modes[-500:]) == {Mode.OFFBOARD}
+    assert set(offboard.modes[-500:]) == {FlightMode.OFFBOARD}
 
 
 def test_parameter_sets_the_patience(offboard):
     assert offboard.autopilot.parameters.write("COM_OF_LOSS_T", 3.0, 9).value == "changed"
     offboard.run(2.9)
-    assert offboard.mode is Mode.OFFBOARD
+    assert offboard.mode is FlightMode.OFFBOARD
     offboard.run(0.3)
-    assert offboard.mode is Mode.RTL
+    assert offboard.mode is FlightMode.RTL
 
 
-@pytest.mark.parametrize(("action", "mode"), [(3, Mode.RTL), (4, Mode.LAND), (5, Mode.LOITER)])
+@pytest.mark.parametrize(
+    ("action", "mode"), [(3, FlightMode.RTL), (4, FlightMode.LAND), (5, FlightMode.LOITER)]
+)
 def test_parameter_chooses_the_failsafe(offboard, action, mode):
     wire = struct.unpack("<f", struct.pack("<i", action))[0]
     offboard.send(dialect.MAVLink_param_set_message(1, 1, b"COM_OBL_RC_ACT", wire, 6))
@@ -174,24 +176,24 @@ def test_parameter_chooses_the_failsafe(offboard, action, mode):
 
 def test_refused_setpoints_do_not_feed_the_watchdog(offboard, velocity_target):
     offboard.run(1.2, lambda: velocity_target(coordinate_frame=9))
-    assert offboard.mode is Mode.RTL
+    assert offboard.mode is FlightMode.RTL
     texts = [text for _, text in offboard.texts()]
     assert texts.count("SET_POSITION_TARGET_LOCAL_NED coordinate frame 9 unsupported") >= 50
 
 
 def test_setpoints_for_another_system_are_not_heard(offboard, velocity_target):
     offboard.run(1.2, lambda: velocity_target(target_system=2))
-    assert offboard.mode is Mode.RTL
+    assert offboard.mode is FlightMode.RTL
 
 
 def test_nan_velocity_keeps_the_watchdog_fed(offboard, velocity_target):
     offboard.run(3.0, lambda: velocity_target(float("nan"), float("nan"), float("nan")))
-    assert offboard.mode is Mode.OFFBOARD
+    assert offboard.mode is FlightMode.OFFBOARD
 
 
 def test_landing_after_a_failsafe_leaves_it_in_offboard(offboard):
     offboard.run_until(lambda: not offboard.commander.armed)
-    assert offboard.mode is Mode.OFFBOARD
+    assert offboard.mode is FlightMode.OFFBOARD
     assert [text for _, text in offboard.texts()][-2:] == [
         "Landing detected",
         "Disarmed by landing",
@@ -218,13 +220,13 @@ def test_landing_disarms_two_seconds_later_and_shows_every_state(bench):
     bench.run_until(lambda: not bench.commander.armed)
     assert bench.stamp_us - landed_us == pytest.approx(2e6, abs=4e4)
     assert states == [
-        LandedState.ON_GROUND,
-        LandedState.TAKEOFF,
-        LandedState.IN_AIR,
-        LandedState.LANDING,
-        LandedState.ON_GROUND,
+        FlightState.ON_GROUND,
+        FlightState.TAKEOFF,
+        FlightState.IN_AIR,
+        FlightState.LANDING,
+        FlightState.ON_GROUND,
     ]
-    assert bench.mode is Mode.LOITER  # so that the next arming is not refused
+    assert bench.mode is FlightMode.LOITER  # so that the next arming is not refused
 
 
 def test_termination_stops_the_motors_for_good(flying):
@@ -248,10 +250,10 @@ def test_sticks_fly_position_mode_and_their_loss_returns(flying):
     flying.run(0.2, sticks)
     flying.command(MODE, 1, 3, 0)
     flying.run(2.0, sticks)
-    assert flying.mode is Mode.POSCTL
+    assert flying.mode is FlightMode.POSCTL
     assert flying.vehicle.velocity_ned_mps[0] == pytest.approx(2.0, abs=0.01)  # of 10 m/s
     flying.run(0.7)
-    assert flying.mode is Mode.RTL
+    assert flying.mode is FlightMode.RTL
 
 
 def test_low_battery_is_told_once(flying):

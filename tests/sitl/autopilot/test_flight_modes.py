@@ -5,7 +5,7 @@ import pytest
 
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.commander import Result
-from sitl.autopilot.modes import Mode
+from sitl.autopilot.modes import FlightMode
 
 TAKEOFF = dialect.MAV_CMD_NAV_TAKEOFF
 NAN = math.nan
@@ -37,8 +37,8 @@ def test_takeoff_to_a_height_then_hold(bench, amsl, reached, words):
     assert bench.acks()[-1] == (TAKEOFF, Result.ACCEPTED)
     texts = bench.texts()
     assert (words in texts) if words else not [t for t in texts if "Using" in t[1]]
-    assert bench.mode is Mode.TAKEOFF
-    bench.run_until(lambda: bench.mode is Mode.LOITER)
+    assert bench.mode is FlightMode.TAKEOFF
+    bench.run_until(lambda: bench.mode is FlightMode.LOITER)
     bench.run(3.0)
     assert height(bench) == pytest.approx(reached, abs=0.05)
 
@@ -179,7 +179,7 @@ def test_reposition_goes_there_and_holds(flying):
         )
     )  # fmt: skip
     flying.run(15.0)
-    assert flying.mode is Mode.LOITER
+    assert flying.mode is FlightMode.LOITER
     assert flying.vehicle.position_ned_m == pytest.approx([15.0, -8.0, -6.0], abs=0.1)
 
 

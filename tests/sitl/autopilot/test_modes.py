@@ -1,18 +1,18 @@
 import pytest
 
-from sitl.autopilot.modes import Mode, base_mode, mode_from_custom, mode_from_numbers
+from sitl.autopilot.modes import FlightMode, base_mode, mode_from_custom, mode_from_numbers
 
 
 # Seen on the wire of PX4 v1.17.
 @pytest.mark.parametrize(
     ("mode", "custom"),
     [
-        (Mode.LOITER, 50593792),
-        (Mode.TAKEOFF, 33816576),
-        (Mode.OFFBOARD, 393216),
-        (Mode.RTL, 84148224),
-        (Mode.LAND, 100925440),
-        (Mode.POSCTL, 196608),
+        (FlightMode.LOITER, 50593792),
+        (FlightMode.TAKEOFF, 33816576),
+        (FlightMode.OFFBOARD, 393216),
+        (FlightMode.RTL, 84148224),
+        (FlightMode.LAND, 100925440),
+        (FlightMode.POSCTL, 196608),
     ],
 )
 def test_custom_mode_is_px4s(mode, custom):
@@ -23,10 +23,10 @@ def test_custom_mode_is_px4s(mode, custom):
 @pytest.mark.parametrize(
     ("mode", "armed", "expected"),
     [
-        (Mode.LOITER, False, 0x1D),
-        (Mode.LOITER, True, 0x9D),
-        (Mode.OFFBOARD, True, 0x91),
-        (Mode.OFFBOARD, False, 0x11),
+        (FlightMode.LOITER, False, 0x1D),
+        (FlightMode.LOITER, True, 0x9D),
+        (FlightMode.OFFBOARD, True, 0x91),
+        (FlightMode.OFFBOARD, False, 0x11),
     ],
 )
 def test_base_mode_is_px4s(mode, armed, expected):
@@ -34,7 +34,7 @@ def test_base_mode_is_px4s(mode, armed, expected):
 
 
 def test_auto_without_sub_mode_is_loiter():
-    assert mode_from_numbers(4, 0) is Mode.LOITER
+    assert mode_from_numbers(4, 0) is FlightMode.LOITER
 
 
 @pytest.mark.parametrize("numbers", [(0, 0), (77, 0), (4, 99), (255, 255)])

@@ -9,7 +9,7 @@ import pytest
 
 from sitl.vehicle.profile_files import load_profile
 from sitl.vehicle.truth import T_POSITION, T_QUATERNION, T_VELOCITY
-from sitl.vehicle.vehicle import PHYSICS_DT_S, Vehicle
+from sitl.vehicle.vehicle import PHYSICS_DT_S, Quadrotor
 
 FREE = math.nan
 
@@ -58,7 +58,7 @@ class Flight:
         base, _, payload_kg = name.partition("+")
         payload_kg = float(payload_kg or 0.0)
         profile = dataclasses.replace(load_profile(base), extra_payload_kg=payload_kg)
-        self.vehicle = Vehicle(profile, position_enu_m=position_enu_m, yaw_enu_rad=yaw_enu_rad)
+        self.vehicle = Quadrotor(profile, position_enu_m=position_enu_m, yaw_enu_rad=yaw_enu_rad)
         self.truth = self.vehicle.truth
 
     def fly(self, setpoint, seconds, *, armed=True):

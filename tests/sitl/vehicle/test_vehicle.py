@@ -9,7 +9,7 @@ import pytest
 from mavfi_cli.core.frames import enu_from_ned, flu_enu_from_frd_ned, yaw_from_quaternion
 from sitl.vehicle.profile_files import load_profile
 from sitl.vehicle.truth import T_ON_GROUND
-from sitl.vehicle.vehicle import PHYSICS_DT_S, Vehicle
+from sitl.vehicle.vehicle import PHYSICS_DT_S, Quadrotor
 
 NAMES = ("solo", "spark", "solo+0.3")
 
@@ -150,7 +150,7 @@ def test_truth_cannot_be_written(grounded):
 
 def test_prints_and_writes_nothing(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    vehicle = Vehicle(load_profile("solo"), position_enu_m=(0, 0, 1.0), yaw_enu_rad=0.0)
+    vehicle = Quadrotor(load_profile("solo"), position_enu_m=(0, 0, 1.0), yaw_enu_rad=0.0)
     for _ in range(300):
         vehicle.step(np.full(11, math.nan), True)  # noqa: FBT003
     del vehicle

@@ -1,38 +1,38 @@
-"""Tells the flight's story: notes what is new after every tick, and shows progress."""
+"""Logs the events of a flight after every tick and reports progress."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from mavfi_cli.autonomy.orders import Mode
+from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.progress import Progress, Watcher
+from mavfi_cli.mission.progress import FlightProgress, Watcher
 from mavfi_cli.mission.record.events import EventLog
 
 PROGRESS_EVERY_S = 1.0
 
 
-class Narrator:
-    """Compares each tick with the one before.
+class FlightLogger:
+    """Finds events by comparing each tick with the last.
 
     Attributes:
-        log: every event so far.
+        log: All events so far.
     """
 
     def __init__(self, watcher: Watcher) -> None:
         self.log = EventLog(watcher)
         self._watcher = watcher
         self._phase: Phase | None = None
-        self._mode: Mode | None = None
+        self._mode: PilotMode | None = None
         self._texts = 0
         self._losses = 0
         self._next_progress_s = 0.0
 
     def note(self, stamp_s: float, kind: str, text: str, state: VehicleState | None) -> None:
-        """Note one event where the vehicle is."""
+        """Log an event at the vehicle's position."""
         place = None if state is None else tuple(round(float(c), 3) for c in state.position_enu_m)
         self.log.add(round(stamp_s, 3), kind, text, place)  # type: ignore[arg-type]
 
@@ -43,7 +43,7 @@ class Narrator:
         companion: Companion | None,
         injection: NoInjection,
     ) -> None:
-        """Note what is new at a tick; once a simulated second, show progress."""
+        """Log the events of a tick, and report progress once per simulated second."""
         state = session.state
         for kind, text in self._news(session, companion, injection):
             self.note(stamp_s, kind, text, state)
@@ -57,7 +57,7 @@ class Narrator:
         companion: Companion | None,
         injection: NoInjection,
     ) -> list[tuple[str, str]]:
-        """Kind and text of what happened since the last tick."""
+        """Return kind and text of each event since the last tick."""
         news: list[tuple[str, str]] = []
         if session.phase is not self._phase:
             self._phase = session.phase
@@ -88,11 +88,11 @@ class Narrator:
         self._mode = mode
         if mode is before:
             return []
-        if mode is Mode.SLOWING:
+        if mode is PilotMode.SLOWING:
             return [("slow", "slows down before an obstacle")]
-        if mode is Mode.STOPPING:
+        if mode is PilotMode.STOPPING:
             return [("stop", "stops before an obstacle")]
-        if mode is Mode.FLYING and before is not None:
+        if mode is PilotMode.FLYING and before is not None:
             again = companion.pilot.counters.replans > 0
             return [("replan", "flies a new plan") if again else ("plan", "flies a plan")]
         return []
@@ -100,9 +100,9 @@ class Narrator:
 
 def _progress(
     stamp_s: float, state: VehicleState, session: OffboardSession, companion: Companion | None
-) -> Progress:
+) -> FlightProgress:
     offboard = companion is not None and session.phase is Phase.OFFBOARD
-    return Progress(
+    return FlightProgress(
         stamp_s=stamp_s,
         phase=companion.mode.value if offboard and companion else session.phase.value,
         speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),
