@@ -21,6 +21,7 @@ from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import DETECTOR, FaultConfig
+from mavfi_cli.stats.shares import wilson
 
 FIRST_SEED = 600_000
 LONGER = 1.05

@@ -9,17 +9,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaign.outcome import MissionResult, State
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
-from mavfi_cli.campaign.statistics.paired import McNemar, mcnemar
-from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.stats.bootstrap import Interval, interval
+from mavfi_cli.stats.paired import McNemar, mcnemar
+from mavfi_cli.stats.shares import Share, rate
 
 Measure = Callable[[Mapping[str, Any]], float | None]  # of a result.json
 Place = tuple[str, int]  # world and seed

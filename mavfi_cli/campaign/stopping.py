@@ -13,7 +13,7 @@ from typing import Any
 
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.specification.spec import Stop
-from mavfi_cli.campaign.statistics.proportions import half_width, rate
+from mavfi_cli.stats.shares import half_width, rate
 
 # Missions in whose success the fault, if there was one, had a part.
 COUNTED = frozenset(

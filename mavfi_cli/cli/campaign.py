@@ -201,7 +201,7 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
 
     What `run` would refuse is refused here too.
     """
-    from mavfi_cli.campaign.statistics.proportions import (
+    from mavfi_cli.stats.shares import (
         missions_for_margin,
         pairs_for_difference,
     )

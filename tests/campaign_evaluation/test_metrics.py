@@ -8,11 +8,9 @@ from evaluation_flights import error_free, flown, pair, struck
 from mavfi_cli.campaign.evaluation.metrics import (
     error_free_metrics,
     fault_metrics,
-    mixture,
     recoveries_compared,
 )
 from mavfi_cli.campaign.outcome import Injected
-from mavfi_cli.campaign.statistics.proportions import rate
 
 
 def test_false_alarms_a_flight_hour():
@@ -131,19 +129,6 @@ def test_without_any_fault_nothing_is_known():
     assert math.isnan(nothing.latency_s.value)
     assert math.isnan(nothing.worst.recovered_share)
     assert math.isnan(nothing.protected.share)
-
-
-def test_a_mixture_of_one_part_is_that_part():
-    part = rate(7, 9)
-    whole = mixture([(90, part), (0, rate(0, 0))])
-    assert (whole.share, whole.low, whole.high) == pytest.approx((part.share, part.low, part.high))
-
-
-def test_a_mixture_weighs_by_size_not_by_sample():
-    whole = mixture([(900, rate(10, 10)), (100, rate(0, 50))])
-    assert whole.share == pytest.approx(0.9)
-    assert whole.low < 0.9 <= whole.high
-    assert math.isnan(mixture([(5, rate(0, 0)), (5, rate(1, 1))]).share)
 
 
 def test_two_detectors_on_the_same_faults():

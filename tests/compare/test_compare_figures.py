@@ -12,7 +12,7 @@ from mavfi_cli.campaign.compare.fly import plan_told
 from mavfi_cli.campaign.compare.plan import ComparePlan
 from mavfi_cli.campaign.compare.rows import rows_csv
 from mavfi_cli.campaign.compare.table import table
-from mavfi_cli.campaign.statistics.proportions import rate
+from mavfi_cli.stats.shares import rate
 
 
 @pytest.fixture(scope="module")

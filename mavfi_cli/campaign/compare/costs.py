@@ -17,10 +17,10 @@ import numpy as np
 
 from mavfi_cli.campaign.compare.flights import Flown
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
-from mavfi_cli.campaign.statistics.paired import sign_flips
-from mavfi_cli.campaign.statistics.worst_case import worst_case, worst_over_own
 from mavfi_cli.core.types import FloatArray
+from mavfi_cli.stats.bootstrap import Interval, interval
+from mavfi_cli.stats.paired import sign_flips
+from mavfi_cli.stats.worst_case import worst_case, worst_over_own
 
 LATE = 0.95  # the quantile beside the worst case, which has no interval
 CONFIDENCE = 0.95

@@ -22,9 +22,9 @@ from mavfi_cli.campaign.compare.costs import (
 )
 from mavfi_cli.campaign.compare.flights import Flown
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE, ComparePlan
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval, mean, median
-from mavfi_cli.campaign.statistics.paired import mcnemar
-from mavfi_cli.campaign.statistics.proportions import rate
+from mavfi_cli.stats.bootstrap import Interval, interval, mean, median
+from mavfi_cli.stats.paired import mcnemar
+from mavfi_cli.stats.shares import rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.campaign.compare.plan import GOLDEN, NONE
-from mavfi_cli.campaign.statistics.bootstrap import FEW
 from mavfi_cli.core.columns import columns
 from mavfi_cli.mission.stack import DEFAULT
+from mavfi_cli.stats.bootstrap import FEW
 
 Row = Mapping[str, Any]
 # The paper, section VII-E: on the TX2, a single bit flip in an inter-kernel state.

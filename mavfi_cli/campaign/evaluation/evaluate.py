@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.evaluation.curves import curves
 from mavfi_cli.campaign.evaluation.fly import fly, model_digest, read
 from mavfi_cli.campaign.evaluation.metrics import (
     error_free_metrics,
@@ -21,9 +20,10 @@ from mavfi_cli.campaign.evaluation.scores import Scores
 from mavfi_cli.campaign.missions import changes_of
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
-from mavfi_cli.campaign.statistics.paired import holm
 from mavfi_cli.mission.detector_config import detector_of
 from mavfi_cli.mission.run import installed_versions
+from mavfi_cli.stats.paired import holm
+from mavfi_cli.stats.roc import curves
 
 SCHEMA = 1
 ALL = "all"

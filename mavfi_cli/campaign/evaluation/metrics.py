@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.evaluation.pairs import (
     LONGER,
     ErrorFree,
@@ -25,12 +24,12 @@ from mavfi_cli.campaign.evaluation.pairs import (
     lengthening,
 )
 from mavfi_cli.campaign.outcome import Injected
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval, median
-from mavfi_cli.campaign.statistics.paired import McNemar, mcnemar
-from mavfi_cli.campaign.statistics.proportions import rate
-from mavfi_cli.campaign.statistics.worst_case import worst_over_own
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
+from mavfi_cli.stats.bootstrap import Interval, interval, median
+from mavfi_cli.stats.paired import McNemar, mcnemar
+from mavfi_cli.stats.shares import Mixture, Share, mixture, rate
+from mavfi_cli.stats.worst_case import worst_over_own
 
 RESAMPLES = 999
 TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick a state message
@@ -112,32 +111,6 @@ class WorstFlight:
     protected: float
     recovered: Interval
     recovered_share: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Mixture:
-    """A rate of parts that were sampled differently, with its interval."""
-
-    share: float
-    low: float
-    high: float
-
-
-def mixture(parts: Sequence[tuple[int, Share]]) -> Mixture:
-    """The rate of a whole from the rates of its parts, each weighted by its true size.
-
-    The interval adds the distances to the ends of the parts' Wilson intervals in squares (MOVER,
-    G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). Not a number where a part that is
-    not empty was never sampled.
-    """
-    whole = sum(size for size, _ in parts)
-    if not whole:
-        return Mixture(share=math.nan, low=0.0, high=1.0)
-    weighted = [(size / whole, part) for size, part in parts if size]
-    share = math.fsum(weight * part.share for weight, part in weighted)
-    below = math.hypot(*(weight * (part.share - part.low) for weight, part in weighted))
-    above = math.hypot(*(weight * (part.high - part.share) for weight, part in weighted))
-    return Mixture(share=share, low=max(0.0, share - below), high=min(1.0, share + above))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

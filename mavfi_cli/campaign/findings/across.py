@@ -15,16 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.findings.groups import Group
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import Injected
-from mavfi_cli.campaign.statistics.layers import CrossLayer, cross_layer, failures_per_hour
-from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.campaign.stopping import COUNTED
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.stats.layers import CrossLayer, cross_layer, failures_per_hour
+from mavfi_cli.stats.shares import Share, rate
 
 KERNELS = "kernels.json"  # what `mavfi kernels --out` leaves
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}

@@ -16,10 +16,10 @@ from mavfi_cli.campaign.findings.groups import (
     matched,
     untreated,
 )
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
-from mavfi_cli.campaign.statistics.paired import McNemar, holm, mcnemar
-from mavfi_cli.campaign.statistics.worst_case import WorstCase, worst_case, worst_over_own
 from mavfi_cli.core.types import FloatArray
+from mavfi_cli.stats.bootstrap import Interval, interval
+from mavfi_cli.stats.paired import McNemar, holm, mcnemar
+from mavfi_cli.stats.worst_case import WorstCase, worst_case, worst_over_own
 
 RESAMPLES = 1999
 

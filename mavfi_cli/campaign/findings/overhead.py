@@ -16,9 +16,9 @@ from mavfi_cli.campaign.findings.groups import Group
 from mavfi_cli.campaign.findings.setting_columns import SettingColumns
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, detection_cost
+from mavfi_cli.stats.bootstrap import Interval, interval
 
 _STAGES = tuple(stage.value for stage in Stage)
 

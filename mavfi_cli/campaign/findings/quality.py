@@ -11,7 +11,7 @@ import numpy as np
 from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden
 from mavfi_cli.campaign.findings.groups import METRICS, Group
 from mavfi_cli.campaign.findings.setting_columns import SettingColumns
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
+from mavfi_cli.stats.bootstrap import Interval, interval
 
 _TITLES = {
     "flight_time_s": ("flight time, s", 1.0),

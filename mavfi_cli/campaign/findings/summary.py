@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mavfi_cli.attack.outcome import Share
 from mavfi_cli.campaign.findings.comparison import RESAMPLES, Comparison, against_golden, protection
 from mavfi_cli.campaign.findings.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.findings.setting_columns import SettingColumns
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.statistics.bootstrap import Interval, interval
-from mavfi_cli.campaign.statistics.proportions import rate
-from mavfi_cli.campaign.statistics.worst_case import WorstCase
 from mavfi_cli.campaign.stopping import COUNTED
+from mavfi_cli.stats.bootstrap import Interval, interval
+from mavfi_cli.stats.shares import Share, rate
+from mavfi_cli.stats.worst_case import WorstCase
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mavfi_cli.attack.outcome import Share
-from mavfi_cli.campaign.statistics.proportions import rate
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.stats.shares import Share, rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

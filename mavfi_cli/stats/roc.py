@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mavfi_cli.campaign.statistics.proportions import z_of
 from mavfi_cli.core.types import FloatArray
+from mavfi_cli.stats.shares import z_of
 
 _HALVINGS = 60
 

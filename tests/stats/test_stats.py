@@ -8,17 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mavfi_cli.campaign.statistics.bootstrap import BLOCKS, FEW, LARGE, interval, mean, median
-from mavfi_cli.campaign.statistics.layers import cross_layer, failures_per_hour
-from mavfi_cli.campaign.statistics.paired import holm, mcnemar, sign_flips
-from mavfi_cli.campaign.statistics.proportions import (
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.stats.bootstrap import BLOCKS, FEW, LARGE, interval, mean, median
+from mavfi_cli.stats.layers import cross_layer, failures_per_hour
+from mavfi_cli.stats.paired import holm, mcnemar, sign_flips
+from mavfi_cli.stats.shares import (
+    design_effect,
     half_width,
     missions_for_margin,
+    mixture,
     pairs_for_difference,
     rate,
+    wilson,
 )
-from mavfi_cli.campaign.statistics.worst_case import worst_case
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.stats.worst_case import worst_case
 
 COUNTS = st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -208,3 +211,42 @@ def test_failures_an_hour_are_the_upsets_that_fail_missions():
     assert failures_per_hour(3.0, share) == pytest.approx((0.6, 3.0 * share.low, 3.0 * share.high))
     with pytest.raises(ConfigError, match="negative"):
         failures_per_hour(-1.0, share)
+
+
+def test_a_mixture_of_one_part_is_that_part():
+    part = rate(7, 9)
+    whole = mixture([(90, part), (0, rate(0, 0))])
+    assert (whole.share, whole.low, whole.high) == pytest.approx((part.share, part.low, part.high))
+
+
+def test_a_mixture_weighs_by_size_not_by_sample():
+    whole = mixture([(900, rate(10, 10)), (100, rate(0, 50))])
+    assert whole.share == pytest.approx(0.9)
+    assert whole.low < 0.9 <= whole.high
+    assert math.isnan(mixture([(5, rate(0, 0)), (5, rate(1, 1))]).share)
+
+
+@pytest.mark.parametrize(("count", "total"), [(0, 10), (3, 10), (10, 10), (84, 1000)])
+def test_wilson_against_scipy(count, total):
+    ours = wilson(count, total)
+    theirs = stats.binomtest(count, total).proportion_ci(method="wilson")
+    assert ours.low == pytest.approx(theirs.low, abs=1e-12)
+    assert ours.high == pytest.approx(theirs.high, abs=1e-12)
+
+
+def test_runs_of_a_window_count_less_the_more_they_are_alike():
+    """Against the spread of the share over repeated samples of windows and of runs in them."""
+    rng = np.random.default_rng(4)
+    chances = rng.beta(0.5, 0.5, size=5000)  # of a crash, window by window
+
+    def campaign():
+        drawn = rng.choice(chances, size=20)
+        windows = rng.integers(20, size=400)
+        return rng.random(400) < drawn[windows], [("f", int(window)) for window in windows]
+
+    campaigns = [campaign() for _ in range(300)]
+    spread = np.var([hits.mean() for hits, _ in campaigns])
+    binomial = chances.mean() * (1.0 - chances.mean()) / 400
+    effects = [design_effect(hits.tolist(), windows) for hits, windows in campaigns]
+    assert spread / binomial > 5.0
+    assert np.mean(effects) == pytest.approx(spread / binomial, rel=0.2)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.campaign.evaluation.curves import curves
+from mavfi_cli.stats.roc import curves
 
 SCORES = st.lists(
     st.one_of(st.sampled_from([0.0, 1.0, 2.0, math.inf]), st.floats(0.0, 10.0)), min_size=1,

@@ -13,8 +13,8 @@ from statistics import NormalDist
 
 import numpy as np
 
-from mavfi_cli.campaign.statistics.proportions import z_of
 from mavfi_cli.core.types import FloatArray
+from mavfi_cli.stats.shares import z_of
 
 RESAMPLES = 9999
 FEW = 10  # of fewer values a 95 % interval holds the true mean in less than nine cases of ten
