@@ -127,9 +127,9 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 @click.argument("path", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
 def export(what: str, path: Path) -> None:
     """Write one row a mission to PATH, a .parquet or .csv file, or - for CSV on stdout."""
+    from mavfi_cli.analysis.export import export as write
+    from mavfi_cli.analysis.export import export_csv
     from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.findings.export import export as write
-    from mavfi_cli.campaign.findings.export import export_csv
     from mavfi_cli.campaign.ledger import Ledger
 
     with Ledger(folder_of(what)) as ledger:
@@ -155,8 +155,8 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     """
     from dataclasses import asdict
 
+    from mavfi_cli.analysis.trajectories import pair
     from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.findings.trajectories import pair
     from mavfi_cli.campaign.ledger import Ledger
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.record.run_folder import load_run
@@ -279,9 +279,10 @@ def _show(
 ) -> None:
     from dataclasses import asdict
 
+    from mavfi_cli.analysis.summary import summarise
     from mavfi_cli.campaign.begin import fixed_world, stopped
-    from mavfi_cli.campaign.findings.summary import summarise, table
     from mavfi_cli.core.files import plain
+    from mavfi_cli.report.tables.campaign import summary_lines
 
     summary = summarise(ledger, by or [], confidence)
     ended, worlds = stopped(ledger), fixed_world(ledger)
@@ -291,7 +292,7 @@ def _show(
         told["fixed_world"] = asdict(worlds)
         lines.append(worlds.told())
     lines += [f"known well enough, so not flown on: {text}" for text in ended]
-    lines += table(summary)
+    lines += summary_lines(summary)
     if more is not None:
         _add_more(ledger, by or [], confidence, more, told, lines)
     click.echo(json.dumps(plain(told), indent=2) if as_json else "\n".join(lines))
@@ -306,22 +307,27 @@ def _add_more(
     lines: list[str],
 ) -> None:
     """What --quality, --overhead and --failures ask for, as plain values and as text."""
-    from mavfi_cli.campaign.findings import across, overhead, quality
-    from mavfi_cli.campaign.findings.groups import groups
+    from dataclasses import asdict
+
+    from mavfi_cli.analysis.failures import failures
+    from mavfi_cli.analysis.groups import groups
+    from mavfi_cli.analysis.overhead import flight_overheads
+    from mavfi_cli.analysis.summary import qualities
+    from mavfi_cli.report.tables import campaign as text
 
     if not (more["quality"] or more["overhead"] or more["failures"]):
         return
     found = groups(ledger, by)
     if more["quality"]:
-        qualities = quality.qualities(found, confidence)
-        told["quality"] = [each.to_dict() for each in qualities]
-        lines += quality.lines(qualities, confidence)
+        quality = qualities(found, confidence)
+        told["quality"] = [asdict(each) for each in quality]
+        lines += text.quality_lines(quality, confidence)
     if more["overhead"]:
-        overheads = overhead.overheads(ledger, found, confidence)
-        told["overhead"] = [each.to_dict() for each in overheads]
-        lines += overhead.lines(overheads, confidence)
+        overheads = flight_overheads(ledger, found, confidence)
+        told["overhead"] = [asdict(each) for each in overheads]
+        lines += text.overhead_lines(overheads, confidence)
     if more["failures"]:
-        rows = across.across(ledger, found, more["kernels"], more["upsets"], confidence)
-        told["failures"] = [each.to_dict() for each in rows]
+        rows = failures(ledger, found, more["kernels"], more["upsets"], confidence)
+        told["failures"] = [asdict(each) for each in rows]
         lines += ["", "injected faults that fail missions which succeed without:"]
-        lines += across.lines(rows)
+        lines += text.failure_lines(rows)

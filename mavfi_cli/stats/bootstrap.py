@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import z_of
@@ -21,6 +22,7 @@ FEW = 10  # of fewer values a 95 % interval holds the true mean in less than nin
 LARGE = 500  # from so many values on the mean is normal, and the bootstrap would only be slow
 BLOCKS = 2000  # of more values whole blocks are left out in turn
 _CHUNK = 4_000_000  # numbers that are drawn at once
+IntArray = NDArray[np.int64]
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
 
 
@@ -110,3 +112,24 @@ def _left_out(sample: FloatArray, statistic: Statistic) -> FloatArray:
         return np.asarray((sample.sum() - sample) / (len(sample) - 1))
     blocks = np.array_split(np.arange(len(sample)), min(len(sample), BLOCKS))
     return np.array([float(statistic(np.delete(sample, block))) for block in blocks])
+
+
+def interval_of_rows(
+    count: int,
+    statistic: Callable[[IntArray], FloatArray],
+    *,
+    confidence: float = 0.95,
+    resamples: int = RESAMPLES,
+) -> Interval:
+    """A statistic of several columns with its interval, by resampling their rows together.
+
+    Args:
+        count: of the rows.
+        statistic: of rows (..., n) of the columns, over the last axis.
+    """
+    return interval(
+        np.arange(count, dtype=np.float64),
+        lambda rows: statistic(rows.astype(np.int64)),
+        confidence=confidence,
+        resamples=resamples,
+    )

@@ -23,6 +23,7 @@ RECOMPUTED = {
 KERNELS = tuple(kernel for kernels in RECOMPUTED.values() for kernel in kernels)
 # Said wherever the checks stand beside simulated time: no factor between hosts is known.
 HOST_CHECKS = "checks take the time of the host that flew, not scaled to the platform"
+UNKNOWN = "an unknown platform"
 _AGAIN = ("recompute", "hold")  # responses to an alarm after which something is computed again
 
 
@@ -38,6 +39,9 @@ class DetectionCost:
             others, which are shared among the stages as those are; so these may be fractions.
         recovery_s: of each stage, simulated: its recomputations, each at the mean latency that its
             kernels had in this flight.
+        compute_s, host_compute_s: all kernels, recomputations included: simulated, and host time.
+        platform: what the mission calls it.
+        faulty: whether the flight has a fault.
     """
 
     detector: str
@@ -46,6 +50,10 @@ class DetectionCost:
     flight_s: float
     recomputations: Mapping[str, float]
     recovery_s: Mapping[str, float]
+    compute_s: float
+    host_compute_s: float
+    platform: str
+    faulty: bool
 
     @property
     def check_host_s(self) -> float:
@@ -78,7 +86,8 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
         None where no detector watched, or where the flight ended before anything was checked.
     """
     detection = result.get("detection")
-    checks_host_s = ((result.get("host") or {}).get("stage_wall_s") or {}).get("gate")
+    walls = (result.get("host") or {}).get("stage_wall_s") or {}
+    checks_host_s = walls.get("gate")
     if not detection or not checks_host_s:
         return None
     checks = sum(detection["checks"].values())
@@ -98,6 +107,10 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
             stage: math.fsum(again[stage] * _mean_s(kernels.get(name)) for name in names)
             for stage, names in RECOMPUTED.items()
         },
+        compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
+        host_compute_s=math.fsum(walls.get(name, 0.0) for name in KERNELS),
+        platform=str(result.get("config", {}).get("platform", UNKNOWN)),
+        faulty=bool(result.get("fault")),
     )
 
 
