@@ -1,15 +1,15 @@
 """What a row of the model becomes in the simulator."""
 
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.studies.flight_plan import flight_plan, write_files
+from mavfi_cli.studies.redundancy import RedundancyPlan
 from mavfi_cli.vpm.board import load_board
-from mavfi_cli.vpm.flight_plan import flight_plan, of_world, write_files
 from mavfi_cli.vpm.model import hover_power_w
 from mavfi_cli.vpm.report import Choices, setting_of
 from mavfi_cli.vpm.schemes import SCHEMES, named
@@ -101,10 +101,23 @@ def test_equal_names_are_equal_flights(plan):
     assert other.mission.vehicle != first.mission.vehicle or (
         other.mission.platform != first.mission.platform
     )
-    mission = of_world(first, "dense", 7)
-    assert mission == replace(first.mission, world="dense", seed=7)
 
 
 def test_what_cannot_be_lifted_has_no_plan(plan):
     with pytest.raises(CannotLift, match=r"cannot lift its compute: 8\.33 N"):
         plan("spark", "tmr", Choices(board=load_board("xavier")))
+
+
+def test_the_list_grows_pair_by_pair(plan, tmp_path):
+    ask = RedundancyPlan(
+        vehicles=(), choices=Choices(), worlds=("sparse", "dense"), missions=2, first_seed=5,
+        folder=tmp_path,
+    )  # fmt: skip
+    missions = ask.list_of({("spark", name): plan("spark", name)[0] for name in ("none", "tmr")})
+    assert [(m.config.seed, m.config.world, m.labels["arm"]) for m in missions] == [
+        (5, "sparse", "none"), (5, "sparse", "tmr"), (5, "dense", "none"), (5, "dense", "tmr"),
+        (6, "sparse", "none"), (6, "sparse", "tmr"), (6, "dense", "none"), (6, "dense", "tmr"),
+    ]  # fmt: skip
+    pairs = [mission.pair for mission in missions]
+    assert pairs[0] == pairs[1] == "sparse/5"
+    assert len(set(pairs)) == 4

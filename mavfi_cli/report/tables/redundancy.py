@@ -8,7 +8,8 @@ from typing import Any
 
 from mavfi_cli.core.columns import wrapped
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
-from mavfi_cli.vpm.table import columns, csv_of
+from mavfi_cli.report.tables.model import columns
+from mavfi_cli.report.tables.rows import csv_text
 
 MANY_ALARMS = 10.0  # of an error-free flight: more is not the detector's usual rate
 _NUMBERS = (
@@ -22,7 +23,7 @@ _NUMBERS = (
 _RATIOS = (("velocity", "Velocity"), ("flight_time", "Flight time"), ("energy", "Energy"))
 
 
-def flight_table(flights: Mapping[str, Any]) -> list[str]:
+def redundancy_lines(flights: Mapping[str, Any]) -> list[str]:
     """The lines that are printed below the model's."""
     lines = [
         "",
@@ -37,7 +38,7 @@ def flight_table(flights: Mapping[str, Any]) -> list[str]:
     return [*lines, *wrapped(["", text] for text in flights["not_scaled"])]
 
 
-def flight_rows_csv(flights: Mapping[str, Any]) -> str:
+def redundancy_csv(flights: Mapping[str, Any]) -> str:
     """CSV text: a row a vehicle and scheme; the header names the units."""
     rows = [
         {
@@ -52,7 +53,7 @@ def flight_rows_csv(flights: Mapping[str, Any]) -> str:
         for one in flights["vehicles"]
         for row in one["schemes"]
     ]
-    return csv_of(rows)
+    return csv_text(rows)
 
 
 def _vehicle(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str]:

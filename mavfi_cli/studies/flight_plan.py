@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from mavfi_cli.analysis.overhead import TIMES
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.companion.companion import BRAKE_SHARE
@@ -19,7 +20,6 @@ from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.stack import DEFAULT
 from mavfi_cli.vpm.model import safe_velocity_mps
-from mavfi_cli.vpm.overhead import TIMES
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
 from mavfi_cli.vpm.setting import Setting, outcome
 
@@ -169,11 +169,6 @@ def platform_text(platform: PlatformProfile, factor: float) -> str:
             f"source = {_quoted(f'{platform.name}{TIMES}{factor:.6g}')}",
         ]
     return "\n".join([*lines, ""])
-
-
-def of_world(plan: FlightPlan, world: str, seed: int) -> MissionConfig:
-    """One mission of a plan."""
-    return replace(plan.mission, world=world, seed=seed)
 
 
 def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:

@@ -6,7 +6,7 @@ each, the world of every flight from a seed of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -121,12 +121,8 @@ def train(
     folder: Path,
     options: Options,
     spectator: Spectator,
-    tell: Callable[[str], None],
 ) -> Trained:
     """Fly, gather, fit, and write the models with their provenance.
-
-    Args:
-        tell: hears what is done, a line each.
 
     Raises:
         ModelError: too few flights, an unknown kind, or torch is missing; before anything is
@@ -138,7 +134,7 @@ def train(
     dataset, failed = fly_training(plan, folder, options, spectator)
     fitted = {}
     for kind in plan.kinds:
-        tell(f"fitting {kind}")
+        spectator.on_note(f"fitting {kind}")
         fitted[kind] = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
     models = {}
     for kind, model in fitted.items():  # all of them, or none

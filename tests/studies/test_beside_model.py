@@ -4,18 +4,19 @@ import json
 import math
 import re
 
+import pyarrow as pa
 import pytest
 
-from mavfi_cli.campaign.arms import Flown, paired_ratio
+from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.record.columns import columns_of
 from mavfi_cli.report.flight_plot import draw_flight_plot, write_flight_plot
-from mavfi_cli.vpm.flight_plan import flight_plan
-from mavfi_cli.vpm.flight_table import flight_rows_csv, flight_table
-from mavfi_cli.vpm.overhead import Overhead
+from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
+from mavfi_cli.studies.beside_model import Beside, side_by_side
+from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.report import Choices, report, setting_of
 from mavfi_cli.vpm.schemes import SCHEMES
-from mavfi_cli.vpm.side_by_side import side_by_side
 from mavfi_cli.vpm.vehicle import load_vehicle
 
 HOVER_SHAFT_W = 20.0  # of the simulated vehicle, with one board
@@ -43,6 +44,22 @@ def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
     }  # fmt: skip
 
 
+def flights_of(records):
+    """Records as the columns of a ledger's table."""
+    return pa.Table.from_pylist(
+        [
+            {
+                "world": "w",
+                "seed": seed,
+                "outcome": record["outcome"],
+                "succeeded": record["outcome"] == "success",
+                **columns_of(record),
+            }
+            for seed, record in enumerate(records)
+        ]
+    )
+
+
 @pytest.fixture
 def spark(tmp_path):
     """The model's report, the plans, and a function that puts flights beside them."""
@@ -58,21 +75,24 @@ def spark(tmp_path):
 
     def beside(change=None, refused=(), count=3):
         flown = {
-            key: Flown(
-                results={
-                    ("w", n): flight(rows[key[1]], plan, **(change or {}).get(key[1], {}))
-                    for n in range(count)
-                },
-                errors=(),
+            key: Beside(plan="too heavy to fly")
+            if key[1] in refused
+            else Beside(
+                plan=plan,
+                flights=flights_of(
+                    [
+                        flight(rows[key[1]], plan, **(change or {}).get(key[1], {}))
+                        for _ in range(count)
+                    ]
+                ),
             )
             for key, plan in plans.items()
         }
-        chosen = {**plans, **{("spark", name): "too heavy to fly" for name in refused}}
-        overhead = Overhead(
+        overhead = ComputeOverhead(
             detector="aad", flights=3, detection_s=0.01, recompute_s=0.0, compute_s=10.0,
             host_compute_s=0.2, alarms=9, platforms=("x86",),
         )  # fmt: skip
-        compared = side_by_side(told, chosen, flown, paired_ratio, {"aad": overhead})
+        compared = side_by_side(told, flown, {"aad": overhead})
         flights = {"worlds": ["w"], "missions_each": count, "first_seed": 1, "detectors": "mine",
                    "stack": "mavbench", **compared}  # fmt: skip
         return {**told, "flights": flights}
@@ -124,15 +144,15 @@ def test_only_successes_count(spark):
 def test_a_scheme_that_is_not_flown_says_why(spark):
     told = spark(refused=("tmr",))
     assert rows_of(told)["tmr"]["problem"] == "too heavy to fly"
-    lines = flight_table(told["flights"])
+    lines = redundancy_lines(told["flights"])
     assert "tmr: not flown: too heavy to fly" in lines
-    rows = flight_rows_csv(told["flights"]).splitlines()
+    rows = redundancy_csv(told["flights"]).splitlines()
     assert len(rows) == 6
     assert "too heavy to fly" in rows[3]
 
 
 def test_the_table_tells_overheads_side_by_side(spark):
-    text = "\n".join(flight_table(spark()["flights"]))
+    text = "\n".join(redundancy_lines(spark()["flights"]))
     assert "aad       0.1 %     0.1 %         0.0062 %  9 in 3 flights  5 %" in text
     assert "none: flown with acceleration 8 m/s² instead of 9.171 m/s²" in text
     assert "no detector" in text
@@ -141,7 +161,7 @@ def test_the_table_tells_overheads_side_by_side(spark):
 
 
 def test_what_has_no_number_has_none_in_the_table(spark):
-    lines = flight_table(spark({"dmr": {"outcome": "collision"}}, count=1)["flights"])
+    lines = redundancy_lines(spark({"dmr": {"outcome": "collision"}}, count=1)["flights"])
     text = "\n".join(lines)
     assert "nan" not in text
     assert max(map(len, lines)) <= 100
@@ -150,7 +170,7 @@ def test_what_has_no_number_has_none_in_the_table(spark):
 
 
 def test_a_detector_that_does_not_know_these_flights(spark):
-    text = "\n".join(flight_table(spark({"aad": {"alarms": 683}})["flights"]))
+    text = "\n".join(redundancy_lines(spark({"aad": {"alarms": 683}})["flights"]))
     assert "aad: 683 alarms in a flight without a fault: its model was fitted to other" in text
 
 

@@ -1,18 +1,17 @@
-"""The report as text and as CSV; every number with its unit."""
+"""The performance model as text and as CSV; every number with its unit."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.core.columns import columns as aligned
 from mavfi_cli.core.columns import wrapped
+from mavfi_cli.report.tables.rows import csv_text
 from mavfi_cli.vpm.report import schemes_of
 
 
-def table(told: Mapping[str, Any]) -> list[str]:
+def model_lines(told: Mapping[str, Any]) -> list[str]:
     """The lines that are printed."""
     lines = [
         f"Model {told['model']}; knee: where velocity is "
@@ -26,19 +25,9 @@ def table(told: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def scheme_rows_csv(told: Mapping[str, Any]) -> str:
+def model_csv(told: Mapping[str, Any]) -> str:
     """CSV text: a row a vehicle and scheme; the header names the units."""
-    return csv_of(schemes_of(dict(told)))
-
-
-def csv_of(rows: Sequence[Mapping[str, Any]]) -> str:
-    """CSV text of flat rows; the header has the keys of all of them, in order."""
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, keys, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(schemes_of(dict(told)))
 
 
 def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
