@@ -20,6 +20,7 @@ from mavfi_cli.analysis.costs import MISSION, cost_difference, cost_row, struck,
 from mavfi_cli.analysis.flights import chosen, flags, flown, known, numbers, paired
 from mavfi_cli.analysis.pairs import both_succeed, difference, ratio, success_test
 from mavfi_cli.core.types import FloatArray
+from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, mean, median
 from mavfi_cli.stats.shares import rate
 
@@ -192,3 +193,31 @@ def _changed(quantity: Quantity, first: pa.Table, second: pa.Table) -> dict[str,
     if quantity.ratio:
         return {"kind": "ratio", "unit": "ratio", **found}
     return {"kind": "difference", "unit": quantity.unit, **found}
+
+
+# What the platforms are -----------------------------------------------------------------------
+
+
+def platforms_told(platforms: Sequence[str]) -> list[dict[str, Any]]:
+    """A row of plain values a platform."""
+    names, profiles = titles(platforms), {name: load_platform(name) for name in platforms}
+    return [
+        {
+            "platform": name,
+            "title": names[name],
+            "description": profile.description or profile.name,
+            "cores": profile.cores,
+            "power_w": profile.power_w,
+            "kernel_latency_s": {k: each.latency_s for k, each in profile.kernels.items()},
+        }
+        for name, profile in profiles.items()
+    ]
+
+
+def titles(platforms: Sequence[str]) -> dict[str, str]:
+    """What platforms are called in tables and pictures: a file by its stem, where that tells."""
+    short = [name.removesuffix(".toml").rpartition("/")[2] for name in platforms]
+    return {
+        name: stem if short.count(stem) == 1 else name
+        for name, stem in zip(platforms, short, strict=True)
+    }

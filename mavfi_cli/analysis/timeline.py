@@ -10,6 +10,7 @@ import statistics
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.companion.companion import SAME_TICK_S
 from mavfi_cli.mission.companion.executor import Invocation
 from mavfi_cli.mission.companion.response import Reaction
@@ -158,3 +159,23 @@ def _spans(
         for each in invocations
         if each.node == kernel and each.end_s >= shown[0] and each.start_s <= shown[1]
     ]
+
+
+def timeline_seed(flown: Sequence[Mapping[str, Any]], platforms: Sequence[str]) -> int | None:
+    """The first mission that all platforms fly well and with a new plan on the way.
+
+    Where there is none, the first that all fly well; None where there is none of those.
+
+    Args:
+        flown: golden and other flights, with the columns of `platforms.SCHEMA`.
+    """
+    for least in (1, 0):
+        by_seed: dict[int, set[str]] = {}
+        for row in flown:
+            won = not row["target"] and row["outcome"] == Outcome.SUCCESS.value
+            if won and (row["replans"] or 0) >= least:
+                by_seed.setdefault(row["seed"], set()).add(row["platform"])
+        complete = [seed for seed, names in by_seed.items() if len(names) == len(platforms)]
+        if complete:
+            return min(complete)
+    return None

@@ -178,7 +178,8 @@ def _flown(
 ) -> dict[str, Any]:
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
-    from mavfi_cli.studies.redundancy import WORLDS, RedundancyPlan, fly_and_report
+    from mavfi_cli.studies.redundancy import fly_and_report
+    from mavfi_cli.studies.redundancy_plan import WORLDS, RedundancyPlan
 
     plan = RedundancyPlan(
         vehicles=vehicles,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,12 @@ from mavfi_cli.analysis.flights import chosen, flights, flown, rows_of
 from mavfi_cli.analysis.scores import Scores, model_digest
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import changes_of
 from mavfi_cli.campaign.outcome import State
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
 from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.mission.detector_config import detector_of
 from mavfi_cli.mission.run import installed_versions
 from mavfi_cli.studies.evaluation_plan import EvaluationPlan, Fault, require_held_out
 
@@ -147,31 +145,8 @@ def told(
     """
     return {
         "schema": SCHEMA,
-        "plan": _plan(plan),
+        "plan": plan.told(),
         "versions": installed_versions(),
         "errors": list(errors),
         **found((NONE, *plan.protectors), *pairs, scored),
-    }
-
-
-def _plan(plan: EvaluationPlan) -> dict[str, Any]:
-    detectors, stack = map(plan.detector_config, plan.protectors), plan.base.stack
-    return {
-        "worlds": list(plan.worlds),
-        "detectors": {
-            each.name: {
-                "threshold": detector_of(each, stack).threshold,
-                "model_sha256": model_digest(each, stack),
-            }
-            for each in detectors
-        },
-        "protect": list(plan.protect),
-        "level": plan.level,
-        "places": [asdict(place) for place in plan.places()],
-        "flights": plan.flights,
-        "harmless_flights": plan.harmless_flights,
-        "golden_flights": plan.golden_flights,
-        "first_seed": plan.first_seed,
-        "seed": plan.seed,
-        "mission": changes_of(plan.base),
     }

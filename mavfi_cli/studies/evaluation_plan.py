@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.detector_pairs import ERROR_FREE, FAULT, NONE
-from mavfi_cli.campaign.missions import Label, PlannedMission
+from mavfi_cli.analysis.scores import model_digest
+from mavfi_cli.campaign.missions import Label, PlannedMission, changes_of
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.seeds import Stream, derive
@@ -127,6 +128,25 @@ class EvaluationPlan:
     def seeds(self) -> range:
         """Of the missions, the same in each world; the first `flights` of them get faults."""
         return range(self.first_seed, self.first_seed + self.golden_flights)
+
+    def told(self) -> dict[str, Any]:
+        """What is flown, with what the detectors are, as plain values."""
+        stack = self.base.stack
+        return {
+            "worlds": list(self.worlds),
+            "detectors": {
+                each.name: {
+                    "threshold": detector_of(each, stack).threshold,
+                    "model_sha256": model_digest(each, stack),
+                }
+                for each in map(self.detector_config, self.protectors)
+            },
+            "protect": list(self.protect),
+            "places": [asdict(place) for place in self.places()],
+            "mission": changes_of(self.base),
+            **{name: getattr(self, name) for name in ("level", "flights", "harmless_flights",
+                                                      "golden_flights", "first_seed", "seed")},
+        }  # fmt: skip
 
     def places(self) -> list[Place]:
         """Where faults strike: stage by bit field, or node."""

@@ -4,7 +4,7 @@ import pyarrow as pa
 import pytest
 
 from mavfi_cli.analysis.platforms import SCHEMA, figures
-from mavfi_cli.studies.compare import ComparePlan, plan_told
+from mavfi_cli.studies.compare_plan import ComparePlan
 
 PLAN = ComparePlan(inject=("planning",), missions=10)
 SEEDS = range(1, 11)
@@ -89,7 +89,7 @@ def whole():
     """All that compare.json holds, of made-up flights; do not change it."""
     return {
         "schema": 1,
-        "plan": plan_told(PLAN),
+        "plan": PLAN.told(),
         "versions": {},
         "errors": [],
         **figures_of(PLAN, made_up()),

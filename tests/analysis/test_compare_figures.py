@@ -10,7 +10,7 @@ from flown_twice import PLAN, SEEDS, figures_of, flight
 from mavfi_cli.analysis.platforms import QUANTITIES
 from mavfi_cli.report.tables.platforms import platform_csv, platform_lines
 from mavfi_cli.stats.shares import rate
-from mavfi_cli.studies.compare import ComparePlan, plan_told
+from mavfi_cli.studies.compare_plan import ComparePlan
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ def test_a_fault_that_cost_nothing_is_not_recommended():
     flights = [flight(p, s, 20.0, setting) for p in PLAN.platforms for s in SEEDS
                for setting in PLAN.settings]  # fmt: skip
     text = "\n".join(
-        platform_lines({"plan": plan_told(PLAN), "errors": [], **figures_of(PLAN, flights)})
+        platform_lines({"plan": PLAN.told(), "errors": [], **figures_of(PLAN, flights)})
     )
     assert "no fault made a flight longer on tx2" in text
     assert "mavfi fly" not in text
@@ -159,7 +159,7 @@ def test_no_line_of_the_text_is_longer_than_100_columns_but_commands():
                outcome="collision" if platform == "tx2" and seed % 4 == 0 else "success")
         for platform in plan.platforms for seed in range(200) for setting in plan.settings
     ]  # fmt: skip
-    told = {"plan": plan_told(plan), "errors": ["mission 3: no"], **figures_of(plan, flights)}
+    told = {"plan": plan.told(), "errors": ["mission 3: no"], **figures_of(plan, flights)}
     text = platform_lines(told)
     assert "-25.0 (p<.001)" in "\n".join(text)
     assert [line for line in text if len(line) > 100 and not line.startswith("  mavfi fly")] == []
@@ -172,7 +172,7 @@ def test_intervals_of_too_few_flights_are_said_to_be_too_narrow(missions, said):
         flight(platform, seed, 20.0 + seed) for platform in plan.platforms
         for seed in range(1, missions + 1)
     ]  # fmt: skip
-    told = {"plan": plan_told(plan), "errors": [], **figures_of(plan, flights)}
+    told = {"plan": plan.told(), "errors": [], **figures_of(plan, flights)}
     assert ("fewer than 10 flights are too narrow" in "\n".join(platform_lines(told))) is said
 
 

@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 
 from mavfi_cli.report.compare_plot import draw_compare_plot, write_compare_plot
 from mavfi_cli.report.timeline import draw_timeline, write_timeline
-from mavfi_cli.studies.compare import ComparePlan, plan_told
+from mavfi_cli.studies.compare_plan import ComparePlan
 
 SVG = "{http://www.w3.org/2000/svg}"
 KERNELS = ("point cloud", "OctoMap", "collision check", "planner", "control")
@@ -80,7 +80,7 @@ def test_the_response_bar_is_the_kernels_and_the_waiting(whole):
      "tx2"))],
 )  # fmt: skip
 def test_nothing_flown_and_other_numbers_of_platforms_are_drawn_all_the_same(plan, tmp_path):
-    told = {"plan": plan_told(plan), "errors": [], **figures_of(plan, []),
+    told = {"plan": plan.told(), "errors": [], **figures_of(plan, []),
             "timeline": {"seed": 1, "platforms": []}}  # fmt: skip
     write_compare_plot(told, tmp_path / "compare.svg")
     write_timeline(told, tmp_path / "timeline.svg")

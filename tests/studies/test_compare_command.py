@@ -13,7 +13,8 @@ from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import plain
-from mavfi_cli.studies.compare import ComparePlan, compare
+from mavfi_cli.studies.compare import compare
+from mavfi_cli.studies.compare_plan import ComparePlan
 
 WORLD = (
     'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'

@@ -6,10 +6,12 @@ from dataclasses import replace
 import pytest
 from flown_twice import flight
 
+from mavfi_cli.analysis.platforms import titles
+from mavfi_cli.analysis.timeline import timeline_seed
 from mavfi_cli.campaign.specification.changes import replaced
 from mavfi_cli.campaign.specification.spec import load_spec
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.studies.compare import ComparePlan, plan_told, timeline_seed, titles
+from mavfi_cli.studies.compare_plan import ComparePlan
 
 
 def test_as_it_stands_it_is_the_preset_fig16_mission_for_mission():
@@ -50,7 +52,7 @@ def test_a_stack_is_that_of_every_mission_and_of_the_preset_with_it():
     assert {mission.config.stack for mission in plan.spec().missions()} == {"hardened"}
     preset = replaced(load_spec("fig16"), ["stack=hardened"])
     assert plan.spec().missions() == preset.missions()
-    assert plan_told(plan)["stack"] == "hardened"
+    assert plan.told()["stack"] == "hardened"
 
 
 def test_one_platform_and_no_faults_is_a_comparison_too():
@@ -107,13 +109,13 @@ def test_the_timeline_is_of_a_mission_that_all_fly_well_with_a_new_plan_on_the_w
         *(flight("tx2", seed, 21.0) for seed in (1, 2, 4)),
         flight("tx2", 3, 21.0, outcome="collision"),
     ]
-    assert timeline_seed(plan, flights) == 4
-    assert timeline_seed(plan, [f for f in flights if f["seed"] != 4]) == 1
-    assert timeline_seed(plan, []) == plan.first_seed
+    assert timeline_seed(flights, plan.platforms) == 4
+    assert timeline_seed([f for f in flights if f["seed"] != 4], plan.platforms) == 1
+    assert timeline_seed([], plan.platforms) is None
 
 
 def test_a_platform_that_does_not_describe_itself_is_called_by_its_name(tmp_path):
     path = tmp_path / "board.toml"
     path.write_text('name = "mine"\ncores = 4\nbase = "tx2"\n')
-    (told,) = plan_told(ComparePlan(platforms=(str(path),), inject=()))["platforms"]
+    (told,) = ComparePlan(platforms=(str(path),), inject=()).told()["platforms"]
     assert (told["title"], told["description"]) == ("board", "mine")

@@ -8,7 +8,7 @@ import pytest
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.studies.flight_plan import flight_plan, write_files
-from mavfi_cli.studies.redundancy import RedundancyPlan
+from mavfi_cli.studies.redundancy_plan import RedundancyPlan
 from mavfi_cli.vpm.board import load_board
 from mavfi_cli.vpm.model import hover_power_w
 from mavfi_cli.vpm.report import Choices, setting_of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 
 from mavfi_cli.analysis.comparison import Comparison
 from mavfi_cli.analysis.failures import Failures
@@ -13,6 +14,7 @@ from mavfi_cli.analysis.summary import Cell, Quality, Summary
 from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
+from mavfi_cli.report.tables.cells import number, percent, spread
 from mavfi_cli.report.tables.settings import SettingColumns
 from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.shares import Share
@@ -60,7 +62,7 @@ def _fate_cells(cell: Cell) -> list[str]:
     over = sum(cell.outcomes.values()) + cell.errors
     share = cell.success
     ends = f"{100 * share.low:.1f} to {100 * share.high:.1f} %" if share.total else "-"
-    every = f"{100 * cell.every.share:.1f} %" if cell.every.total else "-"
+    every = percent(cell.every.share)
     told = [f"{name} {count}" for name, count in cell.outcomes.items() if name != "success"]
     told += [f"{name.replace('_', ' ')} {count}"
              for name, count in cell.injected.items() if name in INACTIVE]  # fmt: skip
@@ -71,8 +73,8 @@ def _fate_cells(cell: Cell) -> list[str]:
 
 def _mean_cells(cell: Cell) -> list[str]:
     time, distance, energy, replans = (cell.metrics[name].value for name in METRICS)
-    units = ((time, "s"), (distance, "m"), (energy / 1e3, "kJ"), (replans, ""))
-    return ["-" if math.isnan(value) else f"{value:.1f} {unit}".rstrip() for value, unit in units]
+    units = ((time, " s"), (distance, " m"), (energy / 1e3, " kJ"), (replans, ""))
+    return [number(value, ".1f", unit=unit) for value, unit in units]
 
 
 def _comparison_table(settings: SettingColumns, found: Sequence[Comparison]) -> list[str]:
@@ -95,7 +97,7 @@ def _comparison_cells(each: Comparison) -> list[str]:
         f"{test.pairs}",
         f"{100 * test.difference:+.1f}",
         f"{each.corrected_p:.3g}",
-        "" if math.isnan(time.low) else _spread(time, 2, sign="+"),
+        "" if math.isnan(time.low) else spread(asdict(time), 2, sign="+"),
         _worst(each.over_own),
         "" if math.isnan(mean.recovered_share) else _worst(mean),
     ]
@@ -135,20 +137,10 @@ def _quality_cells(each: Quality, scale: float) -> list[str]:
     extremes = (each.least, each.median, each.most)
     return [
         f"{each.mean.count}",
-        _spread(each.mean, 2, scale),
-        *("-" if math.isnan(value) else f"{scale * value:.2f}" for value in extremes),
-        "" if each.difference is None else _spread(each.difference, 2, scale, "+"),
+        spread(asdict(each.mean), 2, scale),
+        *(number(value, ".2f", scale) for value in extremes),
+        "" if each.difference is None else spread(asdict(each.difference), 2, scale, "+"),
     ]
-
-
-def _spread(found: Interval, digits: int, scale: float = 1.0, sign: str = "") -> str:
-    """A value and its interval, where there are such."""
-    if math.isnan(found.value):
-        return "-"
-    value, *ends = (
-        format(scale * each, f"{sign}.{digits}f") for each in (found.value, found.low, found.high)
-    )
-    return value if math.isnan(found.low) else f"{value} ({' to '.join(ends)})"
 
 
 # Overhead -------------------------------------------------------------------------------------
@@ -180,7 +172,7 @@ def _detection_cells(each: FlightOverhead) -> list[str]:
     return [
         f"{each.flights}",
         f"{each.checks_per_s.value:.1f}",
-        _spread(each.check_host_s, 2, 1e6),
+        spread(asdict(each.check_host_s), 2, 1e6),
         _percent(each.detection_host_share),
     ]
 
@@ -196,7 +188,7 @@ def _recovery_cells(each: FlightOverhead) -> list[str]:
 
 def _percent(share: Interval, *, ends: bool = True) -> str:
     """Per cent with four digits, as in the paper's table; what is less but not nothing as "<"."""
-    value, *between = _spread(share, 4, 100.0).split(" ", 1)
+    value, *between = spread(asdict(share), 4, 100.0).split(" ", 1)
     told = "<0.0001" if 0.0 < share.value < 0.5e-6 else value
     return " ".join([told, *between]) if ends else told
 

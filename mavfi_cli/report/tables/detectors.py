@@ -12,6 +12,7 @@ from mavfi_cli.analysis.detector_pairs import CSV, NONE
 from mavfi_cli.analysis.detectors import ALL
 from mavfi_cli.analysis.flights import rows_of
 from mavfi_cli.core.columns import columns
+from mavfi_cli.report.tables.cells import fraction, number, percent, rate, spread
 from mavfi_cli.report.tables.rows import csv_text
 
 Row = Mapping[str, Any]
@@ -75,10 +76,10 @@ def _error_free_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
         yield [
             row["detector"],
             f"{row['flights']}",
-            _spread(row["alarms_per_hour"]),
+            spread(row["alarms_per_hour"], 1),
             _share(row["with_alarm"]),
-            _fraction(row["lost"]) + (f", {row['gained']} won" if row["gained"] else ""),
-            _spread(row["lengthening"], scale=100.0, digits=2),
+            fraction(row["lost"]) + (f", {row['gained']} won" if row["gained"] else ""),
+            spread(row["lengthening"], 2, 100.0),
         ]
 
 
@@ -91,11 +92,11 @@ def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
         yield [
             row["detector"],
             _share(row["detected_harmful"]),
-            _rate(row["detected_active"]),
-            _percent(row["by_chance"]["share"]),
-            f"{_number(row['latency_ticks'], 0)} ({_number(row['latency_ticks_p95'], 0)})",
-            f"{_number(found['area'], 3)} ({_number(found['area_low'], 2)} to "
-            f"{_number(found['area_high'], 2)})"
+            rate(row["detected_active"]),
+            percent(row["by_chance"]["share"]),
+            f"{number(row['latency_ticks'], '.0f')} ({number(row['latency_ticks_p95'], '.0f')})",
+            f"{number(found['area'], '.3f')} ({number(found['area_low'], '.2f')} to "
+            f"{number(found['area_high'], '.2f')})"
             if found["positives"]
             else "-",
         ]
@@ -103,15 +104,15 @@ def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
 
 def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
     yield ["", "success", "missions recovered", "harm undone", "added", "worst, recovered"]
-    yield ["golden", _rate(rows[0]["golden"])]
+    yield ["golden", rate(rows[0]["golden"])]
     for row in rows:
         bare = row["detector"] == NONE
         yield [
             row["detector"],
-            _rate(row["unprotected"] if bare else row["protected"]),
+            rate(row["unprotected"] if bare else row["protected"]),
             "" if bare else _share(row["recovered"]),
             "" if bare else _share(row["undone"]),
-            "" if bare else _fraction(row["added"]),
+            "" if bare else fraction(row["added"]),
             _worst_cell(row),
         ]
 
@@ -147,9 +148,9 @@ def _worst_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 
 def _worst_cell(row: Row) -> str:
     worst = row["worst"]
-    told = _percent(worst["protected"], signed=True)
+    told = percent(worst["protected"], "+.1f")
     recovered = row["detector"] != NONE and not math.isnan(worst["recovered_share"])
-    return told + (f", {_percent(worst['recovered_share'], digits=0)}" if recovered else "")
+    return told + (f", {percent(worst['recovered_share'], '.0f')}" if recovered else "")
 
 
 def _comparison_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
@@ -169,37 +170,8 @@ def _comparison_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
         yield [f"{row['first']} against {row['second']}", *told]
 
 
-def _number(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"
-
-
-def _percent(value: float, *, signed: bool = False, digits: int = 1) -> str:
-    if math.isnan(value) or math.isinf(value):
-        return "-"
-    return f"{100.0 * value:{'+' if signed else ''}.{digits}f} %"
-
-
-def _fraction(share: Row) -> str:
-    return f"{share['count']}/{share['total']}" if share["total"] else "-"
-
-
 def _share(share: Row) -> str:
-    return f"{_fraction(share)}: {_rate(share, digits=0)}" if share["total"] else "-"
-
-
-def _rate(share: Row, digits: int = 1) -> str:
-    if math.isnan(share["share"]):
-        return "-"
-    told = f"{100 * share['share']:.{digits}f} %"
-    return f"{told} ({100 * share['low']:.0f} to {100 * share['high']:.0f})"
-
-
-def _spread(each: Row, *, scale: float = 1.0, unit: str = "", digits: int = 1) -> str:
-    value, low, high = (scale * each[name] for name in ("value", "low", "high"))
-    if math.isnan(value):
-        return "-"
-    ends = "" if math.isnan(low) else f" ({low:.{digits}f} to {high:.{digits}f})"
-    return f"{value:.{digits}f}{unit}{ends}"
+    return f"{fraction(share)}: {rate(share, 0)}" if share["total"] else "-"
 
 
 def detector_csv(*pairs: pa.Table) -> str:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, QUANTITIES
 from mavfi_cli.core.columns import columns
 from mavfi_cli.mission.stack import DEFAULT
+from mavfi_cli.report.tables.cells import number, p_value, percent, rate, spread
 from mavfi_cli.report.tables.rows import csv_text
 from mavfi_cli.stats.bootstrap import FEW
 
@@ -23,32 +24,37 @@ def setting_title(setting: str) -> str:
     return {GOLDEN: "golden", NONE: "faults"}.get(setting, f"faults, {setting}")
 
 
+def titles_of(told: Row) -> dict[str, str]:
+    """What the platforms are called."""
+    return {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
+
+
 def platform_lines(told: Row) -> list[str]:
     """The comparison in words and columns."""
+    others = told["plan"]["platforms"][1:]
     lines = _head(told)
     lines += ["", "Flights that count: golden, or with a fault that was read or caught; medians"]
-    lines += _columns(_flight_rows(told))
-    lines += ["", *_columns(_work_rows(told))]
-    for platform in told["plan"]["platforms"][1:]:
-        lines += ["", *_ratio_lines(told, platform)]
+    lines += _beside(told, "settings", "setting", _FLIGHTS, _flight_cells)
+    lines += ["", *_beside(told, "settings", "setting", _WORK, _work_cells)]
+    for platform in others:
+        lines += ["", *_against(told, "ratios", platform, _RATIOS, _ratio_cells)]
     if told["costs"]:
         lines += [
             "",
             "What faults cost (Fig. 16), over the mission's golden flight; both successful",
+            *_beside(told, "costs", "platform", _COSTS, _cost_cells),
         ]
-        lines += _columns(_cost_rows(told))
-        for platform in told["plan"]["platforms"][1:]:
-            lines += ["", *_difference_lines(told, platform)]
+        for platform in others:
+            lines += ["", *_against(told, "cost_differences", platform, _EXTRA, _extra_cells)]
     lines += ["", "The longest successful flights"]
-    lines += _columns(_worst_rows(told))
-    lines += _again(told)
-    share = 100 * told["confidence"]
-    lines.append("")
+    lines += _beside(told, "worst", "platform", _WORST, _worst_cells)
+    lines += [*_again(told), ""]
     if told["errors"]:
         lines.append(f"{len(told['errors'])} missions could not be flown.")
     return [
         *lines,
-        f"In brackets: {share:g} % intervals, Wilson for success, bootstrap for the rest.",
+        f"In brackets: {100 * told['confidence']:g} % intervals, Wilson for success, bootstrap for "
+        "the rest.",
         "Energy: the paper's regression; that of the propellers is in compare.json.",
         "Response, depth frame to setpoint: each flight's median and 95th percentile; here the",
         "median over the flights.",
@@ -67,161 +73,110 @@ def _few(told: Row) -> list[str]:
 def _head(told: Row) -> list[str]:
     plan = told["plan"]
     last = plan["first_seed"] + plan["missions"] - 1
+    faults = "none"
+    if plan["inject"]:
+        bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
+        struck = ", ".join(plan["inject"])
+        faults = f"{bits} in {struck}: one a flight; fault seed {plan['seed']}"
     lines = [
         f"Missions    {plan['missions']} in {plan['world']}, seeds {plan['first_seed']} to {last}, "
         "the same on each platform",
         f"Stack       {plan['stack']}",
-        f"Faults      {_faults(plan)}",
+        f"Faults      {faults}",
     ]
-    for number, row in enumerate(plan["platforms"]):
-        head = "Platforms" if number == 0 else ""
+    heads = ["Platforms", *[""] * len(plan["platforms"])]
+    for head, row in zip(heads, plan["platforms"], strict=False):
         lines.append(f"{head:<11} {row['title']}: {row['description']}, {row['cores']} cores")
     return lines
 
 
-def _faults(plan: Row) -> str:
-    if not plan["inject"]:
-        return "none"
-    bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
-    return f"{bits} in {', '.join(plan['inject'])}: one a flight; fault seed {plan['seed']}"
+# Tables ---------------------------------------------------------------------------------------
 
 
-def titles_of(told: Row) -> dict[str, str]:
-    """What the platforms are called."""
-    return {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
+def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -> list[str]:
+    """A table of all platforms and settings; the label that comes first is told once."""
+    titles, last, rows = titles_of(told), "", []
+    for row in told[name]:
+        labels = [titles[row["platform"]], setting_title(row["setting"])]
+        labels = labels if first == "platform" else labels[::-1]
+        rows.append([labels[0] if labels[0] != last else "", labels[1], *cells(row)])
+        last = labels[0]
+    return columns([["", "", *head], *rows], 2)
 
 
-def _flight_rows(told: Row) -> Iterator[list[str]]:
-    yield ["", "", "flights", "success", "flight time, s", "distance, m"]
-    for row, name, title in _settings(told):
-        found = row["quantities"]
-        yield [
-            name,
-            title,
-            f"{row['counted']} of {row['flown']}",
-            _rate(row["success"]),
-            _spread(found["flight_time_s"]["median"], digits=1),
-            _spread(found["distance_m"]["median"], digits=1),
-        ]
-
-
-def _work_rows(told: Row) -> Iterator[list[str]]:
-    yield [
-        "",
-        "",
-        "energy, kJ",
-        "replans (mean)",
-        "response, ms",
-        "95th perc., ms",
-    ]
-    for row, name, title in _settings(told):
-        found = row["quantities"]
-        yield [
-            name,
-            title,
-            _spread(found["energy_regression_j"]["median"], scale=1e-3, digits=1),
-            _spread(found["replans"]["mean"], digits=1),
-            _spread(found["response_median_s"]["median"], scale=1e3, digits=0),
-            _spread(found["response_p95_s"]["median"], scale=1e3, digits=0),
-        ]
-
-
-def _settings(told: Row) -> Iterator[tuple[Row, str, str]]:
-    """Each row with its setting, once, and its platform."""
-    titles, last = titles_of(told), ""
-    for row in told["settings"]:
-        name = setting_title(row["setting"])
-        yield row, "" if name == last else name, titles[row["platform"]]
-        last = name
-
-
-def _ratio_lines(told: Row, platform: Row) -> list[str]:
-    rows = [row for row in told["ratios"] if row["platform"] == platform["platform"]]
+def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: Any) -> list[str]:
+    """A title, and a table of a platform against the first one."""
+    rows = [row for row in told[name] if row["platform"] == platform["platform"]]
+    title, *names = head
+    told_rows = [[setting_title(row["setting"]), *cells(row)] for row in rows]
     reference = titles_of(told)[rows[0]["reference"]]
-    title = f"{platform['title']} over {reference}, mission by mission"
     return [
-        f"{title} (flights that both succeed in; response: all)",
-        *_columns(_ratio_rows(rows)),
+        title.format(platform["title"], reference),
+        *columns([["", *names], *told_rows], 1),
     ]
 
 
-def _ratio_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "pairs", "flight time, x", "energy, x", "response, x", "success, pts"]
-    for row in rows:
-        found = row["quantities"]
-        difference = row["success"]["difference"]
-        yield [
-            setting_title(row["setting"]),
-            f"{row['both_succeed']}",
-            _spread(found["flight_time_s"], digits=3),
-            _spread(found["energy_regression_j"], digits=2),
-            _spread(found["response_median_s"], digits=2),
-            "-"
-            if math.isnan(difference)
-            else f"{100 * difference:+.1f} ({_chance(row['success']['p_value'])})",
-        ]
+_FLIGHTS = ("flights", "success", "flight time, s", "distance, m")
+_WORK = ("energy, kJ", "replans (mean)", "response, ms", "95th perc., ms")
+_RATIOS = (
+    "{} over {}, mission by mission (flights that both succeed in; response: all)",
+    "pairs", "flight time, x", "energy, x", "response, x", "success, pts",
+)  # fmt: skip
+_COSTS = ("flights", "lost", "mean, s", "95th perc., x", "worst, x", "recovered")
+_EXTRA = (
+    "{} against {}, fault by fault (faults that both survive; worst, longest: of all)",
+    "pairs", "differ", "mean, s", "95th perc., x", "worst, x", "longest, x",
+)  # fmt: skip
+_WORST = ("longest, s", "over mean golden, x", "recovered")
 
 
-def _platforms(told: Row, rows: Sequence[Row]) -> Iterator[tuple[Row, str]]:
-    """Each row with its platform, once."""
-    titles, last = titles_of(told), ""
-    for row in rows:
-        title = titles[row["platform"]]
-        yield row, "" if title == last else title
-        last = title
+def _flight_cells(row: Row) -> list[str]:
+    found = row["quantities"]
+    medians = (spread(found[name]["median"], 1) for name in ("flight_time_s", "distance_m"))
+    return [f"{row['counted']} of {row['flown']}", rate(row["success"]), *medians]
 
 
-def _cost_rows(told: Row) -> Iterator[list[str]]:
-    yield ["", "", "flights", "lost", "mean, s", "95th perc., x", "worst, x",
-           "recovered"]  # fmt: skip
-    for row, title in _platforms(told, told["costs"]):
-        yield [
-            title,
-            setting_title(row["setting"]),
-            f"{row['pairs']}",
-            f"{row['lost']}",
-            _spread(row["cost_s"]["mean"], digits=2),
-            _spread(row["over_own"]["p95"], digits=3),
-            _number(row["over_own"]["largest"], "{:.3f}"),
-            _number(row["over_own"]["recovered_share"], "{:.1%}"),
-        ]
-
-
-def _difference_lines(told: Row, platform: Row) -> list[str]:
-    """How much more the same faults cost on another platform than on the first."""
-    rows = [row for row in told["cost_differences"] if row["platform"] == platform["platform"]]
-    reference = titles_of(told)[rows[0]["reference"]]
-    title = f"{platform['title']} against {reference}, fault by fault"
+def _work_cells(row: Row) -> list[str]:
+    found = row["quantities"]
     return [
-        f"{title} (faults that both survive; worst, longest: of all)",
-        *_columns(_difference_rows(rows)),
+        spread(found["energy_regression_j"]["median"], 1, 1e-3),
+        spread(found["replans"]["mean"], 1),
+        spread(found["response_median_s"]["median"], 0, 1e3),
+        spread(found["response_p95_s"]["median"], 0, 1e3),
     ]
 
 
-def _difference_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    yield ["", "pairs", "differ", "mean, s", "95th perc., x", "worst, x", "longest, x"]
-    for row in rows:
-        yield [
-            setting_title(row["setting"]),
-            f"{row['pairs']}",
-            f"{row['differ']}",
-            _spread(row["extra_s"], digits=2, chance=row["p_value"]),
-            _spread(row["p95_ratio"], digits=3),
-            _number(row["largest_ratio"], "{:.3f}"),
-            _number(row["longest_ratio"], "{:.3f}"),
-        ]
+def _ratio_cells(row: Row) -> list[str]:
+    found, test = row["quantities"], row["success"]
+    points = number(test["difference"], "+.1f", 100.0, f" ({p_value(test['p_value'])})")
+    return [
+        f"{row['both_succeed']}",
+        spread(found["flight_time_s"], 3),
+        spread(found["energy_regression_j"], 2),
+        spread(found["response_median_s"], 2),
+        points,
+    ]
 
 
-def _worst_rows(told: Row) -> Iterator[list[str]]:
-    yield ["", "", "longest, s", "over mean golden, x", "recovered"]
-    for row, title in _platforms(told, told["worst"]):
-        yield [
-            title,
-            setting_title(row["setting"]),
-            _number(row["worst_s"], "{:.1f}"),
-            _number(row["over_mean_ratio"], "{:.3f}"),
-            _number(row["over_mean_recovered_share"], "{:.1%}"),
-        ]
+def _cost_cells(row: Row) -> list[str]:
+    over = row["over_own"]
+    return [
+        f"{row['pairs']}", f"{row['lost']}", spread(row["cost_s"]["mean"], 2),
+        spread(over["p95"], 3), number(over["largest"], ".3f"), percent(over["recovered_share"]),
+    ]  # fmt: skip
+
+
+def _extra_cells(row: Row) -> list[str]:
+    return [
+        f"{row['pairs']}", f"{row['differ']}", spread(row["extra_s"], 2, chance=row["p_value"]),
+        spread(row["p95_ratio"], 3), number(row["largest_ratio"], ".3f"),
+        number(row["longest_ratio"], ".3f"),
+    ]  # fmt: skip
+
+
+def _worst_cells(row: Row) -> list[str]:
+    over = number(row["over_mean_ratio"], ".3f")
+    return [number(row["worst_s"], ".1f"), over, percent(row["over_mean_recovered_share"])]
 
 
 def _again(told: Row) -> list[str]:
@@ -232,15 +187,15 @@ def _again(told: Row) -> list[str]:
             continue
         if row["over_own"]["largest"] > 1.0:
             lines.append(f"the fault that costs most on {titles[row['platform']]}:")
-            lines.append(f"  {command_of(told, row)}")
+            lines.append(f"  {_command_of(told['plan'], row)}")
         else:
             lines.append(f"no fault made a flight longer on {titles[row['platform']]}")
     return [*lines, *([PAPER] if told["plan"]["inject"] else [])]
 
 
-def command_of(told: Row, row: Row) -> str:
+def _command_of(plan: Row, row: Row) -> str:
     """The command that flies the worst flight of a setting without detector again."""
-    plan, flight = told["plan"], row["worst_flight"]
+    flight = row["worst_flight"]
     parts = [
         f"mavfi fly --world {plan['world']} --seed {flight['seed']} --platform {row['platform']}"
     ]
@@ -252,120 +207,99 @@ def command_of(told: Row, row: Row) -> str:
     return " ".join(parts)
 
 
-# Cells --------------------------------------------------------------------------------------------
-
-
-def _columns(rows: Iterator[list[str]]) -> list[str]:
-    """Rows as text: the first columns to the left, numbers to the right."""
-    cells = list(rows)
-    return columns(cells, 2 if cells[0][1] == "" else 1)
-
-
-def _chance(p_value: float) -> str:
-    """A p-value in little room."""
-    return "p<.001" if p_value < 0.001 else f"p {p_value:.1g}".replace("p 0.", "p .")
-
-
-def _rate(share: Row) -> str:
-    if math.isnan(share["share"]):
-        return "-"
-    ends = f"({100 * share['low']:.0f} to {100 * share['high']:.0f})"
-    return f"{100 * share['share']:.1f} % {ends}"
-
-
-def _spread(each: Row, *, scale: float = 1.0, digits: int, chance: float | None = None) -> str:
-    """A value with its interval, and the p-value where one is given."""
-    value, low, high = (scale * each[name] for name in ("value", "low", "high"))
-    if math.isnan(value):
-        return "-"
-    told = [] if math.isnan(low) else [f"{low:z.{digits}f} to {high:z.{digits}f}"]
-    told += [] if chance is None else [_chance(chance)]
-    ends = f" ({', '.join(told)})" if told else ""
-    return f"{value:z.{digits}f}{ends}"
-
-
-def _number(value: float, shape: str) -> str:
-    return "-" if math.isnan(value) else shape.format(value).replace("%", " %")
-
-
-# Rows -------------------------------------------------------------------------------------------
+# Rows -----------------------------------------------------------------------------------------
 
 
 _NAMES = ("table", "platform", "reference", "setting", "quantity", "statistic", "unit", "value",
           "low", "high", "count")  # fmt: skip
+# Quantity, statistic and unit of a number, and where it stands in its row.
+_OF_COSTS = (
+    ("lost by faults", "flights", "count", ("lost",)),
+    ("cost of a fault", "mean", "s", ("cost_s", "mean")),
+    ("cost of a fault", "largest", "s", ("cost_s", "largest")),
+    ("flight time over own golden", "95th percentile", "1", ("over_own", "p95")),
+    ("flight time over own golden", "largest", "1", ("over_own", "largest")),
+    ("flight time over own golden", "share of the largest increase recovered", "1",
+     ("over_own", "recovered_share")),
+)  # fmt: skip
+_OF_DIFFERENCES = (
+    ("cost of a fault", "mean difference", "s", ("extra_s",)),
+    ("cost of a fault", "pairs that differ", "count", ("differ",)),
+    ("cost of a fault", "p-value of the mean difference", "1", ("p_value",)),
+    ("flight time over own golden", "ratio of 95th percentiles", "1", ("p95_ratio",)),
+    ("flight time over own golden", "ratio of the largest", "1", ("largest_ratio",)),
+    ("flight time", "ratio of the longest", "1", ("longest_ratio",)),
+)
+_OF_WORST = (
+    ("flight time", "largest", "s", ("worst_s",)),
+    ("flight time", "largest over mean golden", "1", ("over_mean_ratio",)),
+    ("flight time", "share of the increase over mean golden recovered", "1",
+     ("over_mean_recovered_share",)),
+)  # fmt: skip
 
 
 def platform_csv(told: Row) -> str:
     """A row a number: what it is, of which platform and setting, its unit and its interval."""
-    return csv_text(
-        ({key: "" if isinstance(cell, float) and math.isnan(cell) else cell
-          for key, cell in row.items()}
-         for row in _csv_rows(told)),
-        _NAMES,
-    )  # fmt: skip
-
-
-def _csv_rows(told: Row) -> Iterator[dict[str, Any]]:
-    for row in told["settings"]:
-        at = {"table": "settings", "platform": row["platform"], "setting": row["setting"]}
-        success = row["success"]
-        yield {**at, "quantity": "success", "statistic": "share", "unit": "1",
-               "value": success["share"], "low": success["low"], "high": success["high"],
-               "count": success["total"]}  # fmt: skip
-        for quantity in QUANTITIES:
-            found = row["quantities"][quantity.name]
-            for statistic in ("median", "mean"):
-                yield {**at, "quantity": quantity.title, "statistic": statistic,
-                       "unit": quantity.unit, **found[statistic]}  # fmt: skip
-    for row in told["ratios"]:
-        at = {"table": "ratios", **{k: row[k] for k in ("platform", "reference", "setting")}}
-        yield {**at, "quantity": "success", "statistic": "difference", "unit": "1",
-               "value": row["success"]["difference"], "count": row["pairs"]}  # fmt: skip
-        for quantity in QUANTITIES:
-            found = dict(row["quantities"][quantity.name])
-            kind = found.pop("kind")
-            unit = "1" if kind == "ratio" else found["unit"]
-            yield {**at, "quantity": quantity.title, **found, "statistic": kind, "unit": unit}
+    rows = [*_setting_numbers(told["settings"]), *_ratio_numbers(told["ratios"])]
     for row in told["costs"]:
-        at = {"table": "costs", "platform": row["platform"], "setting": row["setting"]}
-        yield from _cost_csv(at, row)
+        counts = {"lost": row["pairs"] + row["lost"]}
+        rows += _numbers("costs", row, _OF_COSTS, counts, row["pairs"])
     for row in told["cost_differences"]:
-        at = {"table": "costs", **{k: row[k] for k in ("platform", "reference", "setting")}}
-        yield {**at, "quantity": "cost of a fault", "statistic": "mean difference", "unit": "s",
-               **row["extra_s"]}  # fmt: skip
-        yield {**at, "quantity": "cost of a fault", "statistic": "pairs that differ",
-               "unit": "count", "value": row["differ"], "count": row["pairs"]}  # fmt: skip
-        yield {**at, "quantity": "cost of a fault", "statistic": "p-value of the mean difference",
-               "unit": "1", "value": row["p_value"], "count": row["pairs"]}  # fmt: skip
-        yield {**at, "quantity": "flight time over own golden", "unit": "1",
-               "statistic": "ratio of 95th percentiles", **row["p95_ratio"]}  # fmt: skip
-        yield {**at, "quantity": "flight time over own golden", "statistic": "ratio of the largest",
-               "unit": "1", "value": row["largest_ratio"]}  # fmt: skip
-        yield {**at, "quantity": "flight time", "statistic": "ratio of the longest", "unit": "1",
-               "value": row["longest_ratio"]}  # fmt: skip
+        counts = dict.fromkeys(("differ", "p_value"), row["pairs"])
+        rows += _numbers("costs", row, _OF_DIFFERENCES, counts)
     for row in told["worst"]:
-        at = {"table": "worst", "platform": row["platform"], "setting": row["setting"],
-              "quantity": "flight time", "count": row["flights"]}  # fmt: skip
-        for statistic, unit, key in _WORST:
-            yield {**at, "statistic": statistic, "unit": unit, "value": row[key]}
+        rows += _numbers("worst", row, _OF_WORST, {}, row["flights"])
+    blank = (
+        {key: "" if isinstance(cell, float) and math.isnan(cell) else cell
+         for key, cell in row.items()}
+        for row in rows
+    )  # fmt: skip
+    return csv_text(blank, _NAMES)
 
 
-def _cost_csv(at: dict[str, Any], row: Row) -> Iterator[dict[str, Any]]:
-    cost, over, pairs = row["cost_s"], row["over_own"], {"count": row["pairs"]}
-    yield {**at, "quantity": "lost by faults", "statistic": "flights", "unit": "count",
-           "value": row["lost"], "count": row["pairs"] + row["lost"]}  # fmt: skip
-    of_cost = {**at, "quantity": "cost of a fault", "unit": "s"}
-    yield {**of_cost, "statistic": "mean", **cost["mean"]}
-    yield {**of_cost, "statistic": "largest", "value": cost["largest"], **pairs}
-    of_ratio = {**at, "quantity": "flight time over own golden", "unit": "1"}
-    yield {**of_ratio, "statistic": "95th percentile", **over["p95"]}
-    yield {**of_ratio, "statistic": "largest", "value": over["largest"], **pairs}
-    yield {**of_ratio, "statistic": "share of the largest increase recovered",
-           "value": over["recovered_share"], **pairs}  # fmt: skip
+def _at(table: str, row: Row, quantity: str, statistic: str, unit: str) -> dict[str, Any]:
+    labels = {name: row[name] for name in ("platform", "reference", "setting") if name in row}
+    return {"table": table, **labels, "quantity": quantity, "statistic": statistic, "unit": unit}
 
 
-_WORST = (
-    ("largest", "s", "worst_s"),
-    ("largest over mean golden", "1", "over_mean_ratio"),
-    ("share of the increase over mean golden recovered", "1", "over_mean_recovered_share"),
-)
+def _setting_numbers(rows: Iterable[Row]) -> Iterator[dict[str, Any]]:
+    for row in rows:
+        success = row["success"]
+        yield {**_at("settings", row, "success", "share", "1"), "value": success["share"],
+               "low": success["low"], "high": success["high"],
+               "count": success["total"]}  # fmt: skip
+        for each in QUANTITIES:
+            found = row["quantities"][each.name]
+            for statistic in ("median", "mean"):
+                told = _at("settings", row, each.title, statistic, each.unit)
+                yield {**told, **found[statistic]}
+
+
+def _ratio_numbers(rows: Iterable[Row]) -> Iterator[dict[str, Any]]:
+    for row in rows:
+        yield {**_at("ratios", row, "success", "difference", "1"),
+               "value": row["success"]["difference"], "count": row["pairs"]}  # fmt: skip
+        for each in QUANTITIES:
+            found = dict(row["quantities"][each.name])
+            kind, unit = found.pop("kind"), found.pop("unit")
+            told = _at("ratios", row, each.title, kind, "1" if kind == "ratio" else unit)
+            yield {**told, **found}
+
+
+def _numbers(
+    table: str, row: Row, listed: Any, counts: Mapping[str, int], count: int | None = None
+) -> Iterator[dict[str, Any]]:
+    """The listed numbers of a row.
+
+    Args:
+        counts: of how many some of them are, by the first word of their place.
+        count: of how many the others are that do not say it.
+    """
+    for quantity, statistic, unit, place in listed:
+        found: Any = row
+        for name in place:
+            found = found[name]
+        values = dict(found) if isinstance(found, Mapping) else {"value": found}
+        if "count" not in values and (of := counts.get(place[0], count)) is not None:
+            values["count"] = of
+        yield {**_at(table, row, quantity, statistic, unit), **values}
