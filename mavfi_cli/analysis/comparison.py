@@ -19,7 +19,7 @@ RESAMPLES = 1999
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class PairedComparison:
     """Two settings over the missions that both flew.
 
     Attributes:
@@ -102,7 +102,7 @@ class _Match:
         return found
 
 
-def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Comparison]:
+def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[PairedComparison]:
     """Every setting with faults against the golden one with which it shares most pairs."""
     found = []
     for group in groups:
@@ -112,7 +112,7 @@ def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Co
     return _compared(found, confidence)
 
 
-def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[Comparison]:
+def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[PairedComparison]:
     """Every protected setting against the unprotected one with the same faults."""
     bare = {
         untreated(group.labels): group for group in groups if not (group.watched or group.golden)
@@ -140,17 +140,15 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     return groups[-most[1]] if most[0] else None
 
 
-def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
+def _compared(matches: Sequence[_Match], confidence: float) -> list[PairedComparison]:
     matches = [each for each in matches if len(each.at_second)]
-    tests = [
-        mcnemar(zip(*(column.tolist() for column in each.success), strict=True)) for each in matches
-    ]
+    tests = [mcnemar(*each.success) for each in matches]
     corrected = holm([test.p_value for test in tests])
     found = []
     for each, test, p in zip(matches, tests, corrected, strict=True):
         over_own, over_mean = each.worst()
         found.append(
-            Comparison(
+            PairedComparison(
                 first=each.first.labels,
                 second=each.second.labels,
                 name=each.second.name,

@@ -308,8 +308,7 @@ def recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McN
 
     def test(among: pa.Array, column: str) -> McNemar:
         """McNemar's test of a column of flags, over some of the pairs."""
-        ends = (flags(each.filter(among), column).tolist() for each in (here, there))
-        return mcnemar(zip(*ends, strict=True))
+        return mcnemar(*(flags(each.filter(among), column) for each in (here, there)))
 
     lost, harmful = pc.equal(harm, Harm.LOST.value), pc.not_equal(harm, Harm.NONE.value)
     return test(lost, "won"), test(harmful, "undone")
@@ -321,7 +320,7 @@ def _share(pairs: pa.Table, column: str, *, wanted: bool = True) -> Share:
 
 def _ends(pairs: pa.Table, first: str) -> McNemar:
     """McNemar's test of success without and with the detector."""
-    return mcnemar(zip(flags(pairs, first).tolist(), flags(pairs, "won").tolist(), strict=True))
+    return mcnemar(flags(pairs, first), flags(pairs, "won"))
 
 
 def _worst(pairs: pa.Table) -> WorstFlight:

@@ -133,8 +133,8 @@ def paired(first: pa.Table, second: pa.Table, on: Sequence[str]) -> tuple[pa.Tab
     """
     if not (first.num_rows and second.num_rows):  # an empty column has no type to join by
         return first.slice(0, 0), second.slice(0, 0)
-    there = first.select(on).append_column("first", pa.array(range(first.num_rows), pa.int64()))
-    here = second.select(on).append_column("second", pa.array(range(second.num_rows), pa.int64()))
+    there = first.select(on).append_column("first", pa.array(np.arange(first.num_rows)))
+    here = second.select(on).append_column("second", pa.array(np.arange(second.num_rows)))
     places = here.join(there, list(on), join_type="inner", use_threads=False).sort_by("second")
     return first.take(places["first"]), second.take(places["second"])
 

@@ -19,8 +19,7 @@ def both_succeed(first: pa.Table, second: pa.Table) -> BoolArray:
 
 def success_test(first: pa.Table, second: pa.Table) -> McNemar:
     """McNemar's test of the success of these pairs."""
-    ends = (flags(each, "succeeded").tolist() for each in (first, second))
-    return mcnemar(zip(*ends, strict=True))
+    return mcnemar(flags(first, "succeeded"), flags(second, "succeeded"))
 
 
 def ratio(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.analysis.comparison import RESAMPLES, Comparison, against_golden, protection
+from mavfi_cli.analysis.comparison import RESAMPLES, PairedComparison, against_golden, protection
 from mavfi_cli.analysis.groups import INACTIVE, METRICS, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.outcome import COUNTED
@@ -54,8 +54,8 @@ class Summary:
     over: int
     confidence: float
     cells: Sequence[Cell]
-    faults: Sequence[Comparison]
-    protection: Sequence[Comparison]
+    faults: Sequence[PairedComparison]
+    protection: Sequence[PairedComparison]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -140,7 +140,9 @@ def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[Quality
     ]
 
 
-def _quality(group: Group, metric: str, compared: Comparison | None, confidence: float) -> Quality:
+def _quality(
+    group: Group, metric: str, compared: PairedComparison | None, confidence: float
+) -> Quality:
     values = group.successes(metric)
     quantiles = np.quantile(values, (0.0, 0.5, 1.0)) if len(values) else np.full(3, np.nan)
     least, median, most = quantiles.tolist()

@@ -14,13 +14,14 @@ from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.outcome import COUNTED, Injected, MissionResult, State
 from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.mission.record.columns import columns_of
 from mavfi_cli.mission.record.run_folder import RESULT
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Flight:
+class DrawnFlight:
     """One flight of the picture.
 
     Attributes:
@@ -38,7 +39,7 @@ class Flight:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Panel:
+class DrawnPanel:
     """The flights of one fault, golden ones first, protected ones last.
 
     Attributes:
@@ -46,22 +47,22 @@ class Panel:
     """
 
     title: str
-    flights: Sequence[Flight]
+    flights: Sequence[DrawnFlight]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pair:
+class DrawnPair:
     """All flights of a pair, and which of its missions have none.
 
     Attributes:
         absent: what is not in the picture, and why, a line each.
     """
 
-    panels: Sequence[Panel]
+    panels: Sequence[DrawnPanel]
     absent: Sequence[str]
 
 
-def pair(ledger: Ledger, number: int | None = None) -> Pair:
+def pair(ledger: Ledger, number: int | None = None) -> DrawnPair:
     """The flights that share world, start and noise with a mission, panel by panel.
 
     Args:
@@ -90,7 +91,7 @@ def pair(ledger: Ledger, number: int | None = None) -> Pair:
     if not whole:
         raise RecordError(f"{ledger.folder}: {_told(mine)} left no record to draw")
     missing = sorted(set(mine) - {each.number for each in over})
-    return Pair(
+    return DrawnPair(
         panels=_panels(whole),
         absent=[
             f"mission {each.number} could not begin: {each.reason}"
@@ -144,7 +145,7 @@ def _most_prolonged(ledger: Ledger) -> int:
     return first[max(complete, key=lambda name: (increase.get(name, 0.0), -first[name]))]
 
 
-def _panels(flown: Sequence[MissionResult]) -> list[Panel]:
+def _panels(flown: Sequence[MissionResult]) -> list[DrawnPanel]:
     golden = [each for each in flown if each.injected is Injected.GOLDEN]
     struck: dict[str, list[MissionResult]] = {}
     for each in flown:
@@ -179,7 +180,7 @@ def _common(labels: Sequence[Mapping[str, Any]]) -> set[str]:
     }
 
 
-def _panel(title: str, flown: Sequence[MissionResult]) -> Panel:
+def _panel(title: str, flown: Sequence[MissionResult]) -> DrawnPanel:
     ordered = sorted(
         flown,
         key=lambda each: (
@@ -190,14 +191,14 @@ def _panel(title: str, flown: Sequence[MissionResult]) -> Panel:
     )
     short = [_setting(each) for each in ordered]
     often = Counter(short)
-    return Panel(
+    return DrawnPanel(
         title=title,
         flights=[
-            Flight(
+            DrawnFlight(
                 number=each.number,
                 name=name if often[name] == 1 else f"{name} {_treatment(each)}".rstrip(),
                 outcome=each.outcome,
-                flight_time_s=(each.result.get("quality_of_flight") or {}).get("flight_time_s"),
+                flight_time_s=columns_of(each.result)["flight_time_s"],
                 path=each.path,
             )
             for name, each in zip(short, ordered, strict=True)

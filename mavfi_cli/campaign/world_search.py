@@ -18,6 +18,7 @@ from mavfi_cli.campaign.specification.fixed_world import FixedWorld, Flown
 from mavfi_cli.campaign.specification.spec import Spec
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.record.columns import columns_of
 
 SEARCH = "world-search"  # the folder
 _AT_ONCE = 4  # candidates whose flights fill the slots together
@@ -123,6 +124,5 @@ def _replans(
     quiet = replace(options, keep=Keep.NONE)
     with run_campaign(planned, folder, quiet, _Notes(spectator), append=True) as ledger:
         return {
-            each.mission.config: (each.result.get("pilot") or {}).get("replans")
-            for each in ledger.results()
+            each.mission.config: columns_of(each.result)["replans"] for each in ledger.results()
         }

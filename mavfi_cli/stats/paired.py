@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+BoolArray = NDArray[np.bool_]
 _EXACT = 16  # differences up to which all signs are tried
 _FLIPS = 9999  # random ones for more
 _CHUNK = 4_000_000  # numbers that are drawn at once
@@ -41,21 +43,19 @@ class McNemar:
         return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
 
 
-def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> McNemar:
+def mcnemar(first: Sequence[bool] | BoolArray, second: Sequence[bool] | BoolArray) -> McNemar:
     """McNemar's test (Psychometrika 12, 1947), exact: the differing pairs as fair coins.
 
     Args:
-        pairs: success of the first and of the second treatment, a pair a mission.
+        first, second: success of each treatment, (n,) a mission.
     """
-    counts = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
-    for first, second in pairs:
-        counts[bool(first), bool(second)] += 1
-    only_first, only_second = counts[True, False], counts[False, True]
+    ends = 2 * np.asarray(first, dtype=np.int64) + np.asarray(second, dtype=np.int64)
+    neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
     return McNemar(
-        both=counts[True, True],
+        both=both,
         only_first=only_first,
         only_second=only_second,
-        neither=counts[False, False],
+        neither=neither,
         p_value=_coins(min(only_first, only_second), only_first + only_second),
     )
 

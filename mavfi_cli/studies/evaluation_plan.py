@@ -41,7 +41,7 @@ _DRAWS = 1000  # fault seeds that are tried until one draws a state of the wante
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class InjectionSite:
     """Where faults of one kind strike.
 
     Attributes:
@@ -55,7 +55,7 @@ class Place:
     field: str
 
 
-Fault = tuple[str, int, Place]  # world, seed of the mission, where
+Fault = tuple[str, int, InjectionSite]  # world, seed of the mission, where
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,15 +148,15 @@ class EvaluationPlan:
                                                       "golden_flights", "first_seed", "seed")},
         }  # fmt: skip
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[InjectionSite]:
         """Where faults strike: stage by bit field, or node."""
         if self.level == INSTRUCTION:
             return [
-                Place(stage=stage.value, target=node, field=Field.ANY.value)
+                InjectionSite(stage=stage.value, target=node, field=Field.ANY.value)
                 for node, stage in NODES.items()
             ]
         return [
-            Place(stage=stage.value, target=stage.value, field=name)
+            InjectionSite(stage=stage.value, target=stage.value, field=name)
             for stage, name in itertools.product(Stage, self.fields)
             if stage is not Stage.CONTROL or name != INTEGER  # its states are all float64
         ]
@@ -181,13 +181,15 @@ class EvaluationPlan:
         """Whether the detectors fly all faults of this mission, harmless ones as well."""
         return seed in self.seeds[: self.harmless_flights]
 
-    def _keys(self) -> Iterator[tuple[str, int, Place | None]]:
+    def _keys(self) -> Iterator[tuple[str, int, InjectionSite | None]]:
         for world, seed in itertools.product(self.worlds, self.seeds):
             yield world, seed, None
         faulty = self.seeds[: self.flights]
         yield from itertools.product(self.worlds, faulty, self.places())
 
-    def _mission(self, key: tuple[str, int, Place | None], detector: str = NONE) -> PlannedMission:
+    def _mission(
+        self, key: tuple[str, int, InjectionSite | None], detector: str = NONE
+    ) -> PlannedMission:
         world, seed, place = key
         config = replace(self.base, world=world, seed=seed)
         labels: dict[str, Label] = {
@@ -203,7 +205,7 @@ class EvaluationPlan:
             config = replace(config, detector=self.detector_config(detector))
         return PlannedMission(config=config, labels=labels)
 
-    def _fault(self, world: str, seed: int, place: Place) -> dict[str, Any]:
+    def _fault(self, world: str, seed: int, place: InjectionSite) -> dict[str, Any]:
         drawn = (self.seed, Stream.FAULT, "evaluation", world, seed, place.target, place.field)
         if self.level == INSTRUCTION:
             return {"instruction": InstructionConfig(target=place.target, seed=derive(*drawn))}

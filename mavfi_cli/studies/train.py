@@ -67,7 +67,7 @@ class TrainingPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trained:
+class TrainedDetectors:
     """What came of it.
 
     Attributes:
@@ -121,7 +121,7 @@ def train(
     folder: Path,
     options: Options,
     spectator: Spectator,
-) -> Trained:
+) -> TrainedDetectors:
     """Fly, gather, fit, and write the models with their provenance.
 
     Raises:
@@ -141,4 +141,4 @@ def train(
         path = folder / f"{kind}.json"
         model_file.save(path, model)
         models[kind] = (model, path)
-    return Trained(dataset=dataset, models=models, failed=failed)
+    return TrainedDetectors(dataset=dataset, models=models, failed=failed)

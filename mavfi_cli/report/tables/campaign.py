@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from mavfi_cli.analysis.comparison import Comparison
+from mavfi_cli.analysis.comparison import PairedComparison
 from mavfi_cli.analysis.failures import Failures
 from mavfi_cli.analysis.groups import INACTIVE, METRICS
 from mavfi_cli.analysis.overhead import FlightOverhead
@@ -77,7 +77,7 @@ def _mean_cells(cell: Cell) -> list[str]:
     return [number(value, ".1f", unit=unit) for value, unit in units]
 
 
-def _comparison_table(settings: SettingColumns, found: Sequence[Comparison]) -> list[str]:
+def _comparison_table(settings: SettingColumns, found: Sequence[PairedComparison]) -> list[str]:
     """A line a comparison; without the columns in which none has a value."""
     head = ["pairs", "success, points", "p", "time, s", "worst over own golden",
             "worst over mean golden"]  # fmt: skip
@@ -90,7 +90,7 @@ def _comparison_table(settings: SettingColumns, found: Sequence[Comparison]) -> 
     return settings.table([head[place] for place in used], rows)
 
 
-def _comparison_cells(each: Comparison) -> list[str]:
+def _comparison_cells(each: PairedComparison) -> list[str]:
     """Success, time, and worst cases; that over the mean golden flight beside protection only."""
     test, time, mean = each.success, each.differences["flight_time_s"], each.over_mean
     return [
