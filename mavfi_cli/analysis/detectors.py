@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.stats.bootstrap import Interval, interval, interval_of_rows, median
 from mavfi_cli.stats.paired import McNemar, holm, mcnemar
 from mavfi_cli.stats.roc import curves
-from mavfi_cli.stats.shares import Mixture, Share, mixture, rate
+from mavfi_cli.stats.shares import Share, mixture, rate
 from mavfi_cli.stats.worst_case import worst_over_own
 
 RESAMPLES = 999
@@ -51,7 +51,7 @@ def found(
     """
     return {
         "error_free": [
-            {"by": by, "value": value, "detector": detector, **asdict(error_free_metrics(part))}
+            {"by": by, "value": value, "detector": detector, **error_free_metrics(part)}
             for by, value, detector, part in _grouped(detectors, error_free, (ALL, "world"))
         ],
         "faults": [
@@ -59,7 +59,7 @@ def found(
                 "by": by,
                 "value": value,
                 "detector": detector,
-                **asdict(fault_metrics(_part(faults, by, value, NONE), part)),
+                **fault_metrics(_part(faults, by, value, NONE), part),
             }
             for by, value, detector, part in _grouped(detectors, faults, GROUPS)
         ],
@@ -114,49 +114,32 @@ def _curves(harmful: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
 # Without faults -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorFreeMetrics:
+def error_free_metrics(pairs: pa.Table) -> dict[str, Any]:
     """A detector on flights without faults, against the same flights without it.
 
-    Attributes:
-        hours: of flight with the detector, from taking over to the end of the mission.
-        alarms, episodes: all alarms, and with those in a row as one.
-        alarms_per_hour: bootstrap over flights; with no alarm at all, a Poisson upper limit.
-        with_alarm: flights with at least one.
-        lost: golden successes that failed with the detector; gained: the other way round.
-        success: McNemar's test of the golden flights (first) against those with the detector.
-        lengthening: median of flight time over golden flight time, minus 1, of both successful.
+    Returns:
+        `hours`: of flight with the detector, from taking over to the end of the mission. `alarms`,
+        `episodes`: all alarms, and with those in a row as one. `alarms_per_hour`: bootstrap over
+        flights; with no alarm at all, a Poisson upper limit. `with_alarm`: flights with at least
+        one. `lost`: golden successes that failed with the detector; `gained`: the other way round.
+        `success`: McNemar's test, golden first. `lengthening`: median of flight time over golden
+        flight time, minus 1, of both successful.
     """
-
-    flights: int
-    hours: float
-    alarms: int
-    episodes: int
-    alarms_per_hour: Interval
-    with_alarm: Share
-    lost: Share
-    gained: int
-    success: McNemar
-    lengthening: Interval
-
-
-def error_free_metrics(pairs: pa.Table) -> ErrorFreeMetrics:
-    """Metrics of one detector on these flights."""
     alarms = numbers(pairs, "alarms")
     hours = np.nan_to_num(numbers(pairs, "time_s")) / 3600.0
     test = _ends(pairs, "golden_won")
-    return ErrorFreeMetrics(
-        flights=pairs.num_rows,
-        hours=math.fsum(hours.tolist()),
-        alarms=int(alarms.sum()),
-        episodes=int(numbers(pairs, "episodes").sum()),
-        alarms_per_hour=_rate_per_hour(alarms, hours),
-        with_alarm=rate(int(np.count_nonzero(alarms)), pairs.num_rows),
-        lost=rate(test.only_first, test.both + test.only_first),
-        gained=test.only_second,
-        success=test,
-        lengthening=_interval(known(numbers(pairs, "lengthening")), median),
-    )
+    return {
+        "flights": pairs.num_rows,
+        "hours": math.fsum(hours.tolist()),
+        "alarms": int(alarms.sum()),
+        "episodes": int(numbers(pairs, "episodes").sum()),
+        "alarms_per_hour": asdict(_rate_per_hour(alarms, hours)),
+        "with_alarm": asdict(rate(int(np.count_nonzero(alarms)), pairs.num_rows)),
+        "lost": asdict(rate(test.only_first, test.both + test.only_first)),
+        "gained": test.only_second,
+        "success": asdict(test),
+        "lengthening": asdict(_interval(known(numbers(pairs, "lengthening")), median)),
+    }
 
 
 def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
@@ -173,90 +156,30 @@ def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
 # With faults ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorstFlight:
-    """The worst successful flight time and its recovery, as in the paper's section VII-A.
-
-    The paper flies one world with one seed. Here every mission has a seed of its own, so every
-    flight is held against its own golden pair.
-
-    Attributes:
-        faulty, protected: the largest flight time over golden flight time, minus 1.
-        recovered: how much lower the second is, in parts of the golden flight time. Resampled
-            missions never hold a worse case than the worst that was seen, so the interval says
-            how much it hangs on single flights, not how bad it can become.
-        recovered_share: of the increase; not a number where no flight was LONGER.
-    """
-
-    faulty: float
-    protected: float
-    recovered: Interval
-    recovered_share: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FaultMetrics:
+def fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
     """A detector against faults.
-
-    Attributes:
-        planned: faults; of them not_injected, not_activated (nothing read what was struck) and
-            active. All that follows is about the active ones, where nothing else is said.
-        crashed: faults that killed a node: those are seen without any detector.
-        harmful: LOST, LONGER or OTHERWISE; their numbers follow.
-        flown: with this detector: all harmful faults, and the harmless ones of complete missions.
-        not_struck: of them those that never struck, because the protected flight had parted from
-            the other; in no rate of detection.
-        detected_harmful: with an alarm at or after the strike.
-        detected_active: the same of all faults of complete missions.
-        detected_inactive: the same of faults that were struck but not activated.
-        by_chance: flights of complete missions that have an alarm in that time without their
-            fault as well.
-        latency_s, latency_ticks: median and 95th percentile from strike to alarm, harmful faults.
-        recovered: of the lost missions those that succeed with protection.
-        undone: of the harmful faults those that do no harm with protection.
-        added: of the harmless faults those that do harm with protection.
-        golden, unprotected: success rates of all missions with an active fault.
-        protected: the same with the detector: harmful and harmless faults, each with its own
-            rate, weighted by how many there are.
-        success: McNemar's test on complete missions, unprotected first.
-        worst: flight time, of the faults that were flown with this detector.
-    """
-
-    planned: int
-    not_injected: int
-    not_activated: int
-    active: int
-    crashed: int
-    harmful: Share
-    lost: int
-    longer: int
-    otherwise: int
-    flown: int
-    not_struck: int
-    detected_harmful: Share
-    detected_active: Share
-    detected_inactive: Share
-    by_chance: Share
-    latency_s: Interval
-    latency_s_p95: Interval
-    latency_ticks: float
-    latency_ticks_p95: float
-    recovered: Share
-    undone: Share
-    added: Share
-    golden: Share
-    unprotected: Share
-    protected: Mixture
-    success: McNemar
-    worst: WorstFlight
-
-
-def fault_metrics(bare: pa.Table, pairs: pa.Table) -> FaultMetrics:
-    """Metrics of one detector on these faults.
 
     Args:
         bare: the faults without a detector, all of them.
         pairs: those that were flown with the detector.
+
+    Returns:
+        `planned`: faults; of them `not_injected`, `not_activated` (nothing read what was struck)
+        and `active`. All that follows is about the active ones, where nothing else is said.
+        `crashed`: faults that killed a node: those are seen without any detector. `harmful`: lost,
+        longer or otherwise; their numbers follow. `flown`: with this detector: all harmful faults,
+        and the harmless ones of complete missions. `not_struck`: of them those that never struck,
+        because the protected flight had parted from the other; in no rate of detection.
+        `detected_harmful`: with an alarm at or after the strike. `detected_active`: the same of all
+        faults of complete missions. `detected_inactive`: the same of faults that were struck but
+        not activated. `by_chance`: flights of complete missions that have an alarm in that time
+        without their fault as well. `latency_s`, `latency_ticks`: median and 95th percentile from
+        strike to alarm, harmful faults. `recovered`: of the lost missions those that succeed with
+        protection. `undone`: of the harmful faults those that do no harm with it. `added`: of the
+        harmless faults those that do harm with it. `golden`, `unprotected`: success rates of all
+        missions with an active fault. `protected`: the same with the detector: harmful and harmless
+        faults, each with its own rate, weighted by how many there are. `success`: McNemar's test on
+        complete missions, unprotected first. `worst`: as `_worst`, of the flown faults.
     """
     injected = bare.filter(pc.not_equal(bare["injected"], Injected.NOT_INJECTED.value))
     active = chosen(injected, active=True)
@@ -268,37 +191,40 @@ def fault_metrics(bare: pa.Table, pairs: pa.Table) -> FaultMetrics:
     harmless = chosen(complete, harm=Harm.NONE.value)
     latencies_s = known(numbers(harmful, "latency_s"))
     middle, late = _interval(latencies_s, median), _interval(latencies_s, _p95)
-    return FaultMetrics(
-        planned=bare.num_rows,
-        not_injected=bare.num_rows - injected.num_rows,
-        not_activated=injected.num_rows - active.num_rows,
-        active=active.num_rows,
-        crashed=int(flags(active, "crashed").sum()),
-        harmful=rate(harmful_count, active.num_rows),
-        lost=harms[Harm.LOST],
-        longer=harms[Harm.LONGER],
-        otherwise=harms[Harm.OTHERWISE],
-        flown=flown.num_rows,
-        not_struck=chosen(flown, struck=False).num_rows,
-        detected_harmful=_share(chosen(harmful, struck=True), "seen"),
-        detected_active=_share(chosen(complete, struck=True), "seen"),
-        detected_inactive=_share(chosen(pairs, active=False, complete=True, struck=True), "seen"),
-        by_chance=_share(chosen(complete, struck=True), "by_chance"),
-        latency_s=middle,
-        latency_s_p95=late,
-        latency_ticks=middle.value * TICKS_PER_S,
-        latency_ticks_p95=late.value * TICKS_PER_S,
-        recovered=_share(chosen(harmful, harm=Harm.LOST.value), "won"),
-        undone=_share(harmful, "undone"),
-        added=_share(harmless, "undone", wanted=False),
-        golden=_share(active, "golden_won"),
-        unprotected=_share(active, "faulty_won"),
-        protected=mixture(
-            [(harmful_count, _share(harmful, "won")), (harms[Harm.NONE], _share(harmless, "won"))]
-        ),
-        success=_ends(complete, "faulty_won"),
-        worst=_worst(flown),
+    protected = mixture(
+        [(harmful_count, _share(harmful, "won")), (harms[Harm.NONE], _share(harmless, "won"))]
     )
+    return {
+        "planned": bare.num_rows,
+        "not_injected": bare.num_rows - injected.num_rows,
+        "not_activated": injected.num_rows - active.num_rows,
+        "active": active.num_rows,
+        "crashed": int(flags(active, "crashed").sum()),
+        "harmful": asdict(rate(harmful_count, active.num_rows)),
+        **{harm.value: harms[harm] for harm in (Harm.LOST, Harm.LONGER, Harm.OTHERWISE)},
+        "flown": flown.num_rows,
+        "not_struck": chosen(flown, struck=False).num_rows,
+        "latency_s": asdict(middle),
+        "latency_s_p95": asdict(late),
+        "latency_ticks": middle.value * TICKS_PER_S,
+        "latency_ticks_p95": late.value * TICKS_PER_S,
+        **{name: asdict(share) for name, share in {
+            "detected_harmful": _share(chosen(harmful, struck=True), "seen"),
+            "detected_active": _share(chosen(complete, struck=True), "seen"),
+            "detected_inactive": _share(
+                chosen(pairs, active=False, complete=True, struck=True), "seen"
+            ),
+            "by_chance": _share(chosen(complete, struck=True), "by_chance"),
+            "recovered": _share(chosen(harmful, harm=Harm.LOST.value), "won"),
+            "undone": _share(harmful, "undone"),
+            "added": _share(harmless, "undone", wanted=False),
+            "golden": _share(active, "golden_won"),
+            "unprotected": _share(active, "faulty_won"),
+        }.items()},
+        "protected": asdict(protected),
+        "success": asdict(_ends(complete, "faulty_won")),
+        "worst": _worst(flown),
+    }  # fmt: skip
 
 
 def recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
@@ -323,17 +249,27 @@ def _ends(pairs: pa.Table, first: str) -> McNemar:
     return mcnemar(flags(pairs, first), flags(pairs, "won"))
 
 
-def _worst(pairs: pa.Table) -> WorstFlight:
+def _worst(pairs: pa.Table) -> dict[str, Any]:
+    """The worst successful flight time and its recovery, as in the paper's section VII-A.
+
+    The paper flies one world with one seed. Here every mission has a seed of its own, so every
+    flight is held against its own golden pair.
+
+    Returns:
+        `faulty`, `protected`: the largest flight time over golden flight time, minus 1.
+        `recovered`: how much lower the second is, in parts of the golden flight time. Resampled
+        missions never hold a worse case than the worst that was seen, so the interval says how much
+        it hangs on single flights, not how bad it can become. `recovered_share`: of the increase;
+        not a number where no flight was LONGER.
+    """
     # A flight that failed has no time: it is the longest of none.
     faulty, protected = (
         np.nan_to_num(numbers(pairs, name), nan=-math.inf)
         for name in ("faulty_lengthening", "lengthening")
     )
-    if not (np.isfinite(faulty).any() and np.isfinite(protected).any()):
-        nan = math.nan
-        nothing = Interval(value=nan, low=nan, high=nan, count=0)
-        return WorstFlight(faulty=nan, protected=nan, recovered=nothing, recovered_share=nan)
     usable = np.isfinite(faulty) | np.isfinite(protected)
+    if not (np.isfinite(faulty).any() and np.isfinite(protected).any()):
+        usable[:] = False
     faulty, protected = faulty[usable], protected[usable]
 
     def recovered(rows: IntArray) -> FloatArray:
@@ -343,12 +279,12 @@ def _worst(pairs: pa.Table) -> WorstFlight:
         return np.asarray(worst[0] - worst[1])
 
     worst = worst_over_own((1.0 + faulty).tolist(), (1.0 + protected).tolist())
-    return WorstFlight(
-        faulty=worst.increase,
-        protected=worst.protected_worst - 1.0,
-        recovered=interval_of_rows(len(faulty), recovered, resamples=RESAMPLES),
-        recovered_share=worst.recovered_share if worst.increase > LONGER else math.nan,
-    )
+    return {
+        "faulty": worst.increase,
+        "protected": worst.protected_worst - 1.0,
+        "recovered": asdict(interval_of_rows(len(faulty), recovered, resamples=RESAMPLES)),
+        "recovered_share": worst.recovered_share if worst.increase > LONGER else math.nan,
+    }
 
 
 def _p95(values: FloatArray) -> FloatArray:
