@@ -12,7 +12,7 @@ from mavfi_cli.analysis.flights import CONFIG, FAULT, flights
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_atomically
-from mavfi_cli.mission.record.columns import QUALITY, STRUCK
+from mavfi_cli.mission.record.measures import QUALITY, STRUCK
 
 FORMATS = (".parquet", ".csv")
 

@@ -20,7 +20,7 @@ from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaign.outcome import COUNTED, MissionResult, State
 from mavfi_cli.core.types import FloatArray, Outcome
-from mavfi_cli.mission.record.columns import columns_of
+from mavfi_cli.mission.record.measures import measures_of
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
 FAULT = ("target", "seed", "bits", "field")
@@ -31,7 +31,7 @@ IntArray = NDArray[np.int64]
 def flights(ledger: Ledger, missions: Iterable[PlannedMission] | None = None) -> pa.Table:
     """The missions that are over; those that could not begin have the state `error`.
 
-    Columns: what `mission.record.columns` tells of a record, of CONFIG and of the fault's FAULT
+    Columns: what `mission.record.measures` tells of a record, of CONFIG and of the fault's FAULT
     what was asked for, each label as `label_NAME` and all of them as text in `labels`; `succeeded`;
     and `counted`: golden, or with a fault that struck something that was read or caught.
 
@@ -57,7 +57,7 @@ def _names(labels: Sequence[str]) -> list[str]:
     own = ("number", "pair", "labels", *(f"label_{name}" for name in labels), *CONFIG, "level")
     asked = (*(f"fault_{name}" for name in FAULT), "detector", "protect", "changes")
     came = ("state", "outcome", "succeeded", "counted", "reason", "injected", "wall_s", "attempts")
-    return [*own, *asked, *came, "path", *columns_of({})]
+    return [*own, *asked, *came, "path", *measures_of({})]
 
 
 def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
         "wall_s": entry.wall_s,
         "attempts": entry.attempts,
         "path": None if entry.path is None else str(entry.path),
-        **columns_of(entry.result),
+        **measures_of(entry.result),
     }
 
 

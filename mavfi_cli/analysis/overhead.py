@@ -9,8 +9,9 @@ take as long as they took on the host.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -161,19 +162,6 @@ class ComputeOverhead:
             f"{HOST_CHECKS}"
         )
 
-    def plus(self, cost: DetectionCost, platform: str) -> ComputeOverhead:
-        """The same with one more flight."""
-        return replace(
-            self,
-            flights=self.flights + 1,
-            detection_s=self.detection_s + cost.checks_host_s,
-            recompute_s=self.recompute_s + cost.recovered_s,
-            compute_s=self.compute_s + cost.compute_s,
-            host_compute_s=self.host_compute_s + cost.host_compute_s,
-            alarms=self.alarms + round(math.fsum(cost.recomputations.values())),
-            platforms=tuple(sorted({*self.platforms, platform})),
-        )
-
 
 def compute_overheads(
     records: Iterable[Mapping[str, Any]], platform: str | None = None
@@ -186,22 +174,31 @@ def compute_overheads(
         records: result.json of flights.
         platform: only flights on this one count; None: all.
     """
-    found: dict[str, ComputeOverhead] = {}
-    left_out: dict[str, int] = {}
+    counted: dict[str, list[DetectionCost]] = {}
+    left_out: Counter[str] = Counter()
     names: dict[str, str] = {}  # of platforms, by what missions call them
     for cost in filter(None, map(detection_cost, records)):
         if cost.faulty or cost.compute_s <= cost.recovered_s or cost.host_compute_s <= 0.0:
             continue
         name = names.setdefault(cost.platform, _platform_name(cost.platform))
-        if platform is not None and not _same(name, platform):
-            left_out[cost.detector] = left_out.get(cost.detector, 0) + 1
-            continue
-        none = ComputeOverhead(
-            detector=cost.detector, flights=0, detection_s=0.0, recompute_s=0.0, compute_s=0.0,
-            host_compute_s=0.0, alarms=0, platforms=(),
-        )  # fmt: skip
-        found[cost.detector] = found.get(cost.detector, none).plus(cost, name)
-    return {name: replace(each, left_out=left_out.get(name, 0)) for name, each in found.items()}
+        if platform is None or _same(name, platform):
+            counted.setdefault(cost.detector, []).append(cost)
+        else:
+            left_out[cost.detector] += 1
+    return {
+        detector: ComputeOverhead(
+            detector=detector,
+            flights=len(costs),
+            detection_s=sum(cost.checks_host_s for cost in costs),
+            recompute_s=sum(cost.recovered_s for cost in costs),
+            compute_s=sum(cost.compute_s for cost in costs),
+            host_compute_s=sum(cost.host_compute_s for cost in costs),
+            alarms=sum(round(math.fsum(cost.recomputations.values())) for cost in costs),
+            platforms=tuple(sorted({names[cost.platform] for cost in costs})),
+            left_out=left_out[detector],
+        )
+        for detector, costs in counted.items()
+    }
 
 
 def _platform_name(called: str) -> str:

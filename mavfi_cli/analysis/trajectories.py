@@ -14,7 +14,7 @@ from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.campaign.outcome import COUNTED, Injected, MissionResult, State
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.mission.record.columns import columns_of
+from mavfi_cli.mission.record.measures import fields_of
 from mavfi_cli.mission.record.run_folder import RESULT
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
@@ -198,7 +198,7 @@ def _panel(title: str, flown: Sequence[MissionResult]) -> DrawnPanel:
                 number=each.number,
                 name=name if often[name] == 1 else f"{name} {_treatment(each)}".rstrip(),
                 outcome=each.outcome,
-                flight_time_s=columns_of(each.result)["flight_time_s"],
+                flight_time_s=fields_of(each.result)["flight_time_s"],
                 path=each.path,
             )
             for name, each in zip(short, ordered, strict=True)

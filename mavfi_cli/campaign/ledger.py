@@ -25,7 +25,7 @@ from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, c
 from mavfi_cli.campaign.outcome import Injected, MissionResult, State
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import plain
-from mavfi_cli.mission.record.columns import columns_of
+from mavfi_cli.mission.record.measures import fields_of
 
 SCHEMA = 1
 LEDGER, LOCK, RUNS = "ledger.sqlite", "ledger.lock", "runs"
@@ -265,7 +265,7 @@ class Ledger:
         Raises:
             RecordError: the disk is full, or something else kept it from being written.
         """
-        columns = columns_of(result)
+        columns = fields_of(result)
         row = (
             number,
             state.value,

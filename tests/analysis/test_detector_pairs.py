@@ -6,7 +6,7 @@ from evaluation_flights import flown, pair, struck
 
 from mavfi_cli.analysis.detector_pairs import WANTED, Harm, harm_of, pairs_of
 from mavfi_cli.campaign.outcome import Injected
-from mavfi_cli.mission.record.columns import columns_of
+from mavfi_cli.mission.record.measures import measures_of
 
 GOLDEN = {"kind": "error-free", "world": "farm", "seed": 7}
 FAULT = {
@@ -94,7 +94,7 @@ def test_pairs_need_all_of_their_flights():
 
 
 def record(fault, **result):
-    return columns_of({"quality_of_flight": {"flight_time_s": 12.0}, "fault": fault, **result})
+    return measures_of({"quality_of_flight": {"flight_time_s": 12.0}, "fault": fault, **result})
 
 
 def test_a_record_of_a_source_level_fault():
@@ -129,5 +129,5 @@ def test_a_record_of_an_instruction_level_fault():
 
 
 def test_a_record_of_a_mission_that_was_cut_off_has_empty_columns():
-    read = columns_of({})
+    read = measures_of({})
     assert not any(value for value in read.values())

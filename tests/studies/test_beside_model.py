@@ -10,7 +10,7 @@ import pytest
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.platform import load_platform
-from mavfi_cli.mission.record.columns import columns_of
+from mavfi_cli.mission.record.measures import measures_of
 from mavfi_cli.report.flight_plot import draw_flight_plot, write_flight_plot
 from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
 from mavfi_cli.studies.beside_model import Beside, side_by_side
@@ -53,7 +53,7 @@ def flights_of(records):
                 "seed": seed,
                 "outcome": record["outcome"],
                 "succeeded": record["outcome"] == "success",
-                **columns_of(record),
+                **measures_of(record),
             }
             for seed, record in enumerate(records)
         ]

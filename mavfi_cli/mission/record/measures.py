@@ -1,8 +1,9 @@
-"""A flight as columns: the one place where whoever counts flights reads a result.json.
+"""The measures of a flight: the one place where whoever counts flights reads a result.json.
 
-A mission that crashed or hung before it could write its record has few fields; a column that its
-record does not have is None. A source-level fault that struck several components has them joined
-by ";", in one order in all columns; of several strikes the columns have the first.
+Each is a column of a table of flights. A mission that crashed or hung before it could write its
+record has few fields; a measure that its record does not have is None. A source-level fault that
+struck several components has them joined by ";", in one order in all measures; of several strikes
+the measures have the first.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ STRUCK = (*_BOTH, *_SOURCE, *_INSTRUCTION)
 _FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits of their bits
 
 
-def columns_of(record: Record) -> dict[str, Any]:
-    """The columns of a mission.
+def measures_of(record: Record) -> dict[str, Any]:
+    """All measures of a mission.
 
     Beside those that are fields of the record: `straight_m`, from the take-off point to the edge of
     the goal's tolerance; `crashed`, whether a node died; `struck_s`, `struck_sites` and
@@ -56,13 +57,18 @@ def columns_of(record: Record) -> dict[str, Any]:
     """
     nodes: Record = record.get("nodes") or {}
     return {
-        **{name: _at(record, *place) for name, place in _PLACES.items()},
+        **fields_of(record),
         "straight_m": _straight_m(record),
-        "crashed": any(node["crashes"] for node in nodes.values()),
+        "crashed": any(node.get("crashes") for node in nodes.values()),
         **_alarms(record.get("detection") or {}),
         **_applied(record.get("fault") or {}),
         **struck(record),
     }
+
+
+def fields_of(record: Record) -> dict[str, Any]:
+    """The measures that are fields of a record."""
+    return {name: _at(record, *place) for name, place in _PLACES.items()}
 
 
 def _at(record: Record, *place: str) -> Any:
@@ -103,7 +109,7 @@ def _applied(fault: Record) -> dict[str, Any]:
             "first_bits": list(strikes[0]["changes"][0]["bits"]) if strikes else [],
         }
     return {
-        "struck_s": fault["stamp_s"] if applied else None,
+        "struck_s": fault.get("stamp_s") if applied else None,
         "struck_sites": [fault["node"]] if "node" in fault else [],
         "first_bits": list((fault.get("corruption") or {}).get("bits", ())),
     }

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.mission.record.columns import STRUCK, struck
+from mavfi_cli.mission.record.measures import STRUCK, struck
 
 STRIKE = {
     "changes": [
