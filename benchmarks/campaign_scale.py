@@ -143,7 +143,7 @@ def _missing(folder: Path) -> None:
 
 def _summarise(folder: Path) -> None:
     with Ledger(folder) as ledger:
-        assert len(summarise(ledger).cells) == CELLS
+        assert len(summarise(ledger)["cells"]) == CELLS
 
 
 def main() -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,36 +11,11 @@ import numpy as np
 from mavfi_cli.analysis.flights import BoolArray, IntArray, known
 from mavfi_cli.analysis.groups import METRICS, Group, matched, untreated
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.stats.bootstrap import Interval, interval
-from mavfi_cli.stats.paired import McNemar, holm, mcnemar
+from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.paired import holm, mcnemar
 from mavfi_cli.stats.worst_case import WorstCase, worst_case, worst_over_own
 
 RESAMPLES = 1999
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairedComparison:
-    """Two settings over the missions that both flew.
-
-    Attributes:
-        first, second: their labels; the first is golden, or faulty where the second is protected.
-        name: of the second in one phrase.
-        corrected_p: of the family of all comparisons of this kind, by Holm.
-        differences: second minus first, over the pairs in which both succeeded.
-        over_own: the largest flight time over that of the golden flight of the same mission, both
-            successful; with what protection recovers of it.
-        over_mean: the longest of the same flights over the mean of the same golden ones, as the
-            paper has it.
-    """
-
-    first: Mapping[str, Any]
-    second: Mapping[str, Any]
-    name: str
-    success: McNemar
-    corrected_p: float
-    differences: Mapping[str, Interval]
-    over_own: WorstCase
-    over_mean: WorstCase
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +77,17 @@ class _Match:
         return found
 
 
-def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[PairedComparison]:
-    """Every setting with faults against the golden one with which it shares most pairs."""
+def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+    """Every setting with faults against the golden one with which it shares most pairs.
+
+    Returns:
+        Plain values, over the missions that both flew. `first`, `second`: labels of the golden
+        setting, and of the other; `name`: of that in one phrase. `corrected_p`: of the family of
+        all comparisons of this kind, by Holm. `differences`: second minus first, over the pairs in
+        which both succeeded. `over_own`: the largest flight time over that of the golden flight of
+        the same mission, both successful. `over_mean`: the longest of the same flights over the
+        mean of the same golden ones, as the paper has it.
+    """
     found = []
     for group in groups:
         golden = _golden_for(group, groups)
@@ -112,8 +96,12 @@ def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[Pa
     return _compared(found, confidence)
 
 
-def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[PairedComparison]:
-    """Every protected setting against the unprotected one with the same faults."""
+def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+    """Every protected setting against the unprotected one with the same faults.
+
+    Returns:
+        As `against_golden`; the worst cases with what protection recovers of them.
+    """
     bare = {
         untreated(group.labels): group for group in groups if not (group.watched or group.golden)
     }
@@ -140,28 +128,28 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     return groups[-most[1]] if most[0] else None
 
 
-def _compared(matches: Sequence[_Match], confidence: float) -> list[PairedComparison]:
+def _compared(matches: Sequence[_Match], confidence: float) -> list[dict[str, Any]]:
     matches = [each for each in matches if len(each.at_second)]
     tests = [mcnemar(*each.success) for each in matches]
     corrected = holm([test.p_value for test in tests])
-    found = []
-    for each, test, p in zip(matches, tests, corrected, strict=True):
+    rows = []
+    for each, test, p_value in zip(matches, tests, corrected, strict=True):
         over_own, over_mean = each.worst()
-        found.append(
-            PairedComparison(
-                first=each.first.labels,
-                second=each.second.labels,
-                name=each.second.name,
-                success=test,
-                corrected_p=p,
-                differences={
-                    name: interval(
-                        each.differences(name), confidence=confidence, resamples=RESAMPLES
+        rows.append(
+            {
+                "first": each.first.labels,
+                "second": each.second.labels,
+                "name": each.second.name,
+                "success": asdict(test),
+                "corrected_p": p_value,
+                "differences": {
+                    name: asdict(
+                        interval(each.differences(name), confidence=confidence, resamples=RESAMPLES)
                     )
                     for name in METRICS
                 },
-                over_own=over_own,
-                over_mean=over_mean,
-            )
+                "over_own": asdict(over_own),
+                "over_mean": asdict(over_mean),
+            }
         )
-    return found
+    return rows

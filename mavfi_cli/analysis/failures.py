@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,32 +21,12 @@ from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import COUNTED, Injected
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.stats.layers import CrossLayer, cross_layer, failures_per_hour
-from mavfi_cli.stats.shares import Share, rate
+from mavfi_cli.stats.layers import cross_layer, failures_per_hour
+from mavfi_cli.stats.shares import rate
 
 KERNELS = "kernels.json"  # what `mavfi kernels --out` leaves
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 Runs = Mapping[str, tuple[int, int]]  # kernel -> silent corruptions, injected faults
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Failures:
-    """One setting with faults.
-
-    Attributes:
-        name: its labels in one phrase.
-        failure: injected faults that fail a mission, of those whose golden flight succeeds.
-        kernel: that all of its faults strike at instruction level; None where there are several.
-        layers: its own corruption beside that; None without runs of the kernel by itself.
-        per_hour: failures a flight hour, with the ends of the interval; None where not asked for.
-    """
-
-    labels: Mapping[str, Any]
-    name: str
-    failure: Share
-    kernel: str | None
-    layers: CrossLayer | None
-    per_hour: tuple[float, float, float] | None
 
 
 def failures(
@@ -55,13 +35,20 @@ def failures(
     kernels: Path | None = None,
     upsets_per_hour: float | None = None,
     confidence: float = 0.95,
-) -> list[Failures]:
+) -> list[dict[str, Any]]:
     """Every setting with faults that has golden flights beside it.
 
     Args:
         found: the settings of the ledger.
         kernels: folder of `mavfi kernels --out`.
         upsets_per_hour: bit flips that reach what is attacked in an hour of flight.
+
+    Returns:
+        Plain values. `name`: of the setting in one phrase. `failure`: injected faults that fail a
+        mission, of those whose golden flight succeeds. `kernel`: that all of its faults strike at
+        instruction level; None where there are several. `layers`: its own corruption beside that;
+        None without runs of the kernel by itself. `per_hour`: failures a flight hour, with the
+        ends of the interval; None where not asked for.
 
     Raises:
         RecordError: no such folder, or what is in it cannot be read.
@@ -85,17 +72,16 @@ def failures(
         if alone is not None and kernel is not None and kernel in alone.runs:
             alone.require(configs[0])
             layers = cross_layer(*alone.runs[kernel], failed, struck, confidence)
+        hourly = None if upsets_per_hour is None else failures_per_hour(upsets_per_hour, failure)
         rows.append(
-            Failures(
-                labels=group.labels,
-                name=group.name,
-                failure=failure,
-                kernel=kernel,
-                layers=layers,
-                per_hour=None
-                if upsets_per_hour is None
-                else failures_per_hour(upsets_per_hour, failure),
-            )
+            {
+                "labels": group.labels,
+                "name": group.name,
+                "failure": asdict(failure),
+                "kernel": kernel,
+                "layers": None if layers is None else asdict(layers),
+                "per_hour": hourly,
+            }
         )
     return rows
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, detection_cost
 from mavfi_cli.mission.record.run_folder import RESULT, load_run
-from mavfi_cli.stats.bootstrap import Interval, interval
+from mavfi_cli.stats.bootstrap import interval
 
 MEASURED = "measured"  # how the source of a measured overhead begins
 TIMES = " x "  # between a platform's name and the one factor on its latencies, in a file's name
@@ -36,41 +36,22 @@ _LEDGERS = (LEDGER, f"protected/*/{LEDGER}", f"flights/{LEDGER}")
 # Of the flight time ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlightOverhead:
-    """One detector in one setting. Shares are of the flight time: 0.01 is one per cent.
-
-    Attributes:
-        labels: of the setting, with the detector.
-        flights: in which it checked anything.
-        checks_per_s: of flight time.
-        check_host_s: mean time of a check on the host that flew.
-        detection_host_share: all checks, time of the host that flew.
-        recomputations: in all flights, by stage.
-        recovery_share: simulated latency of what was computed again, by stage.
-        recovery_share_in_all: of all stages.
-        share_in_all: detection and recovery, host time and simulated time added up as the paper
-            does.
-    """
-
-    labels: Mapping[str, Any]
-    flights: int
-    checks_per_s: Interval
-    check_host_s: Interval
-    detection_host_share: Interval
-    recomputations: Mapping[str, float]
-    recovery_share: Mapping[str, Interval]
-    recovery_share_in_all: Interval
-    share_in_all: Interval
-
-
 def flight_overheads(
     ledger: Ledger, found: Sequence[Group], confidence: float = 0.95
-) -> list[FlightOverhead]:
+) -> list[dict[str, Any]]:
     """Every setting with a detector; a setting that gathers several has a row for each.
 
     Args:
         found: the settings of the ledger.
+
+    Returns:
+        Plain values; shares are of the flight time: 0.01 is one per cent. `labels`: of the
+        setting, with the detector. `flights`: in which it checked anything. `checks_per_s`: of
+        flight time. `check_host_s`: mean time of a check on the host that flew.
+        `detection_host_share`: all checks, time of the host that flew. `recomputations`: in all
+        flights, by stage. `recovery_share`: simulated latency of what was computed again, by stage;
+        `recovery_share_in_all`: of all stages. `share_in_all`: detection and recovery, host time
+        and simulated time added up as the paper does.
     """
     rows = []
     for group in found:
@@ -85,27 +66,27 @@ def flight_overheads(
 
 def _of_setting(
     labels: Mapping[str, Any], costs: Sequence[DetectionCost], confidence: float
-) -> FlightOverhead:
-    def mean(measure: Callable[[DetectionCost], float]) -> Interval:
+) -> dict[str, Any]:
+    def mean(values: Iterable[float]) -> dict[str, Any]:
         """Over the flights, with its interval."""
-        return interval([*map(measure, costs)], confidence=confidence, resamples=RESAMPLES)
+        return asdict(interval([*values], confidence=confidence, resamples=RESAMPLES))
 
-    return FlightOverhead(
-        labels={**labels, "detector": costs[0].detector},
-        flights=len(costs),
-        checks_per_s=mean(lambda cost: cost.checks / cost.flight_s),
-        check_host_s=mean(lambda cost: cost.check_host_s),
-        detection_host_share=mean(lambda cost: cost.detection_share),
-        recomputations={
+    return {
+        "labels": {**labels, "detector": costs[0].detector},
+        "flights": len(costs),
+        "checks_per_s": mean(cost.checks / cost.flight_s for cost in costs),
+        "check_host_s": mean(cost.check_host_s for cost in costs),
+        "detection_host_share": mean(cost.detection_share for cost in costs),
+        "recomputations": {
             stage: math.fsum(cost.recomputations[stage] for cost in costs) for stage in _STAGES
         },
-        recovery_share={
-            stage: mean(lambda cost, stage=stage: cost.recovery_s[stage] / cost.flight_s)  # type: ignore[misc]
+        "recovery_share": {
+            stage: mean(cost.recovery_s[stage] / cost.flight_s for cost in costs)
             for stage in _STAGES
         },
-        recovery_share_in_all=mean(lambda cost: cost.recovery_share),
-        share_in_all=mean(lambda cost: cost.detection_share + cost.recovery_share),
-    )
+        "recovery_share_in_all": mean(cost.recovery_share for cost in costs),
+        "share_in_all": mean(cost.detection_share + cost.recovery_share for cost in costs),
+    }
 
 
 # Of the kernels' time -------------------------------------------------------------------------

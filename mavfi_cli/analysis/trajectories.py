@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.groups import TREATMENT, untreated
@@ -20,55 +18,19 @@ from mavfi_cli.mission.record.run_folder import RESULT
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnFlight:
-    """One flight of the picture.
-
-    Attributes:
-        number: of the mission.
-        name: of its setting, as short as tells it from the others beside it.
-        flight_time_s: None where the record has none.
-        path: of its run folder.
-    """
-
-    number: int
-    name: str
-    outcome: str | None
-    flight_time_s: float | None
-    path: Path
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnPanel:
-    """The flights of one fault, golden ones first, protected ones last.
-
-    Attributes:
-        title: what is struck; empty where the flights are golden.
-    """
-
-    title: str
-    flights: Sequence[DrawnFlight]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnPair:
-    """All flights of a pair, and which of its missions have none.
-
-    Attributes:
-        absent: what is not in the picture, and why, a line each.
-    """
-
-    panels: Sequence[DrawnPanel]
-    absent: Sequence[str]
-
-
-def pair(ledger: Ledger, number: int | None = None) -> DrawnPair:
+def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
     """The flights that share world, start and noise with a mission, panel by panel.
 
     Args:
         number: of the mission; None: of the pair, among those whose run folders are all kept, in
             which a fault prolongs a flight most without failing it, by its share of the golden
             flight time; the first of the list where none does.
+
+    Returns:
+        `panels`: a row a fault with its `title`, what is struck, empty of golden flights; and its
+        `flights`, golden ones first, protected ones last: `number` of the mission, `name` of its
+        setting, as short as tells it from the others beside it, `outcome`, `flight_time_s`, and the
+        `path` of its run folder. `absent`: what is not in the picture, and why, a line each.
 
     Raises:
         ConfigError: the list has no such mission.
@@ -91,20 +53,16 @@ def pair(ledger: Ledger, number: int | None = None) -> DrawnPair:
     if not whole:
         raise RecordError(f"{ledger.folder}: {_told(mine)} left no record to draw")
     missing = sorted(set(mine) - {each.number for each in over})
-    return DrawnPair(
-        panels=_panels(whole),
-        absent=[
-            f"mission {each.number} could not begin: {each.reason}"
-            for each in over
-            if each.state is State.ERROR
-        ]
-        + [
-            f"mission {each.number}: {each.outcome}, cut off before its record"
-            for each in flown
-            if _cut_off(each)
-        ]
-        + ([f"{_told(missing)} not flown yet"] if missing else []),
-    )
+    errors = [each for each in over if each.state is State.ERROR]
+    return {
+        "panels": _panels(whole),
+        "absent": [
+            *(f"mission {each.number} could not begin: {each.reason}" for each in errors),
+            *(f"mission {each.number}: {each.outcome}, cut off before its record"
+              for each in flown if _cut_off(each)),
+            *([f"{_told(missing)} not flown yet"] if missing else []),
+        ],
+    }  # fmt: skip
 
 
 def _cut_off(each: MissionResult) -> bool:
@@ -145,7 +103,7 @@ def _most_prolonged(ledger: Ledger) -> int:
     return first[max(complete, key=lambda name: (increase.get(name, 0.0), -first[name]))]
 
 
-def _panels(flown: Sequence[MissionResult]) -> list[DrawnPanel]:
+def _panels(flown: Sequence[MissionResult]) -> list[dict[str, Any]]:
     golden = [each for each in flown if each.injected is Injected.GOLDEN]
     struck: dict[str, list[MissionResult]] = {}
     for each in flown:
@@ -180,7 +138,7 @@ def _common(labels: Sequence[Mapping[str, Any]]) -> set[str]:
     }
 
 
-def _panel(title: str, flown: Sequence[MissionResult]) -> DrawnPanel:
+def _panel(title: str, flown: Sequence[MissionResult]) -> dict[str, Any]:
     ordered = sorted(
         flown,
         key=lambda each: (
@@ -191,20 +149,20 @@ def _panel(title: str, flown: Sequence[MissionResult]) -> DrawnPanel:
     )
     short = [_setting(each) for each in ordered]
     often = Counter(short)
-    return DrawnPanel(
-        title=title,
-        flights=[
-            DrawnFlight(
-                number=each.number,
-                name=name if often[name] == 1 else f"{name} {_treatment(each)}".rstrip(),
-                outcome=each.outcome,
-                flight_time_s=fields_of(each.result)["flight_time_s"],
-                path=each.path,
-            )
+    return {
+        "title": title,
+        "flights": [
+            {
+                "number": each.number,
+                "name": name if often[name] == 1 else f"{name} {_treatment(each)}".rstrip(),
+                "outcome": each.outcome,
+                "flight_time_s": fields_of(each.result)["flight_time_s"],
+                "path": each.path,
+            }
             for name, each in zip(short, ordered, strict=True)
             if each.path is not None
         ],
-    )
+    }
 
 
 def _setting(each: MissionResult) -> str:

@@ -153,8 +153,6 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 
     From the run folders that were kept, all settings of the pair; a panel for each fault.
     """
-    from dataclasses import asdict
-
     from mavfi_cli.analysis.trajectories import pair
     from mavfi_cli.campaign.begin import folder_of
     from mavfi_cli.campaign.ledger import Ledger
@@ -166,16 +164,17 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         chosen = pair(ledger, number)
     panels = [
         Panel(
-            title=panel.title, flights=[(each.name, load_run(each.path)) for each in panel.flights]
+            title=panel["title"],
+            flights=[(each["name"], load_run(each["path"])) for each in panel["flights"]],
         )
-        for panel in chosen.panels
+        for panel in chosen["panels"]
     ]
     write_trajectories(panels, output)
     if as_json:
-        told = {**asdict(chosen), "picture": output}
+        told = {**chosen, "picture": output}
         click.echo(json.dumps(plain(told), indent=2, default=str))
     else:
-        absent = [f"not in the picture: {text}" for text in chosen.absent]
+        absent = [f"not in the picture: {text}" for text in chosen["absent"]]
         click.echo("\n".join([*lines(panels), *absent, f"Picture  {output}"]))
 
 
@@ -286,8 +285,8 @@ def _show(
 
     summary = summarise(ledger, by or [], confidence)
     ended, worlds = stopped(ledger), fixed_world(ledger)
-    told = {**summary.to_dict(), "stopped": ended}
-    lines = [f"{summary.name}: {summary.over} of {summary.missions} missions"]
+    told = {**summary, "stopped": ended}
+    lines = [f"{summary['name']}: {summary['over']} of {summary['missions']} missions"]
     if worlds is not None:
         told["fixed_world"] = asdict(worlds)
         lines.append(worlds.told())
@@ -307,8 +306,6 @@ def _add_more(
     lines: list[str],
 ) -> None:
     """What --quality, --overhead and --failures ask for, as plain values and as text."""
-    from dataclasses import asdict
-
     from mavfi_cli.analysis.failures import failures
     from mavfi_cli.analysis.groups import groups
     from mavfi_cli.analysis.overhead import flight_overheads
@@ -320,14 +317,14 @@ def _add_more(
     found = groups(ledger, by)
     if more["quality"]:
         quality = qualities(found, confidence)
-        told["quality"] = [asdict(each) for each in quality]
+        told["quality"] = quality
         lines += text.quality_lines(quality, confidence)
     if more["overhead"]:
         overheads = flight_overheads(ledger, found, confidence)
-        told["overhead"] = [asdict(each) for each in overheads]
+        told["overhead"] = overheads
         lines += text.overhead_lines(overheads, confidence)
     if more["failures"]:
         rows = failures(ledger, found, more["kernels"], more["upsets"], confidence)
-        told["failures"] = [asdict(each) for each in rows]
+        told["failures"] = rows
         lines += ["", "injected faults that fail missions which succeed without:"]
         lines += text.failure_lines(rows)

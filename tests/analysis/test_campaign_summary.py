@@ -5,6 +5,7 @@ import math
 import re
 
 import pytest
+from plain_values import named
 
 from mavfi_cli.analysis.comparison import against_golden, protection
 from mavfi_cli.analysis.failures import failures
@@ -39,7 +40,7 @@ def test_faults_that_did_nothing_are_counted_apart(book):
     for seed, injected in enumerate(fates):
         outcome = "collision" if injected is ACTIVE else "success"
         book.add(FI, seed, 20.0 + seed, injected=injected, outcome=outcome)
-    (cell,) = summarise(book.ledger).cells
+    (cell,) = named(summarise(book.ledger)).cells
     assert (cell.success.count, cell.success.total) == (2, 3)
     assert (cell.inactive.count, cell.inactive.total) == (3, 3)
     assert (cell.every.count, cell.every.total) == (5, 6)
@@ -62,13 +63,13 @@ def test_errors_are_counted_nowhere_else(book):
         30, state=State.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
         attempts=1, path=None,
     )  # fmt: skip
-    golden = summarise(book.ledger).cells[0]
+    golden = named(summarise(book.ledger)).cells[0]
     assert (golden.planned, golden.errors, golden.every.total) == (11, 1, 10)
 
 
 def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
     fill(book)
-    faulty, saved = against_golden(groups(book.ledger))
+    faulty, saved = named(against_golden(groups(book.ledger)))
     assert (faulty.first, faulty.second) == ({"setting": "golden"}, FI)
     assert (faulty.success.pairs, faulty.success.only_first) == (10, 3)
     assert faulty.success.difference == pytest.approx(-0.3)
@@ -84,7 +85,7 @@ def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
 
 def test_protection_is_held_against_the_same_faults_without_it(book):
     fill(book)
-    (saved,) = protection(groups(book.ledger))
+    (saved,) = named(protection(groups(book.ledger)))
     assert (saved.first, saved.second) == (FI, SAVED)
     assert (saved.success.only_second, saved.success.neither) == (2, 1)
     assert saved.differences["flight_time_s"].value == pytest.approx(-8.0)
@@ -100,7 +101,7 @@ def test_the_worst_case_is_no_missions_own_length(book):
         book.add({"setting": "golden"}, seed, time_s, injected=GOLDEN)
         book.add(FI, seed, time_s)
     book.add({"setting": "golden"}, 2, 100.0, injected=GOLDEN)
-    (faulty,) = against_golden(groups(book.ledger))
+    (faulty,) = named(against_golden(groups(book.ledger)))
     assert faulty.over_own.increase == 0.0
     assert faulty.over_mean.golden == 20.0
     told = summary_lines(summarise(book.ledger))
@@ -120,7 +121,7 @@ def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
     book.add({"setting": "golden"}, 3, 20.0, injected=GOLDEN)
     book.add(FI, 3, 20.0, outcome="collision")  # a flight of its protection is still a pair
     book.add(SAVED, 3, 26.0)
-    (saved,) = protection(groups(book.ledger))
+    (saved,) = named(protection(groups(book.ledger)))
     assert saved.over_own.increase == pytest.approx(1.0)
     assert saved.over_own.protected_worst == pytest.approx(1.3)
     assert saved.over_own.recovered_share == pytest.approx(0.7)
@@ -134,10 +135,10 @@ def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
 
 def test_a_group_without_what_it_is_gathered_by_is_named(book):
     fill(book)
-    names = [cell.name for cell in summarise(book.ledger, ["stage"]).cells]
+    names = [cell.name for cell in named(summarise(book.ledger, ["stage"])).cells]
     assert names == ["golden", "stage=control"]
-    assert summarise(book.ledger, ["detector"]).cells[0].name == "no detector"
-    assert summarise(book.ledger, ["setting", "stage"]).cells[0].name == "setting=golden"
+    assert named(summarise(book.ledger, ["detector"])).cells[0].name == "no detector"
+    assert named(summarise(book.ledger, ["setting", "stage"])).cells[0].name == "setting=golden"
     assert summary_lines(summarise(book.ledger, ["stage"]))[1].startswith("golden ")
 
 
@@ -183,7 +184,7 @@ def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothi
             fate = Injected.NOT_INJECTED if idle else ACTIVE
             book.add({"setting": "FI", "stage": stage}, seed, time_s, injected=fate)
             book.add({"setting": "D&R", "stage": stage, "detector": "gad"}, seed, time_s)
-    (saved,) = protection(groups(book.ledger, ["setting"]))
+    (saved,) = named(protection(groups(book.ledger, ["setting"])))
     assert (saved.first, saved.second) == ({"setting": "FI"}, {"setting": "D&R"})
     assert saved.success.pairs == 9
     time = saved.differences["flight_time_s"]
@@ -195,7 +196,7 @@ def test_the_detector_none_watches_nothing(book):
     for seed in range(4):
         book.add({"kind": "golden", "detector": "none"}, seed, 20.0, injected=GOLDEN)
         book.add({"kind": "fault", "detector": "none"}, seed, 22.0)
-    (faulty,) = against_golden(groups(book.ledger))
+    (faulty,) = named(against_golden(groups(book.ledger)))
     assert faulty.success.pairs == 4
 
 
@@ -204,7 +205,7 @@ def test_settings_are_gathered_by_labels(book):
         book.add({"setting": "FI", "stage": "planning", "world": "farm"}, seed, 20.0)
         book.add({"setting": "FI", "stage": "control", "world": "farm"}, seed, 21.0)
         book.add({"setting": "FI", "stage": "control", "world": "dense"}, seed, 22.0)
-    cells = summarise(book.ledger, ["setting", "world"]).cells
+    cells = named(summarise(book.ledger, ["setting", "world"])).cells
     assert [(cell.labels["world"], cell.success.total) for cell in cells] == [
         ("farm", 8), ("dense", 4),
     ]  # fmt: skip
@@ -227,7 +228,7 @@ def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
     assert "7/10" in text
     assert "collision 3" in text
     assert "recovered 40.0 points, 72.7 %" in text
-    assert json.loads(json.dumps(plain(summary.to_dict()), allow_nan=False))["missing"] == 0
+    assert json.loads(json.dumps(plain(summary), allow_nan=False))["missing"] == 0
 
 
 def test_a_campaign_that_has_just_begun_has_a_table(book):
@@ -237,7 +238,7 @@ def test_a_campaign_that_has_just_begun_has_a_table(book):
 
 def test_quality_has_intervals_and_extremes_of_every_metric(book):
     fill(book)
-    found = qualities(groups(book.ledger))
+    found = named(qualities(groups(book.ledger)))
     assert [each.metric for each in found[::3]] == [*METRICS]
     golden, faulty, _ = found[:3]
     assert (golden.mean.value, golden.difference) == (20.0, None)
@@ -253,7 +254,7 @@ def test_quality_has_intervals_and_extremes_of_every_metric(book):
 
 def test_quality_without_a_success_is_no_number(book):
     book.add(FI, 1, 30.0, outcome="collision")
-    found = qualities(groups(book.ledger))
+    found = named(qualities(groups(book.ledger)))
     assert all(math.isnan(each.most) for each in found)
     assert quality_lines(found)[3].split()[-5:] == ["0", "-", "-", "-", "-"]
 
@@ -268,7 +269,7 @@ def test_failures_are_of_missions_that_succeed_without_the_fault(book):
         book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN, outcome=golden)
         outcome = "collision" if injected is ACTIVE else "success"
         book.add(FI, seed, 20.0, injected=injected, outcome=outcome)
-    faulty, saved = failures(book.ledger, groups(book.ledger), upsets_per_hour=2.0)
+    faulty, saved = named(failures(book.ledger, groups(book.ledger), upsets_per_hour=2.0))
     assert (faulty.labels, faulty.failure.count, faulty.failure.total) == (FI, 3, 11)
     assert (saved.failure.count, saved.failure.total) == (1, 10)
     assert faulty.per_hour == pytest.approx((6 / 11, 2 * faulty.failure.low,
@@ -301,7 +302,7 @@ def kernels_folder(tmp_path, **changes):
 
 def test_failure_given_a_kernels_corruption(book, tmp_path):
     native(book, range(10))
-    (row,) = failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
+    (row,) = named(failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path)))
     assert row.kernel == "octomap"
     assert row.layers.corruption.share == 0.8
     assert row.layers.failure_given_corruption[0] == pytest.approx(0.5 / 0.8)

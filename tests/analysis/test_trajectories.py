@@ -1,8 +1,9 @@
 """Which flights of a campaign are drawn together, and under which names."""
 
 import pytest
+from plain_values import named
 
-from mavfi_cli.analysis.trajectories import pair
+from mavfi_cli.analysis import trajectories
 from mavfi_cli.campaign.begin import chosen
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
@@ -11,6 +12,11 @@ from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import FaultConfig
+
+
+def pair(*arguments):
+    return named(trajectories.pair(*arguments))
+
 
 GOLDEN = {"setting": "golden", "world": "dense"}
 
