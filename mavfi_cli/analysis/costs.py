@@ -17,7 +17,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.comparison import RESAMPLES
-from mavfi_cli.analysis.flights import chosen, numbers, paired
+from mavfi_cli.analysis.flights import chosen, numbers
+from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import interval_of_rows
 from mavfi_cli.stats.paired import sign_flips

@@ -19,7 +19,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.detector_pairs import KEY, LONGER, NONE, Harm
-from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers, paired
+from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers
+from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings

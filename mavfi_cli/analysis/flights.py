@@ -6,6 +6,7 @@ What the missions were comes from the list, what came of them from their records
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,11 +20,14 @@ from numpy.typing import NDArray
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaign.outcome import COUNTED, MissionResult, State
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import FloatArray, Outcome
-from mavfi_cli.mission.record.measures import measures_of
+from mavfi_cli.mission.record.measures import QUALITY, STRUCK, measures_of
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
 FAULT = ("target", "seed", "bits", "field")
+FORMATS = (".parquet", ".csv")
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
@@ -125,20 +129,6 @@ def known(values: FloatArray) -> FloatArray:
     return values[~np.isnan(values)]
 
 
-def paired(first: pa.Table, second: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:
-    """The rows of two tables that have equal keys, side by side, in the order of the second.
-
-    Args:
-        on: names of the key columns; no two rows of `first` have the same keys.
-    """
-    if not (first.num_rows and second.num_rows):  # an empty column has no type to join by
-        return first.slice(0, 0), second.slice(0, 0)
-    there = first.select(on).append_column("first", pa.array(np.arange(first.num_rows)))
-    here = second.select(on).append_column("second", pa.array(np.arange(second.num_rows)))
-    places = here.join(there, list(on), join_type="inner", use_threads=False).sort_by("second")
-    return first.take(places["first"]), second.take(places["second"])
-
-
 def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
     """Some columns, row by row."""
     found: list[Mapping[str, Any]] = table.select(names).to_pylist()
@@ -148,3 +138,55 @@ def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
 def path_of(row: Mapping[str, Any]) -> Path | None:
     """The run folder that was kept of a row's flight."""
     return None if row["path"] is None else Path(row["path"])
+
+
+# The table as a file --------------------------------------------------------------------------
+
+
+def export(ledger: Ledger, path: Path) -> int:
+    """Write the table of a campaign to a .parquet or .csv file; how many rows.
+
+    Raises:
+        ConfigError: another kind of file.
+        RecordError: it cannot be written.
+    """
+    if path.suffix not in FORMATS:
+        raise ConfigError(
+            f"expected a name that ends in {' or '.join(FORMATS)}, or - for CSV on stdout",
+            path=path,
+        )
+    found = _exported(ledger)
+
+    def write(file: Any) -> None:
+        """Write the table in the format of the name."""
+        from pyarrow import csv, parquet
+
+        if path.suffix == ".csv":
+            csv.write_csv(found, file)
+        else:
+            parquet.write_table(found, file, compression="zstd")
+
+    write_atomically(path, write)
+    return int(found.num_rows)
+
+
+def export_csv(ledger: Ledger) -> bytes:
+    """The same as CSV."""
+    from pyarrow import csv
+
+    text = io.BytesIO()
+    csv.write_csv(_exported(ledger), text)
+    return text.getvalue()
+
+
+def _exported(ledger: Ledger) -> pa.Table:
+    """One row a mission that is over, in the order of the list; the labels are columns too."""
+    whole = flights(ledger)
+    return whole.select(
+        [
+            "number", "pair", *(name for name in whole.column_names if name.startswith("label_")),
+            *CONFIG, "level", *(f"fault_{name}" for name in FAULT), *STRUCK, "detector", "protect",
+            "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s", "wall_s",
+            "attempts", "path", "changes",
+        ]
+    )  # fmt: skip

@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 
+import numpy as np
 import pyarrow as pa
 
 from mavfi_cli.analysis.flights import BoolArray, flags
 from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
 from mavfi_cli.stats.paired import McNemar, mcnemar
+
+
+def paired(first: pa.Table, second: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:
+    """The rows of two tables that have equal keys, side by side, in the order of the second.
+
+    Args:
+        on: names of the key columns; no two rows of `first` have the same keys.
+    """
+    if not (first.num_rows and second.num_rows):  # an empty column has no type to join by
+        return first.slice(0, 0), second.slice(0, 0)
+    there = first.select(on).append_column("first", pa.array(np.arange(first.num_rows)))
+    here = second.select(on).append_column("second", pa.array(np.arange(second.num_rows)))
+    places = here.join(there, list(on), join_type="inner", use_threads=False).sort_by("second")
+    return first.take(places["first"]), second.take(places["second"])
 
 
 def both_succeed(first: pa.Table, second: pa.Table) -> BoolArray:

@@ -17,8 +17,8 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.comparison import RESAMPLES
 from mavfi_cli.analysis.costs import MISSION, cost_difference, cost_row, struck, worst_row
-from mavfi_cli.analysis.flights import chosen, flags, flown, known, numbers, paired
-from mavfi_cli.analysis.pairs import both_succeed, difference, ratio, success_test
+from mavfi_cli.analysis.flights import chosen, flags, flown, known, numbers
+from mavfi_cli.analysis.pairs import both_succeed, difference, paired, ratio, success_test
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, mean, median

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import chosen, flags, known, numbers, paired
+from mavfi_cli.analysis.flights import chosen, flags, known, numbers
 from mavfi_cli.analysis.overhead import ComputeOverhead
-from mavfi_cli.analysis.pairs import both_succeed, ratio
+from mavfi_cli.analysis.pairs import both_succeed, paired, ratio
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import Interval, interval
 from mavfi_cli.stats.shares import rate

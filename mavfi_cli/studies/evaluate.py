@@ -113,14 +113,14 @@ def _errors(tables: Iterable[pa.Table]) -> list[str]:
     ]
 
 
-def _scored(scores: Scores, error_free: pa.Table, faults: pa.Table, spectator: Spectator) -> Scored:
+def _scored(scores: Scores, error_free: pa.Table, faults: pa.Table, view: Spectator) -> Scored:
     """Scores of the harmful faults and of the error-free flights, by detector."""
     harmful = _active_harm(faults)
     golden = chosen(error_free, detector=NONE)["golden_path"].to_pylist()
     struck = harmful["faulty_path"].to_pylist()
     struck_s = harmful["faulty_struck_s"].to_pylist()
     wanted = itertools.chain(zip(struck, struck_s, strict=True), ((path, None) for path in golden))
-    scores.score_all(wanted, spectator.on_note)
+    scores.score_all(wanted, view.on_note)
 
     def of(detector: str) -> tuple[pa.Table, list[float]]:
         positive = pa.array([scores.of(path, detector) for path in struck], pa.float64())
@@ -132,10 +132,7 @@ def _scored(scores: Scores, error_free: pa.Table, faults: pa.Table, spectator: S
 
 
 def told(
-    plan: EvaluationPlan,
-    pairs: tuple[pa.Table, pa.Table],
-    errors: Sequence[str],
-    scored: Scored,
+    plan: EvaluationPlan, pairs: tuple[pa.Table, pa.Table], errors: Sequence[str], scored: Scored
 ) -> dict[str, Any]:
     """What is known of these pairs, as plain values.
 
