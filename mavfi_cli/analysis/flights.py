@@ -135,11 +135,6 @@ def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
     return found
 
 
-def path_of(row: Mapping[str, Any]) -> Path | None:
-    """The run folder that was kept of a row's flight."""
-    return None if row["path"] is None else Path(row["path"])
-
-
 # The table as a file --------------------------------------------------------------------------
 
 
