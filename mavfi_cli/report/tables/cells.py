@@ -38,9 +38,8 @@ def spread(
     """A value with its interval, where it has one, and the p-value, where one is given."""
     if math.isnan(each["value"]):
         return "-"
-    value, low, high = (
-        f"{scale * each[end]:{sign}z.{digits}f}" for end in ("value", "low", "high")
-    )
+    shape = f"{sign or 'z'}.{digits}f"  # with a sign, -0.00 tells on which side of zero it is
+    value, low, high = (f"{scale * each[end]:{shape}}" for end in ("value", "low", "high"))
     told = [] if math.isnan(each["low"]) else [f"{low} to {high}"]
     told += [] if chance is None else [p_value(chance)]
     return f"{value} ({', '.join(told)})" if told else value
