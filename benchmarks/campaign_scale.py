@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.campaign.findings.summary import summarise
+from mavfi_cli.analysis.summary import summarise
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission
@@ -138,7 +138,7 @@ def _missing(folder: Path) -> None:
 
 def _summarise(folder: Path) -> None:
     with Ledger(folder) as ledger:
-        assert len(summarise(ledger).cells) == CELLS
+        assert len(summarise(ledger)["cells"]) == CELLS
 
 
 def main() -> None:

@@ -13,7 +13,6 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.attack.outcome import wilson
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
@@ -21,6 +20,7 @@ from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.fault_config import DETECTOR, FaultConfig
+from mavfi_cli.stats.shares import wilson
 
 FIRST_SEED = 600_000
 LONGER = 1.05

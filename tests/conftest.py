@@ -20,7 +20,8 @@ from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.vehicle import start_vehicle
 
-sys.path.insert(0, str(Path(__file__).parent / "link"))  # the scripted autopilots live there
+for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
+    sys.path.insert(0, str(Path(__file__).parent / _folder))
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
 SHORT = MissionConfig(
     world="farm", seed=5, stack="hardened", start=(2.0, 2.0, 0.0), goal=(10.0, 6.0, 5.0)

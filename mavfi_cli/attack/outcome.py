@@ -1,14 +1,15 @@
-"""Outcomes of isolated runs, and proportions with their confidence intervals."""
+"""Outcomes of isolated runs, and how often each of them occurs."""
 
 from __future__ import annotations
 
 import math
 import signal
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Iterable, Mapping
 from enum import Enum
 from typing import Any
+
+from mavfi_cli.stats.shares import Share, design_effect, wilson
 
 
 class Outcome(Enum):
@@ -24,44 +25,6 @@ class Outcome(Enum):
     def title(self) -> str:
         """What people call it."""
         return "SDC" if self is Outcome.SDC else self.value.replace("_", " ")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Share:
-    """A proportion with its Wilson score interval."""
-
-    count: int
-    total: int
-    share: float
-    low: float
-    high: float
-
-
-def wilson(
-    count: int,
-    total: int,
-    *,
-    design_effect: float = 1.0,
-    confidence_z: float = 1.959963984540054,
-) -> Share:
-    """Wilson score interval (E. B. Wilson, JASA 22, 1927), 95 % by default.
-
-    With no observation the interval is the whole of [0, 1] and the share is not a number. A design
-    effect above 1 counts as that many times fewer observations.
-    """
-    if total == 0:
-        return Share(count=0, total=0, share=math.nan, low=0.0, high=1.0)
-    p, n = count / total, total / design_effect
-    z2 = confidence_z**2
-    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = confidence_z * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2)) / (1 + z2 / n)
-    return Share(
-        count=count,
-        total=total,
-        share=p,
-        low=max(0.0, centre - half) if count else 0.0,
-        high=min(1.0, centre + half) if count < total else 1.0,
-    )
 
 
 Window = tuple[Hashable, int]  # stratum and number of the sampled window that a run hit
@@ -87,31 +50,6 @@ def shares(
         effect = design_effect(is_it, [window for _, window in of])
         found[outcome] = wilson(sum(is_it), len(of), design_effect=effect)
     return found
-
-
-def design_effect(hits: Sequence[bool], windows: Sequence[Window | None]) -> float:
-    """How many times the variance of a share is that of as many independent runs; at least 1.
-
-    Windows are clusters within strata (W. G. Cochran, Sampling Techniques, 3rd edition, 1977,
-    sections 9A and 11): squared sums of residuals of the clusters against their stratum's share,
-    and the variance of how many runs fall into each stratum.
-    """
-    total = len(hits)
-    share = sum(hits) / total if total else 0.0
-    if not 0.0 < share < 1.0:
-        return 1.0
-    strata: dict[Hashable, dict[Hashable, list[bool]]] = {}
-    for number, (hit, window) in enumerate(zip(hits, windows, strict=True)):
-        stratum, cluster = window or (None, number)
-        strata.setdefault(stratum, {}).setdefault(cluster, []).append(hit)
-    variance = 0.0
-    for clusters in strata.values():
-        size = sum(map(len, clusters.values()))
-        own = sum(map(sum, clusters.values())) / size
-        variance += size * (own - share) ** 2
-        squares = sum((sum(each) - own * len(each)) ** 2 for each in clusters.values())
-        variance += squares * len(clusters) / max(1, len(clusters) - 1)
-    return max(1.0, variance / (total * share * (1.0 - share)))
 
 
 def shares_to_json(found: Mapping[Outcome, Share]) -> dict[str, dict[str, Any]]:

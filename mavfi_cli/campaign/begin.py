@@ -131,6 +131,34 @@ def _require_one_meaning(what: str) -> None:
         )
 
 
+def resumed(asked: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[Spec, bool]:
+    """The campaign of a study to fly in a folder, and whether its list grows.
+
+    More repetitions of the same study go on from fewer: lists grow repetition by repetition.
+
+    Args:
+        what, repetitions: what the study and its repetitions are called.
+
+    Raises:
+        ConfigError: the folder holds another one; says in what it differs.
+    """
+    if not (folder / LEDGER).is_file():
+        return asked, False
+    with Ledger(folder) as ledger:
+        text = ledger.meta("spec")
+    if text is None:  # killed before it was said, or no such study: the list will tell
+        return asked, False
+    stored = parse_spec(text, folder / LEDGER)
+    ours = replace(asked, name=stored.name, about=stored.about, keep=stored.keep)
+    grows = asked.repetitions > stored.repetitions
+    alike = replace(ours, repetitions=stored.repetitions) if grows else ours
+    if found := differences(stored, alike, repetitions=repetitions):
+        raise ConfigError(
+            f"holds another {what}: {'; '.join(found)}; choose another --out", path=folder
+        )
+    return ours, grows
+
+
 def _stored_spec(ledger: Ledger) -> Spec:
     text = ledger.meta("spec")
     if text is None:

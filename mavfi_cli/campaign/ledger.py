@@ -25,6 +25,7 @@ from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, c
 from mavfi_cli.campaign.outcome import Injected, MissionResult, State
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import plain
+from mavfi_cli.mission.record.measures import fields_of
 
 SCHEMA = 1
 LEDGER, LOCK, RUNS = "ledger.sqlite", "ledger.lock", "runs"
@@ -56,8 +57,9 @@ CREATE TABLE results (
 );
 CREATE TABLE records (number INTEGER PRIMARY KEY REFERENCES results, result BLOB NOT NULL);
 """
-_QUALITY = (
+_SHORT = (
     "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
+    "replans", "simulated_s",
 )  # fmt: skip
 _PORTION = 5000  # rows that are read at once
 
@@ -263,17 +265,14 @@ class Ledger:
         Raises:
             RecordError: the disk is full, or something else kept it from being written.
         """
-        quality = result.get("quality_of_flight") or {}
-        pilot = result.get("pilot") or {}
+        columns = fields_of(result)
         row = (
             number,
             state.value,
             result.get("outcome"),
             reason,
             None if injected is None else injected.value,
-            *(quality.get(name) for name in _QUALITY),
-            pilot.get("replans"),
-            result.get("simulated_s"),
+            *(columns[name] for name in _SHORT),
             wall_s,
             attempts,
             path,

@@ -30,6 +30,12 @@ class Injected(Enum):
     NULL = "null"  # everything but the flip, as was asked for
 
 
+# Missions in whose success the fault, if there was one, had a part.
+COUNTED = frozenset(
+    each.value for each in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionResult:
     """One row of the ledger.

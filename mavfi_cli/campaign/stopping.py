@@ -11,14 +11,10 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.campaign.outcome import COUNTED
 from mavfi_cli.campaign.specification.spec import Stop
-from mavfi_cli.campaign.statistics.proportions import half_width, rate
+from mavfi_cli.stats.shares import half_width, rate
 
-# Missions in whose success the fault, if there was one, had a part.
-COUNTED = frozenset(
-    each.value for each in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
-)
 Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission
 Row = tuple[str | None, str | None]  # outcome, what became of the fault
 

@@ -18,6 +18,7 @@ from mavfi_cli.campaign.specification.fixed_world import FixedWorld, Flown
 from mavfi_cli.campaign.specification.spec import Spec
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.record.measures import fields_of
 
 SEARCH = "world-search"  # the folder
 _AT_ONCE = 4  # candidates whose flights fill the workers together
@@ -122,7 +123,4 @@ def _replans(
     ]
     quiet = replace(options, keep=Keep.NONE)
     with run_campaign(planned, folder, quiet, _Notes(spectator), append=True) as ledger:
-        return {
-            each.mission.config: (each.result.get("pilot") or {}).get("replans")
-            for each in ledger.results()
-        }
+        return {each.mission.config: fields_of(each.result)["replans"] for each in ledger.results()}

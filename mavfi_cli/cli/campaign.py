@@ -119,9 +119,9 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 @click.argument("path", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
 def export(what: str, path: Path) -> None:
     """Write one row a mission to PATH, a .parquet or .csv file, or - for CSV on stdout."""
+    from mavfi_cli.analysis.flights import export as write
+    from mavfi_cli.analysis.flights import export_csv
     from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.findings.export import export as write
-    from mavfi_cli.campaign.findings.export import export_csv
     from mavfi_cli.campaign.ledger import Ledger
 
     with Ledger(folder_of(what)) as ledger:
@@ -145,10 +145,8 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 
     From the run folders that were kept, all settings of the pair; a panel for each fault.
     """
-    from dataclasses import asdict
-
+    from mavfi_cli.analysis.trajectories import pair
     from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.findings.trajectories import pair
     from mavfi_cli.campaign.ledger import Ledger
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.record.run_folder import load_run
@@ -158,16 +156,17 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         chosen = pair(ledger, number)
     panels = [
         Panel(
-            title=panel.title, flights=[(each.name, load_run(each.path)) for each in panel.flights]
+            title=panel["title"],
+            flights=[(each["name"], load_run(each["path"])) for each in panel["flights"]],
         )
-        for panel in chosen.panels
+        for panel in chosen["panels"]
     ]
     write_trajectories(panels, output)
     if as_json:
-        told = {**asdict(chosen), "picture": output}
+        told = {**chosen, "picture": output}
         click.echo(json.dumps(plain(told), indent=2, default=str))
     else:
-        absent = [f"not in the picture: {text}" for text in chosen.absent]
+        absent = [f"not in the picture: {text}" for text in chosen["absent"]]
         click.echo("\n".join([*lines(panels), *absent, f"Picture  {output}"]))
 
 
@@ -193,7 +192,7 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
 
     What `run` would refuse is refused here too.
     """
-    from mavfi_cli.campaign.statistics.proportions import (
+    from mavfi_cli.stats.shares import (
         missions_for_margin,
         pairs_for_difference,
     )
@@ -271,19 +270,20 @@ def _show(
 ) -> None:
     from dataclasses import asdict
 
+    from mavfi_cli.analysis.summary import summarise
     from mavfi_cli.campaign.begin import fixed_world, stopped
-    from mavfi_cli.campaign.findings.summary import summarise, table
     from mavfi_cli.core.files import plain
+    from mavfi_cli.report.tables.campaign import summary_lines
 
     summary = summarise(ledger, by or [], confidence)
     ended, worlds = stopped(ledger), fixed_world(ledger)
-    told = {**summary.to_dict(), "stopped": ended}
-    lines = [f"{summary.name}: {summary.over} of {summary.missions} missions"]
+    told = {**summary, "stopped": ended}
+    lines = [f"{summary['name']}: {summary['over']} of {summary['missions']} missions"]
     if worlds is not None:
         told["fixed_world"] = asdict(worlds)
         lines.append(worlds.told())
     lines += [f"known well enough, so not flown on: {text}" for text in ended]
-    lines += table(summary)
+    lines += summary_lines(summary)
     if more is not None:
         _add_more(ledger, by or [], confidence, more, told, lines)
     click.echo(json.dumps(plain(told), indent=2) if as_json else "\n".join(lines))
@@ -298,22 +298,25 @@ def _add_more(
     lines: list[str],
 ) -> None:
     """What --quality, --overhead and --failures ask for, as plain values and as text."""
-    from mavfi_cli.campaign.findings import across, overhead, quality
-    from mavfi_cli.campaign.findings.groups import groups
+    from mavfi_cli.analysis.failures import failures
+    from mavfi_cli.analysis.groups import groups
+    from mavfi_cli.analysis.overhead import flight_overheads
+    from mavfi_cli.analysis.summary import qualities
+    from mavfi_cli.report.tables import campaign as text
 
     if not (more["quality"] or more["overhead"] or more["failures"]):
         return
     found = groups(ledger, by)
     if more["quality"]:
-        qualities = quality.qualities(found, confidence)
-        told["quality"] = [each.to_dict() for each in qualities]
-        lines += quality.lines(qualities, confidence)
+        quality = qualities(found, confidence)
+        told["quality"] = quality
+        lines += text.quality_lines(quality, confidence)
     if more["overhead"]:
-        overheads = overhead.overheads(ledger, found, confidence)
-        told["overhead"] = [each.to_dict() for each in overheads]
-        lines += overhead.lines(overheads, confidence)
+        overheads = flight_overheads(ledger, found, confidence)
+        told["overhead"] = overheads
+        lines += text.overhead_lines(overheads, confidence)
     if more["failures"]:
-        rows = across.across(ledger, found, more["kernels"], more["upsets"], confidence)
-        told["failures"] = [each.to_dict() for each in rows]
+        rows = failures(ledger, found, more["kernels"], more["upsets"], confidence)
+        told["failures"] = rows
         lines += ["", "injected faults that fail missions which succeed without:"]
-        lines += across.lines(rows)
+        lines += text.failure_lines(rows)

@@ -45,14 +45,13 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     Interrupted, it goes on where it stopped when it is called again. Writes compare.json,
     compare.csv, compare.svg and timeline.svg.
     """
-    from mavfi_cli.campaign.compare.fly import compare as run
-    from mavfi_cli.campaign.compare.rows import rows_csv
-    from mavfi_cli.campaign.compare.table import table
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
     from mavfi_cli.report.compare_plot import write_compare_plot
+    from mavfi_cli.report.tables.platforms import platform_csv, platform_lines
     from mavfi_cli.report.timeline import write_timeline
+    from mavfi_cli.studies.compare import compare as run
 
     if as_json and as_csv:
         raise click.UsageError("--json or --csv, not both")
@@ -60,21 +59,21 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     with missions_view(quiet=quiet) as view:
         told = run(plan, out, Options(jobs=options["jobs"] or 0), view)
     write_json(out / "compare.json", told)
-    write_text(out / "compare.csv", rows_csv(told))
+    write_text(out / "compare.csv", platform_csv(told))
     write_compare_plot(told, out / "compare.svg")
     write_timeline(told, out / "timeline.svg")
     if as_json:
         click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(rows_csv(told), nl=False)
+        click.echo(platform_csv(told), nl=False)
     else:
         files = "compare.json, compare.csv, compare.svg, timeline.svg, timeline/"
-        click.echo("\n".join([*table(told), "", f"Files  {out}: {files}"]))
+        click.echo("\n".join([*platform_lines(told), "", f"Files  {out}: {files}"]))
 
 
 def _plan(options: dict[str, Any]) -> Any:
-    from mavfi_cli.campaign.compare.plan import ComparePlan
     from mavfi_cli.core.errors import ConfigError
+    from mavfi_cli.studies.compare_plan import ComparePlan
 
     names = ("world", "field", "missions", "first_seed", "seed", "stack")
     chosen: dict[str, Any] = {name: options[name] for name in names}

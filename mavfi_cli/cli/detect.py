@@ -21,7 +21,7 @@ def detect() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print with the whole provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
     """Detectors, their model files, stacks and thresholds, and where they come from."""
-    from mavfi_cli.campaign.evaluation.listing import listing
+    from mavfi_cli.detect.listing import listing
 
     rows = listing(models)
     if as_json:
@@ -80,12 +80,12 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     with more flights, worlds or detectors, it adds them. Writes evaluation.json, evaluation.csv,
     roc.svg and recovery.svg.
     """
-    from mavfi_cli.campaign.evaluation.evaluate import evaluate as run
-    from mavfi_cli.campaign.evaluation.table import table, write_csv
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
-    from mavfi_cli.core.files import plain, write_json
+    from mavfi_cli.core.files import plain, write_json, write_text
     from mavfi_cli.report.detection_plot import write_recovery_plot, write_roc_plot
+    from mavfi_cli.report.tables.detectors import detector_csv, detector_lines
+    from mavfi_cli.studies.evaluate import evaluate as run
 
     if as_json and as_csv:
         raise click.UsageError("--json or --csv, not both")
@@ -93,21 +93,21 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     with missions_view(quiet=quiet) as view:
         evaluation, pairs = run(plan, out, Options(jobs=options["jobs"] or 0), view)
     write_json(out / "evaluation.json", evaluation)
-    write_csv(out / "evaluation.csv", pairs)
+    write_text(out / "evaluation.csv", detector_csv(*pairs))
     write_roc_plot(evaluation, out / "roc.svg")
     write_recovery_plot(evaluation, out / "recovery.svg")
     if as_json:
         click.echo(json.dumps(plain(evaluation), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo((out / "evaluation.csv").read_text(encoding="utf-8"), nl=False)
+        click.echo(detector_csv(*pairs), nl=False)
     else:
         files = "evaluation.json, evaluation.csv, roc.svg, recovery.svg"
-        click.echo("\n".join([*table(evaluation), "", f"Files  {out}: {files}"]))
+        click.echo("\n".join([*detector_lines(evaluation), "", f"Files  {out}: {files}"]))
 
 
 def _plan(options: dict[str, Any]) -> Any:
-    from mavfi_cli.campaign.evaluation.plan import DETECTORS, WORLDS, EvaluationPlan
     from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.studies.evaluation_plan import DETECTORS, WORLDS, EvaluationPlan
 
     base = {key: options[key] for key in ("platform", "stack") if options[key] is not None}
     named = options["detectors"]

@@ -46,12 +46,12 @@ def train(
     the autoencoder needs torch: pip install 'mavfi[train]'.
     """
     from mavfi_cli.campaign.run import Options
-    from mavfi_cli.campaign.training import WORLDS, TrainingPlan
-    from mavfi_cli.campaign.training import train as run
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.detect.fit import KINDS
     from mavfi_cli.mission.config import MissionConfig
     from mavfi_cli.report.training_plot import write_loss_curve
+    from mavfi_cli.studies.train import WORLDS, TrainingPlan
+    from mavfi_cli.studies.train import train as run
 
     plan = TrainingPlan(
         worlds=worlds or WORLDS,
@@ -63,7 +63,7 @@ def train(
         base=MissionConfig(stack=stack),
     )
     with missions_view(quiet=quiet) as view:
-        trained = run(plan, out, Options(jobs=jobs or 0), view, view.on_note)
+        trained = run(plan, out, Options(jobs=jobs or 0), view)
     if "aad" in trained.models:
         model, _ = trained.models["aad"]
         write_loss_curve(model.provenance["loss_curve"]["rows"], out / "loss.svg")

@@ -84,13 +84,12 @@ def vpm(
     The F-1 visual performance model: a vehicle flies so fast that it stops within what it sees.
     A copy of the computer adds mass and power; detection and recovery adds compute time.
     """
-    from mavfi_cli.cli.overheads import overheads
     from mavfi_cli.core.config import require_distinct
     from mavfi_cli.core.files import plain
-    from mavfi_cli.vpm.flight_table import flight_rows_csv, flight_table
+    from mavfi_cli.report.tables.model import model_csv, model_lines
+    from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
     from mavfi_cli.vpm.report import report
     from mavfi_cli.vpm.schemes import schemes_with
-    from mavfi_cli.vpm.table import scheme_rows_csv, table
     from mavfi_cli.vpm.vehicle import load_vehicle
 
     if as_json and as_csv:
@@ -104,11 +103,7 @@ def vpm(
     choices = _choices(options)
     platform = choices.platform
     known = overheads(options["overheads"], None if platform is None else platform.name)
-    schemes = schemes_with(
-        {name: percent for name, (percent, _) in known.items()},
-        {name: source for name, (_, source) in known.items()},
-    )
-    told = report(chosen, choices, schemes)
+    told = report(chosen, choices, schemes_with(known))
     if fly:
         out = out or Path("vpm")
         told = _flown(chosen, known, choices, out, options)
@@ -116,12 +111,45 @@ def vpm(
     if as_json:
         click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(flight_rows_csv(told["flights"]) if fly else scheme_rows_csv(told), nl=False)
+        click.echo(redundancy_csv(told["flights"]) if fly else model_csv(told), nl=False)
     else:
-        lines = [*table(told), *(flight_table(told["flights"]) if fly else [])]
+        lines = [*model_lines(told), *(redundancy_lines(told["flights"]) if fly else [])]
         if files:
             lines += ["", f"Files  {out}: {', '.join(files)}"]
         click.echo("\n".join(lines))
+
+
+def overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
+    """Per cent and source of each detector, as given or measured in flights; the last word counts.
+
+    Args:
+        platform: that is modelled; flights on others do not count. None: all count.
+
+    Raises:
+        click.UsageError: neither DETECTOR=PERCENT nor a path.
+        RecordError: a path without flights with a detector on the platform.
+    """
+    found: dict[str, tuple[float, str]] = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        if Path(text).exists():
+            found |= _measured(text, platform)
+            continue
+        try:
+            found[name.strip()] = float(number), "--overhead"
+        except ValueError:
+            raise click.UsageError(
+                f"--overhead {text}: no such file or folder; for per cent write aad=0.0062"
+            ) from None
+    return found
+
+
+def _measured(path: str, platform: str | None) -> dict[str, tuple[float, str]]:
+    from mavfi_cli.analysis.overhead import recorded_overheads
+    from mavfi_cli.vpm.schemes import DETECTORS
+
+    known = recorded_overheads(Path(path), DETECTORS, platform)
+    return {name: (100.0 * each.share, each.told(path)) for name, each in known.items()}
 
 
 def _refuse_unused() -> None:
@@ -150,9 +178,10 @@ def _flown(
 ) -> dict[str, Any]:
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
-    from mavfi_cli.cli.vpm_fly import WORLDS, Ask, fly_and_report
+    from mavfi_cli.studies.redundancy import fly_and_report
+    from mavfi_cli.studies.redundancy_plan import WORLDS, RedundancyPlan
 
-    ask = Ask(
+    plan = RedundancyPlan(
         vehicles=vehicles,
         choices=choices,
         worlds=options["worlds"] or WORLDS,
@@ -164,7 +193,7 @@ def _flown(
         stack=options["stack"],
     )
     with missions_view(quiet=options["quiet"]) as view:
-        return fly_and_report(ask, known, Options(jobs=options["jobs"] or 0), view)
+        return fly_and_report(plan, known, Options(jobs=options["jobs"] or 0), view)
 
 
 def _choices(options: dict[str, Any]) -> Any:
@@ -190,20 +219,20 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
     from mavfi_cli.report.flight_plot import write_flight_plot
     from mavfi_cli.report.redundancy_plot import write_redundancy_plot
     from mavfi_cli.report.roofline_plot import write_roofline_plot
-    from mavfi_cli.vpm.flight_table import flight_rows_csv
-    from mavfi_cli.vpm.table import scheme_rows_csv
+    from mavfi_cli.report.tables.model import model_csv
+    from mavfi_cli.report.tables.redundancy import redundancy_csv
 
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordError(f"{out}: {error.strerror or error}") from None
     write_json(out / "vpm.json", told)
-    write_text(out / "vpm.csv", scheme_rows_csv(told))
+    write_text(out / "vpm.csv", model_csv(told))
     write_roofline_plot(told, out / "roofline.svg")
     write_redundancy_plot(told, out / "redundancy.svg")
     names = ["vpm.json", "vpm.csv", "roofline.svg", "redundancy.svg"]
     if "flights" in told:
-        write_text(out / "flights.csv", flight_rows_csv(told["flights"]))
+        write_text(out / "flights.csv", redundancy_csv(told["flights"]))
         write_flight_plot(told, out / "flights.svg")
         names += ["flights.csv", "flights.svg"]
     return names

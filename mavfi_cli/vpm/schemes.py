@@ -34,35 +34,28 @@ SCHEMES = (
 DETECTORS = tuple(scheme.name for scheme in SCHEMES if scheme.overhead > 0.0)
 
 
-def schemes_with(
-    overheads_percent: Mapping[str, float], sources: Mapping[str, str] | None = None
-) -> tuple[Scheme, ...]:
+def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> tuple[Scheme, ...]:
     """The schemes, with measured overheads in place of the paper's.
 
     Args:
-        overheads_percent: of a detector's name to its overhead, per cent of the compute time.
-        sources: of a detector's name to where its overhead comes from, where that is not the
-            command line.
+        overheads: of a detector's name to its overhead, per cent of the compute time, and where
+            that comes from.
 
     Raises:
         UnknownName: a scheme that does not detect and recover.
         ConfigError: an overhead that is negative, not finite, or a slip of the unit.
     """
-    for name, percent in overheads_percent.items():
+    for name, (percent, _) in overheads.items():
         if name not in DETECTORS:
             raise UnknownName("detector", name, DETECTORS)
         if not 0.0 <= percent <= LARGEST:
             raise ConfigError(
                 f"must be within 0 and {LARGEST:g} %, is {percent:g} %", key=f"overhead of {name}"
             )
-    told = sources or {}
+    given = {name: (percent / 100.0, source) for name, (percent, source) in overheads.items()}
     return tuple(
-        replace(
-            scheme,
-            overhead=overheads_percent[scheme.name] / 100.0,
-            source=told.get(scheme.name, "--overhead"),
-        )
-        if scheme.name in overheads_percent
+        replace(scheme, overhead=given[scheme.name][0], source=given[scheme.name][1])
+        if scheme.name in given
         else scheme
         for scheme in SCHEMES
     )

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
-from mavfi_cli.attack.outcome import Outcome, design_effect, shares, wilson
+from mavfi_cli.attack.outcome import Outcome, shares
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.attack.summary import PROGRAM_COLUMNS, csv_rows, summarise_program
@@ -34,6 +34,7 @@ from mavfi_cli.fi.tracer.fault import (
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import Activation
 from mavfi_cli.fi.tracer.spawn import Command
+from mavfi_cli.stats.shares import design_effect, wilson
 
 QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
 
@@ -328,39 +329,11 @@ def test_a_damaged_record_is_a_clear_error():
 # -- numbers
 
 
-@pytest.mark.parametrize(("count", "total"), [(0, 10), (3, 10), (10, 10), (84, 1000)])
-def test_wilson_against_scipy(count, total):
-    from scipy.stats import binomtest
-
-    ours = wilson(count, total)
-    theirs = binomtest(count, total).proportion_ci(method="wilson")
-    assert ours.low == pytest.approx(theirs.low, abs=1e-12)
-    assert ours.high == pytest.approx(theirs.high, abs=1e-12)
-
-
 def test_not_injected_runs_are_no_part_of_the_other_shares():
     result = shares([Outcome.SDC, Outcome.BENIGN, Outcome.NOT_INJECTED, Outcome.NOT_INJECTED])
     assert (result[Outcome.SDC].share, result[Outcome.SDC].total) == (0.5, 2)
     assert (result[Outcome.NOT_INJECTED].share, result[Outcome.NOT_INJECTED].total) == (0.5, 4)
     assert math.isnan(wilson(0, 0).share)
-
-
-def test_runs_of_a_window_count_less_the_more_they_are_alike():
-    """Against the spread of the share over repeated samples of windows and of runs in them."""
-    rng = np.random.default_rng(4)
-    chances = rng.beta(0.5, 0.5, size=5000)  # of a crash, window by window
-
-    def campaign():
-        drawn = rng.choice(chances, size=20)
-        windows = rng.integers(20, size=400)
-        return rng.random(400) < drawn[windows], [("f", int(window)) for window in windows]
-
-    campaigns = [campaign() for _ in range(300)]
-    spread = np.var([hits.mean() for hits, _ in campaigns])
-    binomial = chances.mean() * (1.0 - chances.mean()) / 400
-    effects = [design_effect(hits.tolist(), windows) for hits, windows in campaigns]
-    assert spread / binomial > 5.0
-    assert np.mean(effects) == pytest.approx(spread / binomial, rel=0.2)
 
 
 def test_independent_runs_count_in_full():

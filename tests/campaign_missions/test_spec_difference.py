@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.compare.plan import ComparePlan
 from mavfi_cli.campaign.specification.difference import differences
 from mavfi_cli.campaign.specification.spec import parse_spec
+from mavfi_cli.studies.compare_plan import ComparePlan
 
 STORED = """
 repetitions = 10

@@ -9,8 +9,8 @@ from plans import planned
 
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.specification.spec import Stop
-from mavfi_cli.campaign.statistics.proportions import half_width, rate
 from mavfi_cli.campaign.stopping import Gate, Queue
+from mavfi_cli.stats.shares import half_width, rate
 
 STOP = Stop(margin=0.12, batch=10)
 

@@ -54,7 +54,7 @@ def test_who_interrupts_is_told_how_to_go_on(command_line, monkeypatch):
     def flying(*_):
         raise Interrupted("interrupted; run again to go on")
 
-    monkeypatch.setattr("mavfi_cli.campaign.compare.fly.compare", flying)
+    monkeypatch.setattr("mavfi_cli.studies.compare.compare", flying)
     code, out, err = command_line("compare", "--quiet")
     assert (code, out, err) == (130, "", "interrupted; run again to go on\n")
 

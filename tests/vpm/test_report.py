@@ -182,15 +182,15 @@ def test_sensitivity_is_the_model_s_derivative():
 
 
 def test_an_overhead_of_one_s_own():
-    slow = rows(told("airsim", schemes=schemes_with({"gad": 50.0})))["gad"]
+    slow = rows(told("airsim", schemes=schemes_with({"gad": (50.0, "--overhead")})))["gad"]
     response_s = parameters(told("airsim"))["response_s"]["value"]
     assert 1.0 / slow["throughput_hz"] == pytest.approx(1.5 * response_s)
     assert slow["source"] == "--overhead"
     with pytest.raises(UnknownName, match="did you mean 'gad'"):
-        schemes_with({"gda": 1.0})
+        schemes_with({"gda": (1.0, "--overhead")})
     for percent in (-1.0, math.nan, math.inf, 1e308):
         with pytest.raises(ConfigError, match=r"must be within 0 and 1e\+06 %, is"):
-            schemes_with({"aad": percent})
+            schemes_with({"aad": (percent, "--overhead")})
 
 
 @pytest.mark.parametrize(
@@ -265,8 +265,13 @@ def test_only_one_measured_overhead_is_said():
     """Rows from two sources are not to be ranked; the paper's two, or two measured ones, may be."""
     chosen, vehicle = Choices(), [load_vehicle("spark")]
     assert report(vehicle, chosen, SCHEMES)["notes"] == []
-    assert report(vehicle, chosen, schemes_with({"gad": 0.3, "aad": 0.1}))["notes"] == []
-    (note,) = report(vehicle, chosen, schemes_with({"aad": 0.1}))["notes"]
+    assert (
+        report(
+            vehicle, chosen, schemes_with({"gad": (0.3, "--overhead"), "aad": (0.1, "--overhead")})
+        )["notes"]
+        == []
+    )
+    (note,) = report(vehicle, chosen, schemes_with({"aad": (0.1, "--overhead")}))["notes"]
     assert note.startswith("the overhead of gad is the paper's and that of aad is not: ")
 
 

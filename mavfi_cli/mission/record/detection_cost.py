@@ -23,6 +23,7 @@ RECOMPUTED = {
 KERNELS = tuple(kernel for kernels in RECOMPUTED.values() for kernel in kernels)
 # Note for every comparison of checks with simulated time, as no factor between hosts is known.
 HOST_CHECKS = "checks take the time of the host that flew, not scaled to the platform"
+UNKNOWN = "an unknown platform"
 _AGAIN = ("recompute", "hold")  # responses to an alarm that cause a recomputation
 
 
@@ -39,6 +40,10 @@ class DetectionCost:
             Numbers may therefore be fractions.
         recovery_s: Simulated time of the recomputations per stage, each at the mean latency of its
             kernels in this flight, s.
+        compute_s: Simulated time of all kernels, recomputations included, s.
+        host_compute_s: Host time of all kernels, recomputations included, s.
+        platform: Name of the platform in the mission's configuration.
+        faulty: Whether the flight has a fault.
     """
 
     detector: str
@@ -47,6 +52,10 @@ class DetectionCost:
     flight_s: float
     recomputations: Mapping[str, float]
     recovery_s: Mapping[str, float]
+    compute_s: float
+    host_compute_s: float
+    platform: str
+    faulty: bool
 
     @property
     def check_host_s(self) -> float:
@@ -79,7 +88,8 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
         Cost; None without a detector or without any check.
     """
     detection = result.get("detection")
-    checks_host_s = ((result.get("host") or {}).get("stage_wall_s") or {}).get("gate")
+    walls = (result.get("host") or {}).get("stage_wall_s") or {}
+    checks_host_s = walls.get("gate")
     if not detection or not checks_host_s:
         return None
     checks = sum(detection["checks"].values())
@@ -99,6 +109,10 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
             stage: math.fsum(again[stage] * _mean_s(kernels.get(name)) for name in names)
             for stage, names in RECOMPUTED.items()
         },
+        compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
+        host_compute_s=math.fsum(walls.get(name, 0.0) for name in KERNELS),
+        platform=str(result.get("config", {}).get("platform", UNKNOWN)),
+        faulty=bool(result.get("fault")),
     )
 
 

@@ -1,0 +1,155 @@
+"""Settings against each other, mission by mission: what faults cost, and what protection saves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.analysis.flights import BoolArray, IntArray, known
+from mavfi_cli.analysis.groups import METRICS, Group, matched, untreated
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.paired import holm, mcnemar
+from mavfi_cli.stats.worst_case import WorstCase, worst_case, worst_over_own
+
+RESAMPLES = 1999
+
+
+@dataclass(frozen=True, slots=True)
+class _Match:
+    """Two settings, the golden one of both, and the places of their pairs, (m,) in each."""
+
+    first: Group
+    second: Group
+    golden: Group
+    at_first: IntArray
+    at_second: IntArray
+
+    @property
+    def success(self) -> tuple[BoolArray, BoolArray]:
+        """Whether each of a pair succeeded, (m,) twice."""
+        return self.first.succeeded[self.at_first], self.second.succeeded[self.at_second]
+
+    def differences(self, metric: str) -> FloatArray:
+        """Second minus first, of the pairs in which both succeeded and have the metric."""
+        first, second = self.success
+        change = self.second.metrics[metric][self.at_second]
+        return known((change - self.first.metrics[metric][self.at_first])[first & second])
+
+    def worst(self) -> tuple[WorstCase, WorstCase]:
+        """The worst cases over own golden flights, and over the mean of these; of the pairs only.
+
+        A pair has a golden flight that succeeded, or it counts in neither.
+        """
+        if self.first.golden:
+            golden, sides = self.at_first, [(self.second, self.at_second)]
+        else:
+            golden = self._golden_of_first()
+            sides = [(self.first, self.at_first), (self.second, self.at_second)]
+        reference = self._times(self.golden, golden)
+        times = [self._times(group, places) for group, places in sides]
+        shown = [~np.isnan(reference) & ~np.isnan(each) for each in times]
+        used = np.logical_or.reduce(shown)
+        _, once = np.unique(golden[used], return_index=True)
+        golden_s = reference[used][once]
+        pairs = list(zip(times, shown, strict=True))
+        return (
+            worst_over_own(*((each[both] / reference[both]).tolist() for each, both in pairs)),
+            worst_case(golden_s.tolist(), *(each[both].tolist() for each, both in pairs)),
+        )
+
+    def _golden_of_first(self) -> IntArray:
+        """The place of the golden flight of each pair, (m,); -1 where there is none."""
+        own = np.full(self.first.flights.num_rows, -1)
+        at_golden, at_faulty = matched(self.golden, self.first)
+        own[at_faulty] = at_golden
+        return own[self.at_first]
+
+    @staticmethod
+    def _times(group: Group, places: IntArray) -> FloatArray:
+        """Flight times of successful flights, (m,); not a number of others, or at -1."""
+        found = np.full(len(places), np.nan)
+        there = (places >= 0) & group.succeeded[places]
+        found[there] = group.metrics["flight_time_s"][places[there]]
+        return found
+
+
+def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+    """Every setting with faults against the golden one with which it shares most pairs.
+
+    Returns:
+        Plain values, over the missions that both flew. `first`, `second`: labels of the golden
+        setting, and of the other; `name`: of that in one phrase. `corrected_p`: of the family of
+        all comparisons of this kind, by Holm. `differences`: second minus first, over the pairs in
+        which both succeeded. `over_own`: the largest flight time over that of the golden flight of
+        the same mission, both successful. `over_mean`: the longest of the same flights over the
+        mean of the same golden ones, as the paper has it.
+    """
+    found = []
+    for group in groups:
+        golden = _golden_for(group, groups)
+        if golden is not None:
+            found.append(_Match(golden, group, golden, *matched(golden, group)))
+    return _compared(found, confidence)
+
+
+def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+    """Every protected setting against the unprotected one with the same faults.
+
+    Returns:
+        As `against_golden`; the worst cases with what protection recovers of them.
+    """
+    bare = {
+        untreated(group.labels): group for group in groups if not (group.watched or group.golden)
+    }
+    found = []
+    for group in groups:
+        if not group.watched:
+            continue
+        faulty, golden = bare.get(untreated(group.labels)), _golden_for(group, groups)
+        if faulty is not None and golden is not None:
+            found.append(_Match(faulty, group, golden, *matched(faulty, group)))
+    return _compared(found, confidence)
+
+
+def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
+    """The golden setting that flew most of this setting's missions; None of itself golden."""
+    if group.golden:
+        return None
+    shared = [
+        (np.intersect1d(group.pairs, each.pairs, assume_unique=True).size, -index)
+        for index, each in enumerate(groups)
+        if each.golden and not each.watched
+    ]
+    most = max(shared, default=(0, 0))
+    return groups[-most[1]] if most[0] else None
+
+
+def _compared(matches: Sequence[_Match], confidence: float) -> list[dict[str, Any]]:
+    matches = [each for each in matches if len(each.at_second)]
+    tests = [mcnemar(*each.success) for each in matches]
+    corrected = holm([test.p_value for test in tests])
+    rows = []
+    for each, test, p_value in zip(matches, tests, corrected, strict=True):
+        over_own, over_mean = each.worst()
+        rows.append(
+            {
+                "first": each.first.labels,
+                "second": each.second.labels,
+                "name": each.second.name,
+                "success": asdict(test),
+                "corrected_p": p_value,
+                "differences": {
+                    name: asdict(
+                        interval(each.differences(name), confidence=confidence, resamples=RESAMPLES)
+                    )
+                    for name in METRICS
+                },
+                "over_own": asdict(over_own),
+                "over_mean": asdict(over_mean),
+            }
+        )
+    return rows

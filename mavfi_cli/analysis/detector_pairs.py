@@ -1,0 +1,210 @@
+"""Flights of one mission side by side: golden, with a fault, and with a fault and a detector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from enum import Enum
+from typing import Any
+
+import pyarrow as pa
+
+from mavfi_cli.campaign.outcome import Injected
+
+LONGER = 0.05  # of the golden flight time: from here on a fault has done harm
+NONE = "none"  # no detector: what all others are held against
+ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
+KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; a golden flight has two
+Flight = Mapping[str, Any]  # a row of `analysis.flights`
+Place = tuple[str, str, tuple[Any, ...]]  # kind, detector, KEY
+# Columns that a pair is read by; the labels are those of KEY, the kind and the detector.
+WANTED = (
+    "outcome", "succeeded", "flight_time_s", "injected", "struck_s", "struck_sites", "first_bits",
+    "crashed", "alarms", "alarm_count", "episodes", "path",
+)  # fmt: skip
+_TEXT, _NUMBER, _FLAG, _COUNT = pa.string(), pa.float64(), pa.bool_(), pa.int64()
+CSV = {
+    "kind": _TEXT, "world": _TEXT, "seed": _COUNT, "detector": _TEXT, "level": _TEXT,
+    "stage": _TEXT, "target": _TEXT, "field": _TEXT, "state": _TEXT, "bits": _TEXT,
+    "injected": _TEXT, "harm": _TEXT, "crashed": _FLAG, "golden_outcome": _TEXT,
+    "golden_time_s": _NUMBER, "faulty_outcome": _TEXT, "faulty_time_s": _NUMBER, "outcome": _TEXT,
+    "time_s": _NUMBER, "lengthening": _NUMBER, "struck_s": _NUMBER, "alarm_s": _NUMBER,
+    "alarm_stage": _TEXT, "latency_s": _NUMBER, "by_chance": _FLAG, "remaining_harm": _TEXT,
+    "alarms": _COUNT, "episodes": _COUNT,
+}  # fmt: skip
+SCHEMA = pa.schema(
+    CSV | dict.fromkeys(("golden_won", "faulty_won", "won", "active", "struck", "seen", "undone",
+                         "complete"), _FLAG)
+    | {"faulty_lengthening": _NUMBER, "faulty_struck_s": _NUMBER, "golden_path": _TEXT,
+       "faulty_path": _TEXT}
+)  # fmt: skip
+
+
+class Harm(Enum):
+    """What a fault did to an unprotected flight, against its golden pair."""
+
+    NONE = "none"
+    LOST = "lost"  # the golden flight reached the goal, this one did not
+    LONGER = "longer"  # both did, this one took more than LONGER longer
+    OTHERWISE = "otherwise"  # both failed, in different ways
+
+
+def harm_of(golden: Flight, flown: Flight) -> Harm:
+    """What a treatment did to a mission, against its golden flight.
+
+    A mission that failed and now succeeds has suffered no harm.
+    """
+    if flown["succeeded"]:
+        longer = golden["succeeded"] and (lengthening(golden, flown) or 0.0) > LONGER
+        return Harm.LONGER if longer else Harm.NONE
+    if golden["succeeded"]:
+        return Harm.LOST
+    return Harm.NONE if flown["outcome"] == golden["outcome"] else Harm.OTHERWISE
+
+
+def lengthening(golden: Flight, flown: Flight) -> float | None:
+    """By what part of the golden flight time another flight was longer; None if either failed."""
+    if not (golden["succeeded"] and flown["succeeded"]):
+        return None
+    if not golden["flight_time_s"] or flown["flight_time_s"] is None:
+        return None
+    return float(flown["flight_time_s"] / golden["flight_time_s"] - 1.0)
+
+
+def _ended(prefix: str, flown: Flight) -> dict[str, Any]:
+    return {f"{prefix}outcome": flown["outcome"], f"{prefix}time_s": flown["flight_time_s"]}
+
+
+def _first_alarm(flown: Flight, from_s: float | None) -> Mapping[str, Any] | None:
+    """The first alarm at that time or later; None where none is listed."""
+    if from_s is None:
+        return None
+    return next((alarm for alarm in flown["alarms"] if alarm["stamp_s"] >= from_s - 1e-9), None)
+
+
+def error_free_pair(
+    world: str, seed: int, detector: str, golden: Flight, watched: Flight
+) -> dict[str, Any]:
+    """A golden flight, and the same with a detector, as a row of SCHEMA."""
+    return {
+        "kind": ERROR_FREE,
+        "world": world,
+        "seed": seed,
+        "detector": detector,
+        **_ended("golden_", golden),
+        **_ended("", watched),
+        "lengthening": lengthening(golden, watched),
+        "alarms": watched["alarm_count"] or 0,
+        "episodes": watched["episodes"],
+        "golden_won": golden["succeeded"],
+        "won": watched["succeeded"],
+        "golden_path": golden["path"],
+    }
+
+
+def fault_pair(
+    labels: Mapping[str, Any],
+    golden: Flight,
+    faulty: Flight,
+    watched: Flight,
+    protected: Flight,
+    *,
+    complete: bool = True,
+) -> dict[str, Any]:
+    """A golden flight, the same with a fault, and with a detector besides, as a row of SCHEMA.
+
+    `active`: the unprotected flight was struck, and something read it or may have. `struck`: the
+    protected flight was; otherwise there was nothing to detect. `seen`: it had an alarm at or
+    after the strike. `by_chance`: without the fault the detector raises one from then on, too.
+
+    Args:
+        labels: KEY and the detector.
+        watched: the golden flight with the detector.
+        protected: the faulty flight itself for the detector `none`.
+        complete: of its mission all faults are flown with detectors; otherwise this one is,
+            because it is harmful.
+    """
+    active = faulty["injected"] in (Injected.ACTIVE.value, Injected.UNREAD.value)
+    harm, remaining = harm_of(golden, faulty), harm_of(golden, protected)
+    struck_s = protected["struck_s"]
+    alarm = _first_alarm(protected, struck_s)
+    return {
+        "kind": FAULT,
+        **labels,
+        "state": "+".join(faulty["struck_sites"]) or labels["target"],
+        "bits": " ".join(map(str, faulty["first_bits"])),
+        "injected": faulty["injected"],
+        "harm": harm.value if active else "",
+        "crashed": faulty["crashed"],
+        **_ended("golden_", golden),
+        **_ended("faulty_", faulty),
+        **_ended("", protected),
+        "lengthening": lengthening(golden, protected),
+        "struck_s": struck_s,
+        "alarm_s": alarm and alarm["stamp_s"],
+        "alarm_stage": alarm and alarm["stage"],
+        "latency_s": None if alarm is None else max(0.0, alarm["stamp_s"] - struck_s),
+        "by_chance": _first_alarm(watched, struck_s) is not None,
+        "remaining_harm": remaining.value if active else "",
+        "alarms": protected["alarm_count"] or 0,
+        "episodes": protected["episodes"],
+        "golden_won": golden["succeeded"],
+        "faulty_won": faulty["succeeded"],
+        "won": protected["succeeded"],
+        "active": active,
+        "struck": struck_s is not None,
+        "seen": alarm is not None,
+        "undone": remaining is Harm.NONE,
+        "complete": complete,
+        "faulty_lengthening": lengthening(golden, faulty),
+        "faulty_struck_s": faulty["struck_s"],
+        "faulty_path": faulty["path"],
+    }
+
+
+def pairs_of(
+    flights: Iterable[pa.Table], detectors: Collection[str], complete: Callable[[int], bool]
+) -> tuple[pa.Table, pa.Table]:
+    """All pairs of which every flight is there: without faults, and with one.
+
+    Args:
+        flights: that ended, labelled with a kind, a detector and KEY; in the order of the pairs.
+        complete: whether all faults of the mission with this seed are flown with detectors.
+    """
+    known = {place: row for table in flights for place, row in _placed(table)}
+    chosen = [(place, row) for place, row in known.items() if place[1] in detectors]
+    return (
+        pa.Table.from_pylist([*_error_free(known, chosen)], SCHEMA),
+        pa.Table.from_pylist([*_faults(known, chosen, complete)], SCHEMA),
+    )
+
+
+def _placed(table: pa.Table) -> Iterator[tuple[Place, Flight]]:
+    names = [name for name in ("kind", "detector", *KEY) if f"label_{name}" in table.column_names]
+    for row in table.select([*(f"label_{name}" for name in names), *WANTED]).to_pylist():
+        key = tuple(row.get(f"label_{name}") for name in KEY)
+        yield (str(row["label_kind"]), str(row["label_detector"]), key), row
+
+
+def _error_free(
+    known: Mapping[Place, Flight], chosen: Iterable[tuple[Place, Flight]]
+) -> Iterator[dict[str, Any]]:
+    for (kind, detector, key), watched in chosen:
+        golden = known.get((ERROR_FREE, NONE, key))
+        if kind == ERROR_FREE and golden is not None:
+            yield error_free_pair(key[0], key[1], detector, golden, watched)
+
+
+def _faults(
+    known: Mapping[Place, Flight],
+    chosen: Iterable[tuple[Place, Flight]],
+    complete: Callable[[int], bool],
+) -> Iterator[dict[str, Any]]:
+    for (kind, detector, key), protected in chosen:
+        mission = (*key[:2], *[None] * (len(KEY) - 2))
+        golden = known.get((ERROR_FREE, NONE, mission))
+        watched = known.get((ERROR_FREE, detector, mission))
+        faulty = known.get((kind, NONE, key))
+        if kind == ERROR_FREE or golden is None or watched is None or faulty is None:
+            continue
+        labels = {**dict(zip(KEY, key, strict=True)), "detector": detector}
+        yield fault_pair(labels, golden, faulty, watched, protected, complete=complete(key[1]))

@@ -1,0 +1,296 @@
+"""What a detector does with faults and without: numbers of pairs, each with its interval.
+
+A fault that was not injected, or that nothing read, is counted apart and is in no other number.
+Harmful faults are all flown with the detectors; harmless ones only of the `complete` missions.
+Everything about what a fault *does* comes from the unprotected flight: in a protected one the
+detector may withhold the value before anybody reads it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.detector_pairs import KEY, LONGER, NONE, Harm
+from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers
+from mavfi_cli.analysis.pairs import paired
+from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.link.session import SessionSettings
+from mavfi_cli.stats.bootstrap import Interval, interval, interval_of_rows, median
+from mavfi_cli.stats.paired import McNemar, holm, mcnemar
+from mavfi_cli.stats.roc import curves
+from mavfi_cli.stats.shares import Share, mixture, rate
+from mavfi_cli.stats.worst_case import worst_over_own
+
+RESAMPLES = 999
+TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick a state message
+ALL = "all"
+GROUPS = (ALL, "world", "stage", "field", "state")  # what faults are gathered by
+_NOTHING_SEEN = -math.log(0.025)  # upper 95 % limit of a Poisson count that was 0
+# Harmful faults with their scores, and the scores of error-free flights, of a detector.
+Scored = Callable[[str], tuple[pa.Table, list[float]]]
+
+
+def found(
+    detectors: Sequence[str], error_free: pa.Table, faults: pa.Table, scored: Scored
+) -> dict[str, Any]:
+    """What the pairs say of the detectors, a row a group and detector, as plain values.
+
+    Args:
+        detectors: all of them, `none` first.
+        error_free, faults: as `detector_pairs.pairs_of` has them.
+        scored: by detector: its harmful faults with the columns `stage`, `field` and `score`, and
+            the scores of its error-free flights.
+    """
+    return {
+        "error_free": [
+            {"by": by, "value": value, "detector": detector, **error_free_metrics(part)}
+            for by, value, detector, part in _grouped(detectors, error_free, (ALL, "world"))
+        ],
+        "faults": [
+            {
+                "by": by,
+                "value": value,
+                "detector": detector,
+                **fault_metrics(_part(faults, by, value, NONE), part),
+            }
+            for by, value, detector, part in _grouped(detectors, faults, GROUPS)
+        ],
+        "comparisons": _comparisons(detectors, faults),
+        "curves": {name: _curves(*scored(name)) for name in detectors if name != NONE},
+    }
+
+
+def _grouped(
+    detectors: Sequence[str], pairs: pa.Table, groups: Sequence[str]
+) -> Iterator[tuple[str, str, str, pa.Table]]:
+    """Group, its value, detector, and the pairs, in the order in which values first come."""
+    for by in groups:
+        values = pc.unique(pairs[by]).to_pylist() if by != ALL else [ALL] * bool(pairs.num_rows)
+        for value, detector in itertools.product(values, detectors):
+            yield by, value, detector, _part(pairs, by, value, detector)
+
+
+def _part(pairs: pa.Table, by: str, value: str, detector: str) -> pa.Table:
+    return chosen(pairs, detector=detector, **({} if by == ALL else {by: value}))
+
+
+def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[dict[str, Any]]:
+    """Every two detectors on the same faults, with p-values corrected over all of them."""
+    rows: list[dict[str, Any]] = []
+    for first, second in itertools.combinations(detectors, 2):
+        tests = recoveries_compared(*(chosen(faults, detector=name) for name in (first, second)))
+        row: dict[str, Any] = {"first": first, "second": second}
+        for what, test in zip(("recovered", "undone"), tests, strict=True):
+            row[what] = {**asdict(test), "difference": test.difference}
+        rows.append(row)
+    for what in ("recovered", "undone"):
+        corrected = holm([row[what]["p_value"] for row in rows])
+        for row, p_value in zip(rows, corrected, strict=True):
+            row[what]["corrected_p"] = p_value
+    return rows
+
+
+def _curves(harmful: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
+    """Curves over all faults, and the areas of each stage and bit field."""
+    table = asdict(curves(harmful["score"].to_pylist(), error_free))
+    told = ("positives", "area", "area_low", "area_high", "average_precision")
+    table["areas"] = []
+    for by in ("stage", "field"):
+        for value in pc.unique(harmful[by]).to_pylist():
+            part = curves(chosen(harmful, **{by: value})["score"].to_pylist(), error_free)
+            numbers_of = {name: getattr(part, name) for name in told}
+            table["areas"].append({"by": by, "value": value, **numbers_of})
+    return table
+
+
+# Without faults -------------------------------------------------------------------------------
+
+
+def error_free_metrics(pairs: pa.Table) -> dict[str, Any]:
+    """A detector on flights without faults, against the same flights without it.
+
+    Returns:
+        `hours`: of flight with the detector, from taking over to the end of the mission. `alarms`,
+        `episodes`: all alarms, and with those in a row as one. `alarms_per_hour`: bootstrap over
+        flights; with no alarm at all, a Poisson upper limit. `with_alarm`: flights with at least
+        one. `lost`: golden successes that failed with the detector; `gained`: the other way round.
+        `success`: McNemar's test, golden first. `lengthening`: median of flight time over golden
+        flight time, minus 1, of both successful.
+    """
+    alarms = numbers(pairs, "alarms")
+    hours = np.nan_to_num(numbers(pairs, "time_s")) / 3600.0
+    test = _ends(pairs, "golden_won")
+    return {
+        "flights": pairs.num_rows,
+        "hours": math.fsum(hours.tolist()),
+        "alarms": int(alarms.sum()),
+        "episodes": int(numbers(pairs, "episodes").sum()),
+        "alarms_per_hour": asdict(_rate_per_hour(alarms, hours)),
+        "with_alarm": asdict(rate(int(np.count_nonzero(alarms)), pairs.num_rows)),
+        "lost": asdict(rate(test.only_first, test.both + test.only_first)),
+        "gained": test.only_second,
+        "success": asdict(test),
+        "lengthening": asdict(_interval(known(numbers(pairs, "lengthening")), median)),
+    }
+
+
+def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
+    total = float(hours.sum())
+    if total > 0.0 and not alarms.any():
+        return Interval(value=0.0, low=0.0, high=_NOTHING_SEEN / total, count=len(alarms))
+    return interval_of_rows(
+        len(alarms),
+        lambda rows: alarms[rows].sum(axis=-1) / hours[rows].sum(axis=-1),
+        resamples=RESAMPLES,
+    )
+
+
+# With faults ----------------------------------------------------------------------------------
+
+
+def fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
+    """A detector against faults.
+
+    Args:
+        bare: the faults without a detector, all of them.
+        pairs: those that were flown with the detector.
+
+    Returns:
+        `planned`: faults; of them `not_injected`, `not_activated` (nothing read what was struck)
+        and `active`. All that follows is about the active ones, where nothing else is said.
+        `crashed`: faults that killed a node: those are seen without any detector. `harmful`: lost,
+        longer or otherwise; their numbers follow. `flown`: with this detector: all harmful faults,
+        and the harmless ones of complete missions. `not_struck`: of them those that never struck,
+        because the protected flight had parted from the other; in no rate of detection.
+        `detected_harmful`: with an alarm at or after the strike. `detected_active`: the same of all
+        faults of complete missions. `detected_inactive`: the same of faults that were struck but
+        not activated. `by_chance`: flights of complete missions that have an alarm in that time
+        without their fault as well. `latency_s`, `latency_ticks`: median and 95th percentile from
+        strike to alarm, harmful faults. `recovered`: of the lost missions those that succeed with
+        protection. `undone`: of the harmful faults those that do no harm with it. `added`: of the
+        harmless faults those that do harm with it. `golden`, `unprotected`: success rates of all
+        missions with an active fault. `protected`: the same with the detector: harmful and harmless
+        faults, each with its own rate, weighted by how many there are. `success`: McNemar's test on
+        complete missions, unprotected first. `worst`: as `_worst`, of the flown faults.
+    """
+    injected = bare.filter(pc.not_equal(bare["injected"], Injected.NOT_INJECTED.value))
+    active = chosen(injected, active=True)
+    harms = {harm: chosen(active, harm=harm.value).num_rows for harm in Harm}
+    harmful_count = active.num_rows - harms[Harm.NONE]
+    flown = chosen(pairs, active=True)
+    complete = chosen(flown, complete=True)
+    harmful = flown.filter(pc.not_equal(flown["harm"], Harm.NONE.value))
+    harmless = chosen(complete, harm=Harm.NONE.value)
+    latencies_s = known(numbers(harmful, "latency_s"))
+    middle, late = _interval(latencies_s, median), _interval(latencies_s, _p95)
+    protected = mixture(
+        [(harmful_count, _share(harmful, "won")), (harms[Harm.NONE], _share(harmless, "won"))]
+    )
+    return {
+        "planned": bare.num_rows,
+        "not_injected": bare.num_rows - injected.num_rows,
+        "not_activated": injected.num_rows - active.num_rows,
+        "active": active.num_rows,
+        "crashed": int(flags(active, "crashed").sum()),
+        "harmful": asdict(rate(harmful_count, active.num_rows)),
+        **{harm.value: harms[harm] for harm in (Harm.LOST, Harm.LONGER, Harm.OTHERWISE)},
+        "flown": flown.num_rows,
+        "not_struck": chosen(flown, struck=False).num_rows,
+        "latency_s": asdict(middle),
+        "latency_s_p95": asdict(late),
+        "latency_ticks": middle.value * TICKS_PER_S,
+        "latency_ticks_p95": late.value * TICKS_PER_S,
+        **{name: asdict(share) for name, share in {
+            "detected_harmful": _share(chosen(harmful, struck=True), "seen"),
+            "detected_active": _share(chosen(complete, struck=True), "seen"),
+            "detected_inactive": _share(
+                chosen(pairs, active=False, complete=True, struck=True), "seen"
+            ),
+            "by_chance": _share(chosen(complete, struck=True), "by_chance"),
+            "recovered": _share(chosen(harmful, harm=Harm.LOST.value), "won"),
+            "undone": _share(harmful, "undone"),
+            "added": _share(harmless, "undone", wanted=False),
+            "golden": _share(active, "golden_won"),
+            "unprotected": _share(active, "faulty_won"),
+        }.items()},
+        "protected": asdict(protected),
+        "success": asdict(_ends(complete, "faulty_won")),
+        "worst": _worst(flown),
+    }  # fmt: skip
+
+
+def recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
+    """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
+    there, here = paired(second, chosen(first, active=True), KEY)
+    harm = here["harm"]
+
+    def test(among: pa.Array, column: str) -> McNemar:
+        """McNemar's test of a column of flags, over some of the pairs."""
+        return mcnemar(*(flags(each.filter(among), column) for each in (here, there)))
+
+    lost, harmful = pc.equal(harm, Harm.LOST.value), pc.not_equal(harm, Harm.NONE.value)
+    return test(lost, "won"), test(harmful, "undone")
+
+
+def _share(pairs: pa.Table, column: str, *, wanted: bool = True) -> Share:
+    return rate(int((flags(pairs, column) == wanted).sum()), pairs.num_rows)
+
+
+def _ends(pairs: pa.Table, first: str) -> McNemar:
+    """McNemar's test of success without and with the detector."""
+    return mcnemar(flags(pairs, first), flags(pairs, "won"))
+
+
+def _worst(pairs: pa.Table) -> dict[str, Any]:
+    """The worst successful flight time and its recovery, as in the paper's section VII-A.
+
+    The paper flies one world with one seed. Here every mission has a seed of its own, so every
+    flight is held against its own golden pair.
+
+    Returns:
+        `faulty`, `protected`: the largest flight time over golden flight time, minus 1.
+        `recovered`: how much lower the second is, in parts of the golden flight time. Resampled
+        missions never hold a worse case than the worst that was seen, so the interval says how much
+        it hangs on single flights, not how bad it can become. `recovered_share`: of the increase;
+        not a number where no flight was LONGER.
+    """
+    # A flight that failed has no time: it is the longest of none.
+    faulty, protected = (
+        np.nan_to_num(numbers(pairs, name), nan=-math.inf)
+        for name in ("faulty_lengthening", "lengthening")
+    )
+    usable = np.isfinite(faulty) | np.isfinite(protected)
+    if not (np.isfinite(faulty).any() and np.isfinite(protected).any()):
+        usable[:] = False
+    faulty, protected = faulty[usable], protected[usable]
+
+    def recovered(rows: IntArray) -> FloatArray:
+        """What protection takes off the worst increase (k,), for resamples of missions (k, n)."""
+        # A sample without any successful flight of a kind has no worst one: as if none was longer.
+        worst = [np.maximum(each[rows].max(axis=-1), 0.0) for each in (faulty, protected)]
+        return np.asarray(worst[0] - worst[1])
+
+    worst = worst_over_own((1.0 + faulty).tolist(), (1.0 + protected).tolist())
+    return {
+        "faulty": worst.increase,
+        "protected": worst.protected_worst - 1.0,
+        "recovered": asdict(interval_of_rows(len(faulty), recovered, resamples=RESAMPLES)),
+        "recovered_share": worst.recovered_share if worst.increase > LONGER else math.nan,
+    }
+
+
+def _p95(values: FloatArray) -> FloatArray:
+    return np.asarray(np.quantile(values, 0.95, axis=-1))
+
+
+def _interval(values: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Interval:
+    return interval(values, statistic, resamples=RESAMPLES)

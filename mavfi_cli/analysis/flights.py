@@ -1,0 +1,187 @@
+"""A ledger as one table of columns: a row a mission that is over, in the order of the list.
+
+What the missions were comes from the list, what came of them from their records. The table is an
+`pyarrow.Table`: `to_pandas()` makes a data frame of it.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaign.outcome import COUNTED, MissionResult, State
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.types import FloatArray, Outcome
+from mavfi_cli.mission.record.measures import QUALITY, STRUCK, measures_of
+
+CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
+FAULT = ("target", "seed", "bits", "field")
+FORMATS = (".parquet", ".csv")
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+def flights(ledger: Ledger, missions: Iterable[PlannedMission] | None = None) -> pa.Table:
+    """The missions that are over; those that could not begin have the state `error`.
+
+    Columns: what `mission.record.measures` tells of a record, of CONFIG and of the fault's FAULT
+    what was asked for, each label as `label_NAME` and all of them as text in `labels`; `succeeded`;
+    and `counted`: golden, or with a fault that struck something that was read or caught.
+
+    Args:
+        missions: only these; the ledger may have others.
+    """
+    wanted = None if missions is None else {_asked(mission) for mission in missions}
+    labels = sorted({name for cell in ledger.cells() for name in cell})
+    rows = [
+        _row(entry, labels)
+        for entry in ledger.results()
+        if wanted is None or _asked(entry.mission) in wanted
+    ]
+    names = _names(labels)
+    return pa.table({name: _column([row[name] for row in rows]) for name in names})
+
+
+def _asked(mission: PlannedMission) -> tuple[str, str]:
+    return canonical(dict(mission.labels)), canonical(changes_of(mission.config))
+
+
+def _names(labels: Sequence[str]) -> list[str]:
+    own = ("number", "pair", "labels", *(f"label_{name}" for name in labels), *CONFIG, "level")
+    asked = (*(f"fault_{name}" for name in FAULT), "detector", "protect", "changes")
+    came = ("state", "outcome", "succeeded", "counted", "reason", "injected", "wall_s", "attempts")
+    return [*own, *asked, *came, "path", *measures_of({})]
+
+
+def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
+    config, detector = entry.mission.config, entry.mission.config.detector
+    fault = config.fault or config.instruction
+    level = None if fault is None else "instruction" if config.fault is None else "source"
+    injected = None if entry.injected is None else entry.injected.value
+    return {
+        "number": entry.number,
+        "pair": entry.mission.pair,
+        "labels": canonical(dict(entry.mission.labels)),
+        **{f"label_{name}": entry.mission.labels.get(name) for name in labels},
+        **{name: getattr(config, name) for name in CONFIG},
+        "level": level,
+        **{f"fault_{name}": None if fault is None else getattr(fault, name) for name in FAULT},
+        "detector": None if detector is None else detector.name,
+        "protect": None if detector is None else "+".join(detector.protect),
+        "changes": canonical(changes_of(config)),
+        "state": entry.state.value,
+        "outcome": entry.outcome,
+        "succeeded": entry.outcome == Outcome.SUCCESS.value,
+        "counted": injected in COUNTED,
+        "reason": entry.reason,
+        "injected": injected,
+        "wall_s": entry.wall_s,
+        "attempts": entry.attempts,
+        "path": None if entry.path is None else str(entry.path),
+        **measures_of(entry.result),
+    }
+
+
+def _column(values: Sequence[Any]) -> pa.Array:
+    """A column of one type: labels of mixed types become text."""
+    kinds = {type(value) for value in values if value is not None}
+    if len(kinds) > 1 and kinds != {int, float}:
+        values = [None if value is None else str(value) for value in values]
+    return pa.array(values, pa.float64() if kinds == {int, float} else None)
+
+
+def chosen(table: pa.Table, **values: Any) -> pa.Table:
+    """The rows whose columns have these values."""
+    for name, value in values.items():
+        table = table.filter(pc.equal(table[name], value))
+    return table
+
+
+def flown(table: pa.Table) -> pa.Table:
+    """The rows of missions that ended, well or badly; without those that could not begin."""
+    return table.filter(pc.equal(table["state"], State.FLOWN.value))
+
+
+def numbers(table: pa.Table, name: str) -> FloatArray:
+    """A column as floats, (n,); not a number where it is empty."""
+    column = table[name].cast(pa.float64())
+    return np.asarray(column.fill_null(math.nan).to_numpy(), dtype=np.float64)
+
+
+def flags(table: pa.Table, name: str) -> BoolArray:
+    """A column of true and false, (n,)."""
+    return np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=bool)
+
+
+def known(values: FloatArray) -> FloatArray:
+    """The values that are numbers."""
+    return values[~np.isnan(values)]
+
+
+def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
+    """Some columns, row by row."""
+    found: list[Mapping[str, Any]] = table.select(names).to_pylist()
+    return found
+
+
+# The table as a file --------------------------------------------------------------------------
+
+
+def export(ledger: Ledger, path: Path) -> int:
+    """Write the table of a campaign to a .parquet or .csv file; how many rows.
+
+    Raises:
+        ConfigError: another kind of file.
+        RecordError: it cannot be written.
+    """
+    if path.suffix not in FORMATS:
+        raise ConfigError(
+            f"expected a name that ends in {' or '.join(FORMATS)}, or - for CSV on stdout",
+            path=path,
+        )
+    found = _exported(ledger)
+
+    def write(file: Any) -> None:
+        """Write the table in the format of the name."""
+        from pyarrow import csv, parquet
+
+        if path.suffix == ".csv":
+            csv.write_csv(found, file)
+        else:
+            parquet.write_table(found, file, compression="zstd")
+
+    write_atomically(path, write)
+    return int(found.num_rows)
+
+
+def export_csv(ledger: Ledger) -> bytes:
+    """The same as CSV."""
+    from pyarrow import csv
+
+    text = io.BytesIO()
+    csv.write_csv(_exported(ledger), text)
+    return text.getvalue()
+
+
+def _exported(ledger: Ledger) -> pa.Table:
+    """One row a mission that is over, in the order of the list; the labels are columns too."""
+    whole = flights(ledger)
+    return whole.select(
+        [
+            "number", "pair", *(name for name in whole.column_names if name.startswith("label_")),
+            *CONFIG, "level", *(f"fault_{name}" for name in FAULT), *STRUCK, "detector", "protect",
+            "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s", "wall_s",
+            "attempts", "path", "changes",
+        ]
+    )  # fmt: skip

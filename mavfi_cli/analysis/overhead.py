@@ -1,0 +1,248 @@
+"""What detection and recovery cost: of the flight time, and of the kernels' time (Table V).
+
+Of the flight time, by setting: a mission is the unit, each number is the mean over the missions of
+the success rate, with its bootstrap interval. Of the kernels' time: of all error-free flights of a
+detector together. Kernels and recomputations take as long as on the flight's platform; the checks
+take as long as they took on the host.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.analysis.comparison import RESAMPLES
+from mavfi_cli.analysis.groups import Group
+from mavfi_cli.campaign.ledger import LEDGER, Ledger
+from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.types import Stage
+from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, detection_cost
+from mavfi_cli.mission.record.run_folder import RESULT, load_run
+from mavfi_cli.stats.bootstrap import interval
+
+MEASURED = "measured"  # how the source of a measured overhead begins
+TIMES = " x "  # between a platform's name and the one factor on its latencies, in a file's name
+NEAR = 0.1  # a factor of the flights' latencies that far from 1 is still the platform
+_STAGES = tuple(stage.value for stage in Stage)
+# Where ledgers lie below: a campaign, an evaluation of detectors, flights of `mavfi vpm --fly`.
+_LEDGERS = (LEDGER, f"protected/*/{LEDGER}", f"flights/{LEDGER}")
+
+
+# Of the flight time ---------------------------------------------------------------------------
+
+
+def flight_overheads(
+    ledger: Ledger, found: Sequence[Group], confidence: float = 0.95
+) -> list[dict[str, Any]]:
+    """Every setting with a detector; a setting that gathers several has a row for each.
+
+    Args:
+        found: the settings of the ledger.
+
+    Returns:
+        Plain values; shares are of the flight time: 0.01 is one per cent. `labels`: of the
+        setting, with the detector. `flights`: in which it checked anything. `checks_per_s`: of
+        flight time. `check_host_s`: mean time of a check on the host that flew.
+        `detection_host_share`: all checks, time of the host that flew. `recomputations`: in all
+        flights, by stage. `recovery_share`: simulated latency of what was computed again, by stage;
+        `recovery_share_in_all`: of all stages. `share_in_all`: detection and recovery, host time
+        and simulated time added up as the paper does.
+    """
+    rows = []
+    for group in found:
+        flown: dict[str, list[DetectionCost]] = {}
+        for each in ledger.results(group.codes("number")[group.counted].tolist()):
+            cost = detection_cost(each.result)
+            if cost is not None:
+                flown.setdefault(cost.detector, []).append(cost)
+        rows += [_of_setting(group.labels, flown[name], confidence) for name in sorted(flown)]
+    return rows
+
+
+def _of_setting(
+    labels: Mapping[str, Any], costs: Sequence[DetectionCost], confidence: float
+) -> dict[str, Any]:
+    def mean(values: Iterable[float]) -> dict[str, Any]:
+        """Over the flights, with its interval."""
+        return asdict(interval([*values], confidence=confidence, resamples=RESAMPLES))
+
+    return {
+        "labels": {**labels, "detector": costs[0].detector},
+        "flights": len(costs),
+        "checks_per_s": mean(cost.checks / cost.flight_s for cost in costs),
+        "check_host_s": mean(cost.check_host_s for cost in costs),
+        "detection_host_share": mean(cost.detection_share for cost in costs),
+        "recomputations": {
+            stage: math.fsum(cost.recomputations[stage] for cost in costs) for stage in _STAGES
+        },
+        "recovery_share": {
+            stage: mean(cost.recovery_s[stage] / cost.flight_s for cost in costs)
+            for stage in _STAGES
+        },
+        "recovery_share_in_all": mean(cost.recovery_share for cost in costs),
+        "share_in_all": mean(cost.detection_share + cost.recovery_share for cost in costs),
+    }
+
+
+# Of the kernels' time -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComputeOverhead:
+    """What a detector cost in a number of flights.
+
+    Attributes:
+        detection_s: all checks of the gate, host time.
+        recompute_s: recomputations, each at the mean latency of its stage's kernels, simulated.
+        compute_s: all kernels, recomputations included, simulated.
+        host_compute_s: all kernels, host time.
+        alarms: after which something was computed again.
+        platforms: names of those on which the flights flew, in alphabetical order.
+        left_out: flights on other platforms, which do not count.
+    """
+
+    detector: str
+    flights: int
+    detection_s: float
+    recompute_s: float
+    compute_s: float
+    host_compute_s: float
+    alarms: int
+    platforms: tuple[str, ...]
+    left_out: int = 0
+
+    @property
+    def share(self) -> float:
+        """Of the compute time without detection and recovery; 0.01 is one per cent."""
+        return (self.detection_s + self.recompute_s) / (self.compute_s - self.recompute_s)
+
+    @property
+    def checks_share(self) -> float:
+        """The part of `share` that the checks take; the rest is recomputation."""
+        return self.detection_s / (self.compute_s - self.recompute_s)
+
+    @property
+    def checks_host_share(self) -> float:
+        """The checks over the host's own kernel time, whose workload is far below the paper's."""
+        return self.detection_s / self.host_compute_s
+
+    def told(self, where: str) -> str:
+        """Where the number comes from, for the table."""
+        again = self.share - self.checks_share
+        left = f" ({self.left_out} on other platforms left out)" if self.left_out else ""
+        return (
+            f"{MEASURED} in {self.flights} {'flight' if self.flights == 1 else 'flights'} of "
+            f"{where} on {' and '.join(self.platforms)}{left}: checks "
+            f"{100.0 * self.checks_share:.4g} %, {self.alarms} "
+            f"{'recomputation' if self.alarms == 1 else 'recomputations'} {100.0 * again:.4g} %; "
+            f"{HOST_CHECKS}"
+        )
+
+
+def compute_overheads(
+    records: Iterable[Mapping[str, Any]], platform: str | None = None
+) -> dict[str, ComputeOverhead]:
+    """The overhead of every detector in these records, over all of its flights together.
+
+    Flights with a fault do not count: their alarms are the fault's.
+
+    Args:
+        records: result.json of flights.
+        platform: only flights on this one count; None: all.
+    """
+    counted: dict[str, list[DetectionCost]] = {}
+    left_out: Counter[str] = Counter()
+    names: dict[str, str] = {}  # of platforms, by what missions call them
+    for cost in filter(None, map(detection_cost, records)):
+        if cost.faulty or cost.compute_s <= cost.recovered_s or cost.host_compute_s <= 0.0:
+            continue
+        name = names.setdefault(cost.platform, _platform_name(cost.platform))
+        if platform is None or _same(name, platform):
+            counted.setdefault(cost.detector, []).append(cost)
+        else:
+            left_out[cost.detector] += 1
+    return {
+        detector: ComputeOverhead(
+            detector=detector,
+            flights=len(costs),
+            detection_s=sum(cost.checks_host_s for cost in costs),
+            recompute_s=sum(cost.recovered_s for cost in costs),
+            compute_s=sum(cost.compute_s for cost in costs),
+            host_compute_s=sum(cost.host_compute_s for cost in costs),
+            alarms=sum(round(math.fsum(cost.recomputations.values())) for cost in costs),
+            platforms=tuple(sorted({names[cost.platform] for cost in costs})),
+            left_out=left_out[detector],
+        )
+        for detector, costs in counted.items()
+    }
+
+
+def _platform_name(called: str) -> str:
+    """The name in a platform's file where that is still there; without it, what it was called."""
+    if not called.endswith(".toml"):
+        return called
+    try:
+        return load_platform(called).name
+    except MavfiError:
+        return Path(called).stem
+
+
+def _same(name: str, platform: str) -> bool:
+    """Whether it is this platform, or what `mavfi vpm --fly` makes of it for a detector's share."""
+    base, times, factor = name.rpartition(TIMES)
+    if name == platform or not times or base != platform:
+        return name == platform
+    try:
+        return abs(float(factor) - 1.0) <= NEAR
+    except ValueError:  # a name of the user's own
+        return False
+
+
+def recorded_overheads(
+    path: Path, detectors: Sequence[str], platform: str | None = None
+) -> dict[str, ComputeOverhead]:
+    """The overheads of detectors in the error-free flights that lie at a path.
+
+    Args:
+        path: a run folder, a folder of them, a campaign, or the folder of another command.
+        platform: only flights on this one count; None: all.
+
+    Raises:
+        RecordError: there are none; says what is there.
+    """
+    of_each = compute_overheads(_records(path), platform)
+    known = {name: each for name, each in of_each.items() if name in detectors}
+    if not known and platform is not None:
+        elsewhere = compute_overheads(_records(path))
+        flown = sorted({on for name in detectors if name in elsewhere
+                        for on in elsewhere[name].platforms})  # fmt: skip
+        if flown:
+            raise RecordError(
+                f"{path}: its flights with a detector flew on {' and '.join(flown)}, not on "
+                f"{platform} (--platform): its kernels would be those of another computer; "
+                f"mavfi fly --platform {platform} --detector {detectors[-1]} records one"
+            )
+    if not known:
+        others = f", only with {', '.join(of_each)}" if of_each else ""
+        raise RecordError(
+            f"{path}: no error-free flight with {' or '.join(detectors)} is recorded there{others}"
+            f"; mavfi fly --detector {detectors[-1]} records one"
+        )
+    return known
+
+
+def _records(path: Path) -> Iterator[Mapping[str, Any]]:
+    """result.json of a run folder, of all runs in a folder, or of all missions of a campaign."""
+    if path.is_file() or (path / RESULT).is_file():
+        yield load_run(path).result
+        return
+    for ledger in (each for pattern in _LEDGERS for each in sorted(path.glob(pattern))):
+        with Ledger(ledger.parent) as opened:
+            yield from (entry.result for entry in opened.results())
+    for run in sorted(path.glob(f"*/{RESULT}")):
+        yield load_run(run).result

@@ -1,0 +1,151 @@
+"""Traces of unprotected flights once more through the detectors: one score a flight.
+
+The score is the highest of the flight's messages, in units of the detector's threshold: above 1
+the gate would have raised an alarm. Nothing is withheld on the way, so the scores do not depend on
+the threshold. The looks through the flown plan are among them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mavfi_cli.core.files import write_json
+from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.core.types import Stage, Trajectory
+from mavfi_cli.detect.model import preprocessing
+from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
+from mavfi_cli.fi import bits
+from mavfi_cli.mission.detector_config import DetectorConfig, detector_of, model_path
+from mavfi_cli.mission.record.plan_file import read_plans
+from mavfi_cli.mission.record.run_folder import load_run
+
+SCORES = "scores.json"
+_WAY = "looks ahead"  # how scores are taken; those of another way are not mixed with them
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Kept:
+    """What was kept of a flight, as far as a gate sees it."""
+
+    columns: Columns
+    plans: Sequence[Trajectory]
+    strikes: Sequence[PlanStrike]
+
+
+def _kept_of(path: Path) -> _Kept:
+    run = load_run(path)
+    if run.trace is None:
+        return _Kept(columns={}, plans=(), strikes=())
+    fault = run.result.get("fault") or {}
+    strikes = [
+        PlanStrike(
+            stamp_s=strike["stamp_s"], state=change["state"], waypoint=change["index"],
+            before=_value(change["state"], change["before_hex"]),
+            after=_value(change["state"], change["after_hex"]),
+        )
+        for strike in fault.get("strikes", ())
+        for change in strike["changes"]
+        if change["state"] in BY_NAME and BY_NAME[change["state"]].stage is Stage.PLANNING
+    ]  # fmt: skip
+    return _Kept(columns=columns_of(run.trace), plans=read_plans(run.folder.plans), strikes=strikes)
+
+
+def _value(state: str, pattern: str) -> float | int | bool:
+    """From its bits: a record has no numbers that are not finite."""
+    kind = bits.NUMPY_TYPES[BY_NAME[state].dtype.value]
+    return bits.value_of(int(pattern, 16), kind)
+
+
+class Scores:
+    """Scores of flights by detector; what was scored once is kept in the folder.
+
+    Args:
+        detectors: without `none`.
+        stack: that the flights flew.
+        folder: of the evaluation.
+    """
+
+    def __init__(self, detectors: Sequence[DetectorConfig], stack: str, folder: Path) -> None:
+        self._detectors = detectors
+        self._stack = stack
+        self._path = folder / SCORES
+        self._names = {
+            each.name: f"{each.name}/{'+'.join(sorted(each.protect))}/{_WAY}/"
+            f"{model_digest(each, stack)}"
+            for each in detectors
+        }
+        self._kept: dict[str, dict[str, float | None]] = _read(self._path)
+
+    def score_all(
+        self, flights: Iterable[tuple[str | None, float | None]], tell: Callable[[str], None]
+    ) -> None:
+        """Score what was not scored yet; flights without a trace are passed over.
+
+        Args:
+            flights: run folder, and when the fault struck, s.
+            tell: hears how many flights are replayed.
+        """
+        missing = [
+            (Path(path), struck_s)
+            for path, struck_s in flights
+            if path is not None
+            and any(Path(path).name not in self._kept.get(n, {}) for n in self._names.values())
+        ]
+        if not missing:
+            return
+        tell(f"replaying {len(missing)} flights through {len(self._names)} detectors")
+        for path, struck_s in missing:
+            flight = _kept_of(path)
+            for detector in self._detectors:
+                kept = self._kept.setdefault(self._names[detector.name], {})
+                if path.name not in kept:
+                    kept[path.name] = self._score(flight, struck_s, detector)
+        write_json(self._path, self._kept)
+
+    def of(self, path: str | None, detector: str) -> float | None:
+        """The score of a flight; None where it has no trace. A score that is NaN is an alarm."""
+        kept = self._kept.get(self._names[detector], {})
+        if path is None or Path(path).name not in kept:
+            return None
+        score = kept[Path(path).name]
+        return math.inf if score is None else score
+
+    def _score(self, flight: _Kept, struck_s: float | None, detector: DetectorConfig) -> float:
+        """The highest score from the strike on, or of the whole flight without one."""
+        if not flight.columns:  # it ended before the first tick
+            return 0.0
+        path = model_path(detector, self._stack)
+        fresh = detector_of(detector, self._stack)
+        from_s = -math.inf if struck_s is None else struck_s - 1e-9
+        highest = 0.0
+        judgements = replay(
+            flight.columns, fresh, None if path is None else preprocessing(path),
+            protect=frozenset(map(Stage, detector.protect)),
+            plans=flight.plans, strikes=flight.strikes,
+        )  # fmt: skip
+        for judged in judgements:
+            if judged.stamp_s >= from_s and not judged.score <= highest:
+                highest = judged.score
+                if math.isnan(highest):
+                    return math.inf
+        return highest / fresh.threshold
+
+
+def model_digest(detector: DetectorConfig, stack: str) -> str:
+    """A name for the contents of a detector's model file; `none` without one."""
+    path = model_path(detector, stack)
+    return "none" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _read(path: Path) -> dict[str, dict[str, float | None]]:
+    """What was kept; damaged or missing, nothing."""
+    try:
+        kept: dict[str, dict[str, float | None]] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return kept

@@ -1,0 +1,181 @@
+"""From one depth frame to its setpoint: which kernel ran when, as a time table tells.
+
+An invocation's input is the output of the last invocation of the kernel before it that had ended
+when this one started: the queues hold one message, and the newest wins.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from mavfi_cli.core.types import Outcome
+from mavfi_cli.mission.companion.companion import SAME_TICK_S
+from mavfi_cli.mission.companion.executor import Invocation
+from mavfi_cli.mission.companion.response import Reaction
+from mavfi_cli.mission.platform import KERNELS
+from mavfi_cli.mission.record.run_folder import Run
+from mavfi_cli.mission.record.timetable import read_timetable
+
+CHAIN = ("point_cloud", "octomap", "collision_check")  # from a frame to the verdict on the way
+LEAST_S = 1.0  # of flight that a timeline shows
+_ANSWERS = ("slow", "stop")  # events: what the pilot does about a foreseen collision
+_PLAN_WITHIN_S = 3.0
+_MARGIN_S = 0.05
+_SAME_S = 1e-9
+
+
+def timelines(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
+    """The timelines of several platforms over the same time, a row each; of those that answered.
+
+    Args:
+        runs: by platform.
+    """
+    alone = {name: timeline_of(run) for name, run in runs.items()}
+    longest_s = max((row["shown_s"][1] for row in alone.values() if row), default=LEAST_S)
+    return [
+        {"platform": name, **row}
+        for name, run in runs.items()
+        if (row := timeline_of(run, longest_s)) is not None
+    ]
+
+
+def timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any] | None:
+    """One second of a flight, from a typical depth frame on; longer where its answer takes longer.
+
+    Where a verdict had the vehicle slow down or stop, the frame is of such a verdict, and what
+    follows is shown up to the first setpoint of the new plan. Times count from the frame's stamp,
+    s. `chain_s` holds the invocations that led to the setpoints, `lanes_s` all that ran in the
+    window.
+
+    Args:
+        run: with its time table and trace.
+        least_s: so much is shown from the frame on.
+
+    Returns:
+        Plain values; None where no frame was ever answered.
+
+    Raises:
+        RecordError: the time table cannot be read.
+    """
+    timetable = read_timetable(run.folder.kernels)
+    told = {e["stamp_s"]: e["text"] for e in run.result["events"] if e["kind"] in _ANSWERS}
+    stamps = [] if run.trace is None else run.trace["stamp_s"].to_pylist()
+    reaction = typical(timetable.reactions, told)
+    if reaction is None:
+        return None
+    ran = timetable.invocations
+    zero_s, answer_s = reaction.frame_stamp_s, reaction.setpoint_stamp_s
+    chain = chain_of(ran, reaction)
+    plan = _planned(ran, answer_s) if answer_s in told else None
+    plan_setpoint_s = None if plan is None else _answered(ran, stamps, plan.end_s)
+    last_s = max(answer_s, plan_setpoint_s or 0.0) + _MARGIN_S
+    shown = (zero_s - _MARGIN_S, max(last_s, zero_s + least_s))
+    return {
+        "frame_stamp_s": zero_s,
+        "response_s": answer_s - zero_s,
+        "answer": told.get(answer_s, "knows of the frame"),
+        "plan_setpoint_s": None if plan_setpoint_s is None else plan_setpoint_s - zero_s,
+        "shown_s": [shown[0] - zero_s, shown[1] - zero_s],
+        "chain_s": {
+            each.node: [each.start_s - zero_s, each.end_s - zero_s]
+            for each in (*chain, *(() if plan is None else (plan,)))
+        },
+        "lanes_s": {kernel: _spans(ran, kernel, shown, zero_s) for kernel in KERNELS},
+        "setpoints_s": [s - zero_s for s in stamps if shown[0] <= s <= shown[1]],
+    }
+
+
+def typical(reactions: Sequence[Reaction], told: Collection[float] = ()) -> Reaction | None:
+    """The reaction whose time is nearest the median of the flight's; the first of equals.
+
+    Args:
+        told: stamps of setpoints; where there are reactions that end in one, it is one of those.
+    """
+    if not reactions:
+        return None
+    median_s = statistics.median(map(_time_s, reactions))
+    chosen = [each for each in reactions if each.setpoint_stamp_s in told] or reactions
+    return min(chosen, key=lambda each: (abs(_time_s(each) - median_s), each.frame_stamp_s))
+
+
+def _time_s(reaction: Reaction) -> float:
+    return reaction.setpoint_stamp_s - reaction.frame_stamp_s
+
+
+def chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
+    """The invocations through which a frame reached its setpoint, in order; control's is the last.
+
+    Fewer where the time table does not hold them all.
+    """
+    found: list[Invocation] = []
+    before_s = reaction.setpoint_stamp_s
+    for kernel in reversed(CHAIN):
+        last = _last(invocations, kernel, before_s)
+        if last is None:
+            break
+        found.insert(0, last)
+        before_s = last.start_s
+    ends_s = found[-1].end_s if found else reaction.frame_stamp_s
+    control = [
+        each for each in invocations if each.node == "control" and ends_s - _SAME_S <= each.start_s
+    ]
+    return [*found, *control[:1]]
+
+
+def _last(invocations: Sequence[Invocation], kernel: str, before_s: float) -> Invocation | None:
+    """The newest output of a kernel at a moment."""
+    over = [e for e in invocations if e.node == kernel and e.end_s <= before_s + _SAME_S]
+    return max(over, key=lambda each: each.end_s, default=None)
+
+
+def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation | None:
+    """The first planning after a verdict was answered, at once or once the vehicle stands."""
+    for each in invocations:
+        if each.node == "planner" and each.start_s >= answer_s - _SAME_S:
+            return each if each.start_s <= answer_s + _PLAN_WITHIN_S else None
+    return None
+
+
+def _answered(
+    invocations: Sequence[Invocation], stamps_s: Sequence[float], ready_s: float
+) -> float | None:
+    """The first setpoint that knows of an output that was ready at a moment."""
+    for each in invocations:
+        if each.node == "control" and each.start_s >= ready_s - _SAME_S:
+            delay_s = each.end_s - each.start_s
+            due_s = each.start_s if delay_s < SAME_TICK_S else each.end_s
+            return next((stamp for stamp in stamps_s if stamp >= due_s - _SAME_S), None)
+    return None
+
+
+def _spans(
+    invocations: Sequence[Invocation], kernel: str, shown: tuple[float, float], zero_s: float
+) -> list[list[float]]:
+    """Start and end of what a kernel did in a window, s from its zero."""
+    return [
+        [each.start_s - zero_s, each.end_s - zero_s]
+        for each in invocations
+        if each.node == kernel and each.end_s >= shown[0] and each.start_s <= shown[1]
+    ]
+
+
+def timeline_seed(flown: Sequence[Mapping[str, Any]], platforms: Sequence[str]) -> int | None:
+    """The first mission that all platforms fly well and with a new plan on the way.
+
+    Where there is none, the first that all fly well; None where there is none of those.
+
+    Args:
+        flown: golden and other flights, with the columns of `platforms.SCHEMA`.
+    """
+    for least in (1, 0):
+        by_seed: dict[int, set[str]] = {}
+        for row in flown:
+            won = not row["target"] and row["outcome"] == Outcome.SUCCESS.value
+            if won and (row["replans"] or 0) >= least:
+                by_seed.setdefault(row["seed"], set()).add(row["platform"])
+        complete = [seed for seed, names in by_seed.items() if len(names) == len(platforms)]
+        if complete:
+            return min(complete)
+    return None

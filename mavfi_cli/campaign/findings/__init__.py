@@ -1,1 +1,0 @@
-"""What a campaign has found: its missions gathered, compared, summarised, drawn and exported."""

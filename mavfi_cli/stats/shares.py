@@ -1,0 +1,172 @@
+"""Proportions with their Wilson intervals, and how many missions an interval takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+from mavfi_cli.core.errors import ConfigError
+
+Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of like runs within it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Share:
+    """A proportion with its Wilson score interval."""
+
+    count: int
+    total: int
+    share: float
+    low: float
+    high: float
+
+
+def wilson(
+    count: int,
+    total: int,
+    *,
+    design_effect: float = 1.0,
+    confidence_z: float = 1.959963984540054,
+) -> Share:
+    """Wilson score interval (E. B. Wilson, JASA 22, 1927), 95 % by default.
+
+    With no observation the interval is the whole of [0, 1] and the share is not a number. A design
+    effect above 1 counts as that many times fewer observations.
+    """
+    if total == 0:
+        return Share(count=0, total=0, share=math.nan, low=0.0, high=1.0)
+    p, n = count / total, total / design_effect
+    z2 = confidence_z**2
+    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = confidence_z * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2)) / (1 + z2 / n)
+    return Share(
+        count=count,
+        total=total,
+        share=p,
+        low=max(0.0, centre - half) if count else 0.0,
+        high=min(1.0, centre + half) if count < total else 1.0,
+    )
+
+
+def z_of(confidence: float) -> float:
+    """The two-sided normal quantile of a confidence between 0 and 1.
+
+    Raises:
+        ConfigError: it is not between them.
+    """
+    if not 0.0 < confidence < 1.0:
+        raise ConfigError(f"must be between 0 and 1, got {confidence:g}", key="confidence")
+    return NormalDist().inv_cdf(0.5 + confidence / 2.0)
+
+
+def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
+    """A proportion with its Wilson score interval."""
+    return wilson(successes, total, confidence_z=z_of(confidence))
+
+
+def half_width(share: Share) -> float:
+    """Half of the width of the interval."""
+    return (share.high - share.low) / 2.0
+
+
+def design_effect(hits: Sequence[bool], clusters: Sequence[Cluster | None]) -> float:
+    """How many times the variance of a share is that of as many independent runs; at least 1.
+
+    W. G. Cochran, Sampling Techniques, 3rd edition, 1977, sections 9A and 11: squared sums of
+    residuals of the clusters against their stratum's share, and the variance of how many runs fall
+    into each stratum.
+
+    Args:
+        hits: whether each run counts.
+        clusters: stratum and cluster of each run; None for a run that stands for itself.
+    """
+    total = len(hits)
+    share = sum(hits) / total if total else 0.0
+    if not 0.0 < share < 1.0:
+        return 1.0
+    strata: dict[Hashable, dict[Hashable, list[bool]]] = {}
+    for number, (hit, place) in enumerate(zip(hits, clusters, strict=True)):
+        stratum, cluster = place or (None, number)
+        strata.setdefault(stratum, {}).setdefault(cluster, []).append(hit)
+    variance = 0.0
+    for members in strata.values():
+        size = sum(map(len, members.values()))
+        own = sum(map(sum, members.values())) / size
+        variance += size * (own - share) ** 2
+        squares = sum((sum(each) - own * len(each)) ** 2 for each in members.values())
+        variance += squares * len(members) / max(1, len(members) - 1)
+    return max(1.0, variance / (total * share * (1.0 - share)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mixture:
+    """A rate of parts that were sampled differently, with its interval."""
+
+    share: float
+    low: float
+    high: float
+
+
+def mixture(parts: Sequence[tuple[int, Share]]) -> Mixture:
+    """The rate of a whole from the rates of its parts, each weighted by its true size.
+
+    The interval adds the distances to the ends of the parts' Wilson intervals in squares (MOVER,
+    G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). Not a number where a part that is
+    not empty was never sampled.
+    """
+    whole = sum(size for size, _ in parts)
+    if not whole:
+        return Mixture(share=math.nan, low=0.0, high=1.0)
+    weighted = [(size / whole, part) for size, part in parts if size]
+    share = math.fsum(weight * part.share for weight, part in weighted)
+    below = math.hypot(*(weight * (part.share - part.low) for weight, part in weighted))
+    above = math.hypot(*(weight * (part.high - part.share) for weight, part in weighted))
+    return Mixture(share=share, low=max(0.0, share - below), high=min(1.0, share + above))
+
+
+def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: float = 0.95) -> int:
+    """The fewest missions whose Wilson interval is at most `margin` to either side of its centre.
+
+    From (z / (1 + z²/n)) sqrt(p (1 - p)/n + z²/(4 n²)) <= m, which is, with u = z²/n, the quadratic
+    u² (1/4 - m²) + u (p (1 - p) - 2 m²) - m² <= 0.
+
+    Args:
+        margin: half of the interval's width.
+        expected: the rate that is expected; 0.5 is the worst case.
+
+    Raises:
+        ConfigError: a margin not between 0 and 0.5, a rate not within 0 and 1.
+    """
+    if not 0.0 < margin < 0.5:
+        raise ConfigError(f"must be between 0 and 0.5, got {margin:g}", key="margin")
+    if not 0.0 <= expected <= 1.0:
+        raise ConfigError(f"must be within 0 and 1, got {expected:g}", key="expected")
+    z2 = z_of(confidence) ** 2
+    a, b, c = 0.25 - margin**2, expected * (1.0 - expected) - 2.0 * margin**2, -(margin**2)
+    u = (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
+    return math.ceil(z2 / u - 1e-9)
+
+
+def pairs_for_difference(
+    difference: float, discordant: float, *, confidence: float = 0.95, power: float = 0.8
+) -> int:
+    """Pairs of missions that McNemar's test needs to find a difference of two success rates.
+
+    (z_a sqrt(q) + z_b sqrt(q - d²))² / d², with q the share of pairs whose outcomes differ and d
+    the difference (R. J. Connor, Biometrics 43, 1987).
+
+    Raises:
+        ConfigError: no difference, or a share of differing pairs that does not allow it.
+    """
+    if not 0.0 < abs(difference) <= discordant <= 1.0:
+        raise ConfigError(
+            "a difference d and a share q of pairs that differ need 0 < d <= q <= 1, got "
+            f"d = {difference:g}, q = {discordant:g}"
+        )
+    if not 0.0 < power < 1.0:
+        raise ConfigError(f"must be between 0 and 1, got {power:g}", key="power")
+    z_b = NormalDist().inv_cdf(power)
+    root = z_of(confidence) * math.sqrt(discordant) + z_b * math.sqrt(discordant - difference**2)
+    return math.ceil(root**2 / difference**2 - 1e-9)

@@ -1,0 +1,105 @@
+"""The missions of a comparison: the same ones on each platform, as a campaign's specification."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.analysis.platforms import GOLDEN, NONE, platforms_told
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.specification.spec import Setting, Spec
+from mavfi_cli.core.config import require_distinct
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.types import Stage
+from mavfi_cli.mission.stack import DEFAULT
+
+FAULTY = "FI"  # settings are named as in the presets
+_SHORT = {"gad": "G", "aad": "A"}  # of detectors, in the names of settings
+STAGES = tuple(stage.value for stage in Stage)
+MOST = 100_000  # missions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparePlan:
+    """What is compared. As it stands: the paper's Fig. 16, mission for mission the preset fig16.
+
+    Attributes:
+        platforms: names or files; the others are held against the first.
+        inject: stages, states or groups that a fault strikes, one a flight; empty flies golden
+            missions only.
+        detectors: names; `none` may be among them or not, it is always flown.
+        missions: of each platform and setting, and of each target of `inject`.
+        first_seed: of the missions; seeds count up from here.
+        seed: root of the faults' seeds.
+        field: bit field that is struck; None draws any bit.
+        stack: of all missions; a name, a file or a variant.
+
+    Raises:
+        ConfigError: nothing to fly, or something is named twice.
+    """
+
+    platforms: tuple[str, ...] = ("x86", "tx2")
+    world: str = "sparse"
+    inject: tuple[str, ...] = STAGES
+    detectors: tuple[str, ...] = (NONE, "gad", "aad")
+    missions: int = 100
+    first_seed: int = 1
+    seed: int = 1
+    field: str | None = None
+    stack: str = DEFAULT
+
+    def __post_init__(self) -> None:
+        named: dict[str, tuple[str, ...]] = {
+            "platform": self.platforms,
+            "detector": self.detectors,
+            "inject": self.inject,
+        }
+        for key, names in named.items():
+            if not names and key != "inject":
+                raise ConfigError("name at least one", key=key)
+        if not 1 <= self.missions <= MOST:
+            limit = "least 1" if self.missions < 1 else f"most {MOST}"
+            raise ConfigError(f"must be at {limit}, got {self.missions}", key="missions")
+        for key in ("first_seed", "seed"):
+            if getattr(self, key) < 0:
+                raise ConfigError(f"must not be negative, got {getattr(self, key)}", key=key)
+        if self.field is not None and not self.inject:
+            raise ConfigError(f"{self.field}: there is no fault", key="field")
+        files = [str(Path(n).resolve()) if n.endswith(".toml") else n for n in self.platforms]
+        for key, names in (*named.items(), ("platform", tuple(files))):
+            require_distinct(names, key)
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Golden, `none`, and the detectors: what is flown on each platform."""
+        protectors = tuple(name for name in self.detectors if name != NONE)
+        return (GOLDEN, NONE, *protectors) if self.inject else (GOLDEN,)
+
+    def told(self) -> dict[str, Any]:
+        """What is compared, with what the platforms are, as plain values."""
+        platforms = platforms_told(self.platforms)
+        return {**asdict(self), "platforms": platforms, "settings": list(self.settings)}
+
+    def spec(self) -> Spec:
+        """The campaign."""
+        axis = "stage" if set(self.inject) <= set(STAGES) else "site"
+        faults: dict[str, tuple[Any, ...]] = {axis: self.inject}
+        if self.field is not None:
+            faults["field"] = (self.field,)
+        settings = [Setting(name=GOLDEN)]
+        for name in self.settings[1:]:
+            detector = {} if name == NONE else {"detector": (name,)}
+            told = FAULTY if name == NONE else f"D&R({_SHORT.get(name, name)})"
+            settings.append(Setting(name=told, axes={**faults, **detector}))
+        return Spec(
+            name="compare",
+            about="The same missions on several computers",
+            seed=self.seed,
+            first_seed=self.first_seed,
+            repetitions=self.missions,
+            keep=Keep.NONE,
+            fixed={} if self.stack == DEFAULT else {"stack": self.stack},
+            axes={"world": (self.world,), "platform": self.platforms},
+            settings=tuple(settings),
+        )

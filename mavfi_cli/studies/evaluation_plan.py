@@ -1,0 +1,252 @@
+"""The missions of an evaluation of detectors, on seeds that no model was made with."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.analysis.detector_pairs import ERROR_FREE, FAULT, NONE
+from mavfi_cli.analysis.scores import model_digest
+from mavfi_cli.campaign.missions import Label, PlannedMission, changes_of
+from mavfi_cli.core.config import require_distinct
+from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
+from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.states import DType
+from mavfi_cli.core.types import Stage
+from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.listing import training_flights
+from mavfi_cli.detect.registry import names
+from mavfi_cli.fi.bits import Field
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.detector_config import STAGES, DetectorConfig, detector_of, model_path
+from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+
+WORLDS = ("sparse", "dense", "factory", "farm")
+DETECTORS = (NONE, "range", "l2", "gad", "aad")
+INTEGER = "integer"  # all bits of states that have no sign, exponent and mantissa
+FIELDS = (Field.SIGN.value, Field.EXPONENT.value, Field.MANTISSA.value, INTEGER)
+NODES = {
+    "octomap": Stage.PERCEPTION,
+    "collision_check": Stage.PERCEPTION,
+    "point_cloud": Stage.PERCEPTION,
+    "planner": Stage.PLANNING,
+    "control": Stage.CONTROL,
+}
+SOURCE, INSTRUCTION = "source", "instruction"
+_DRAWS = 1000  # fault seeds that are tried until one draws a state of the wanted type
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InjectionSite:
+    """Where faults of one kind strike.
+
+    Attributes:
+        stage: of the corrupted kernel or of its output.
+        target: a stage, or a node.
+        field: a bit field, `integer`, or `any`.
+    """
+
+    stage: str
+    target: str
+    field: str
+
+
+Fault = tuple[str, int, InjectionSite]  # world, seed of the mission, where
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationPlan:
+    """What is flown.
+
+    Attributes:
+        detectors: names; `none` may be among them or not, it is always flown.
+        flights: missions of each world that get a fault of each place, one a flight.
+        harmless_flights: of them the first so many, all of whose faults are flown with the
+            detectors; of the others only faults that turn out to do harm.
+        golden_flights: error-free missions of each world; the first of them are those with faults.
+        first_seed: seeds of missions count up from here; training flies from 10 000 on.
+        models: folder of model files `NAME.json`; None takes those shipped for the stack of `base`.
+        level: source or instruction.
+        fields: bit fields that are struck at the source level.
+        seed: of the faults.
+        base: what else is to be flown.
+    """
+
+    worlds: tuple[str, ...] = WORLDS
+    detectors: tuple[str, ...] = DETECTORS
+    flights: int = 25
+    harmless_flights: int = 5
+    golden_flights: int = 100
+    first_seed: int = 500_000
+    protect: tuple[str, ...] = STAGES
+    models: Path | None = None
+    level: str = SOURCE
+    fields: tuple[str, ...] = FIELDS
+    seed: int = 1
+    base: MissionConfig = field(default_factory=MissionConfig)
+
+    def __post_init__(self) -> None:
+        if self.harmless_flights < 0:
+            raise ConfigError(
+                f"must not be negative, got {self.harmless_flights}", key="harmless flights"
+            )
+        if self.flights < 0 or self.golden_flights < max(1, self.flights):
+            raise ConfigError(
+                f"needs at least one error-free flight and one for each with a fault, got "
+                f"{self.golden_flights} and {self.flights}",
+                key="golden flights",
+            )
+        _require_some("level", (self.level,), (SOURCE, INSTRUCTION))
+        _require_some("world", self.worlds, self.worlds)
+        _require_some("detector", self.detectors, (NONE, *names()))
+        _require_some("stage", self.protect, STAGES)
+        _require_some("field", self.fields, FIELDS)
+
+    @property
+    def protectors(self) -> tuple[str, ...]:
+        """The detectors without `none`."""
+        return tuple(name for name in self.detectors if name != NONE)
+
+    def detector_config(self, detector: str) -> DetectorConfig:
+        """A detector as missions take it.
+
+        Raises:
+            ModelError: the folder of models has no such file.
+        """
+        path = None if self.models is None else self.models.absolute() / f"{detector}.json"
+        if path is not None and not path.is_file():
+            raise ModelError("no such model file", path=path)
+        return DetectorConfig(
+            name=detector, protect=self.protect, model=None if path is None else str(path)
+        )
+
+    @property
+    def seeds(self) -> range:
+        """Of the missions, the same in each world; the first `flights` of them get faults."""
+        return range(self.first_seed, self.first_seed + self.golden_flights)
+
+    def told(self) -> dict[str, Any]:
+        """What is flown, with what the detectors are, as plain values."""
+        stack = self.base.stack
+        return {
+            "worlds": list(self.worlds),
+            "detectors": {
+                each.name: {
+                    "threshold": detector_of(each, stack).threshold,
+                    "model_sha256": model_digest(each, stack),
+                }
+                for each in map(self.detector_config, self.protectors)
+            },
+            "protect": list(self.protect),
+            "places": [asdict(place) for place in self.places()],
+            "mission": changes_of(self.base),
+            **{name: getattr(self, name) for name in ("level", "flights", "harmless_flights",
+                                                      "golden_flights", "first_seed", "seed")},
+        }  # fmt: skip
+
+    def places(self) -> list[InjectionSite]:
+        """Where faults strike: stage by bit field, or node."""
+        if self.level == INSTRUCTION:
+            return [
+                InjectionSite(stage=stage.value, target=node, field=Field.ANY.value)
+                for node, stage in NODES.items()
+            ]
+        return [
+            InjectionSite(stage=stage.value, target=stage.value, field=name)
+            for stage, name in itertools.product(Stage, self.fields)
+            if stage is not Stage.CONTROL or name != INTEGER  # its states are all float64
+        ]
+
+    def bare(self) -> list[PlannedMission]:
+        """Golden flights, then those with a fault, none of them with a detector."""
+        return [self._mission(key) for key in self._keys()]
+
+    def protected(self, detector: str, harmful: Collection[Fault]) -> list[PlannedMission]:
+        """The same once more with a detector.
+
+        Args:
+            harmful: the faults that did harm without one.
+        """
+        return [
+            self._mission(key, detector)
+            for key in self._keys()
+            if key[2] is None or self.complete(key[1]) or (*key[:2], key[2]) in harmful
+        ]
+
+    def complete(self, seed: int) -> bool:
+        """Whether the detectors fly all faults of this mission, harmless ones as well."""
+        return seed in self.seeds[: self.harmless_flights]
+
+    def _keys(self) -> Iterator[tuple[str, int, InjectionSite | None]]:
+        for world, seed in itertools.product(self.worlds, self.seeds):
+            yield world, seed, None
+        faulty = self.seeds[: self.flights]
+        yield from itertools.product(self.worlds, faulty, self.places())
+
+    def _mission(
+        self, key: tuple[str, int, InjectionSite | None], detector: str = NONE
+    ) -> PlannedMission:
+        world, seed, place = key
+        config = replace(self.base, world=world, seed=seed)
+        labels: dict[str, Label] = {
+            "kind": FAULT, "world": world, "seed": seed, "detector": detector
+        }  # fmt: skip
+        if place is None:
+            labels["kind"] = ERROR_FREE
+        else:
+            config = replace(config, **self._fault(world, seed, place))
+            labels |= {"level": self.level, "stage": place.stage, "target": place.target,
+                       "field": place.field}  # fmt: skip
+        if detector != NONE:
+            config = replace(config, detector=self.detector_config(detector))
+        return PlannedMission(config=config, labels=labels)
+
+    def _fault(self, world: str, seed: int, place: InjectionSite) -> dict[str, Any]:
+        drawn = (self.seed, Stream.FAULT, "evaluation", world, seed, place.target, place.field)
+        if self.level == INSTRUCTION:
+            return {"instruction": InstructionConfig(target=place.target, seed=derive(*drawn))}
+        whole = place.field == INTEGER
+        for number in range(_DRAWS):
+            fault = FaultConfig(
+                target=place.target,
+                field=Field.ANY.value if whole else place.field,
+                seed=derive(*drawn, number),
+            )
+            # Drawn again until the state is of the wanted type, so each of them is as likely.
+            if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:
+                return {"fault": fault}
+        raise ConfigError(f"no state of {place.target} has a bit field {place.field}")
+
+
+def _require_some(what: str, chosen: Sequence[str], known: Sequence[str]) -> None:
+    if not chosen:
+        raise ConfigError("none is named", key=what)
+    for name in chosen:
+        if name not in known:
+            raise UnknownName(what, name, known)
+    require_distinct(chosen, what)
+
+
+def require_held_out(plan: EvaluationPlan) -> None:
+    """Refuse detectors that cannot be loaded, and missions that a model was made with.
+
+    Seeds are compared whatever the world: two worlds may be drawn from the same numbers.
+
+    Raises:
+        ModelError: a model that cannot be used; names the flight that it was made with.
+    """
+    for detector in map(plan.detector_config, plan.protectors):
+        detector_of(detector, plan.base.stack)
+        path = model_path(detector, plan.base.stack)
+        for flight in () if path is None else training_flights(model_file.provenance(path)):
+            seed = flight.rpartition("/")[2]
+            if seed.isdigit() and int(seed) in plan.seeds:
+                raise ModelError(
+                    f"{detector.name} was made with the flight {flight}: seeds {plan.seeds.start} "
+                    f"to {plan.seeds.stop - 1} are not held out, choose another --first-seed",
+                    path=path,
+                )

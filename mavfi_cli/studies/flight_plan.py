@@ -1,0 +1,194 @@
+"""What a row of the model becomes in the simulator: vehicle, platform, limits of the mission.
+
+The simulated vehicle and platform are TOML files that a mission names by path. Their names hold a
+digest of their contents, so that equal names mean equal flights.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mavfi_cli.analysis.overhead import TIMES
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import write_text
+from mavfi_cli.mission.companion.companion import BRAKE_SHARE
+from mavfi_cli.mission.config import LIMITS, MissionConfig
+from mavfi_cli.mission.detector_config import DetectorConfig
+from mavfi_cli.mission.platform import PlatformProfile
+from mavfi_cli.mission.stack import DEFAULT
+from mavfi_cli.vpm.model import safe_velocity_mps
+from mavfi_cli.vpm.schemes import DETECTORS, Scheme
+from mavfi_cli.vpm.setting import Setting, outcome
+
+# What of the model the simulation does not take over; printed with every report of flights.
+NOT_SCALED = (
+    "size, propellers and drag are those of the simulated vehicle; boards weigh, but have no "
+    "size: inertia and drag do not grow with them",
+    "the model's acceleration is pull / mass - g; here it is the companion's limit, of which "
+    f"planning uses {100.0 * BRAKE_SHARE:g} % to speed up and to brake",
+    "the simulated companion plans with 90 % of the safe velocity, flies round obstacles, stops to "
+    "plan, and speeds up and slows down; the model flies straight at one velocity",
+    "flights begin at take-off height and end within the goal's tolerance; climbing there is not "
+    "counted, as in the model; a turn before departure, where the stack has one, is counted",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightPlan:
+    """How a vehicle is flown with a scheme.
+
+    Attributes:
+        mission: without world and seed.
+        files: TOML files that the mission names, by path.
+        model_velocity_mps: the safe velocity that it flies with, where the mission can take it.
+        braking_velocity_mps: the safe velocity with the deceleration that the companion counts on.
+        rotors_w: electrical power of hovering with all boards, by the model.
+        boards_w: of all boards.
+        cut: what of the model the mission cannot take, in words.
+    """
+
+    scheme: Scheme
+    mission: MissionConfig
+    files: Mapping[Path, str]
+    model_velocity_mps: float
+    braking_velocity_mps: float
+    rotors_w: float
+    boards_w: float
+    cut: tuple[str, ...] = field(default=())
+
+
+def flight_plan(
+    setting: Setting,
+    scheme: Scheme,
+    platform: PlatformProfile,
+    chain_s: float,
+    folder: Path,
+    models: Path | None = None,
+    stack: str = DEFAULT,
+) -> FlightPlan:
+    """The mission that flies a scheme at the model's safe velocity.
+
+    Args:
+        platform: whose latencies are scaled to the model's response time.
+        chain_s: what the model takes for that platform's response time.
+        folder: absolute; for the files.
+        models: of model files NAME.json; None takes those that come with the detectors.
+        stack: that the mission flies.
+
+    Raises:
+        CannotLift: the rotors do not lift so many boards.
+        ConfigError: the model's numbers make no mission.
+    """
+    flown = outcome(setting, scheme)
+    boards_w = scheme.copies * setting.board.power_w
+    velocity_mps, cut_v = _within("v_max_mps", flown.velocity_mps, "velocity", "m/s")
+    accel_mps2, cut_a = _within("a_max_mps2", flown.acceleration_mps2, "acceleration", "m/s²")
+    range_m, cut_r = _within("map_range_m", setting.range_m, "sensing range", "m")
+    rate_hz, cut_f = _within("camera_rate_hz", setting.vehicle.sensor_hz, "sensor rate", "Hz")
+    stem = f"{_safe(setting.vehicle.name)}-{scheme.name}"
+    vehicle = _file(folder, stem, vehicle_text(setting, scheme, accel_mps2))
+    factor = setting.compute_s * (1.0 + scheme.overhead) / chain_s
+    computer = _file(folder, f"{stem}-{_safe(platform.name)}", platform_text(platform, factor))
+    detector = None
+    if scheme.name in DETECTORS:
+        model = None if models is None else str(models.absolute() / f"{scheme.name}.json")
+        detector = DetectorConfig(name=scheme.name, model=model)
+    return FlightPlan(
+        scheme=scheme,
+        mission=MissionConfig(
+            vehicle=str(vehicle[0]),
+            platform=str(computer[0]),
+            stack=stack,
+            v_max_mps=velocity_mps,
+            a_max_mps2=accel_mps2,
+            map_range_m=range_m,
+            camera_rate_hz=rate_hz,
+            detector=detector,
+        ),
+        files=dict((vehicle, computer)),
+        model_velocity_mps=flown.velocity_mps,
+        braking_velocity_mps=safe_velocity_mps(
+            BRAKE_SHARE * accel_mps2, setting.response_s(scheme.overhead), setting.range_m
+        ),
+        rotors_w=flown.power_w - boards_w,
+        boards_w=boards_w,
+        cut=tuple(filter(None, (cut_v, cut_a, cut_r, cut_f))),
+    )
+
+
+def write_files(plan: FlightPlan) -> None:
+    """Write the TOML files that the plan's missions name.
+
+    Raises:
+        RecordError: a file cannot be written.
+    """
+    for path, text in plan.files.items():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordError(f"{path.parent}: {error.strerror or error}") from None
+        write_text(path, text)
+
+
+def vehicle_text(setting: Setting, scheme: Scheme, acceleration_mps2: float) -> str:
+    """TOML of the simulated vehicle that stands in for the model's, with a scheme's boards."""
+    vehicle, boards = setting.vehicle, scheme.copies
+    told = f"{vehicle.name} of the performance model with {boards} x {setting.board.name}"
+    return "\n".join(
+        [
+            f"name = {_quoted(f'{vehicle.name}-{scheme.name}')}",
+            f"description = {_quoted(told)}",
+            f"base = {_quoted(vehicle.stand_in)}",
+            f"mass_kg = {vehicle.mass_kg!r}",
+            f"extra_payload_kg = {setting.carried_kg(boards)!r}  # boards and heat sinks",
+            f"rotor_pull_n = {setting.pull_n!r}",
+            f"acceleration_mps2 = {acceleration_mps2!r}",
+            f"hover_power_w = {vehicle.hover_power_w!r}",
+            f"battery_wh = {vehicle.battery_wh!r}",
+            f"avionics_w = {boards * setting.board.power_w!r}",
+            "",
+        ]
+    )
+
+
+def platform_text(platform: PlatformProfile, factor: float) -> str:
+    """TOML of a platform with all latencies of another times a factor."""
+    lines = [
+        f"name = {_quoted(f'{platform.name}{TIMES}{factor:.6g}')}",
+        f"cores = {platform.cores}",
+        f"carried = {str(platform.carried).lower()}",
+    ]
+    for name, kernel in platform.kernels.items():
+        lines += [
+            f"[kernels.{name}]",
+            f"latency_s = {factor * kernel.latency_s!r}",
+            f"spread = {kernel.spread!r}",
+            f"source = {_quoted(f'{platform.name}{TIMES}{factor:.6g}')}",
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:
+    """The nearest that a mission can take, and what is to be told where that is not the same."""
+    low, high = LIMITS[key]
+    taken = min(max(wanted, low), high)
+    told = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"
+    return taken, "" if taken == wanted else told
+
+
+def _file(folder: Path, stem: str, text: str) -> tuple[Path, str]:
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return folder / f"{stem}-{digest}.toml", text
+
+
+def _safe(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "-" for c in name) or "unnamed"
+
+
+def _quoted(text: str) -> str:
+    """A TOML basic string."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else " " for c in escaped) + '"'

@@ -1,0 +1,181 @@
+"""Which flights stand beside the rows of the performance model: a plan a vehicle and scheme."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaign.preflight import ask_vehicle
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options
+from mavfi_cli.campaign.specification.factors import check_names
+from mavfi_cli.core.config import require_distinct
+from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.detector_config import detector_of
+from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.stack import DEFAULT
+from mavfi_cli.studies.beside_model import BASE, Key
+from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan, write_files
+from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS
+from mavfi_cli.studies.train import TrainingPlan, train
+from mavfi_cli.vpm.report import CHAINS, Choices, setting_of
+from mavfi_cli.vpm.schemes import DETECTORS, Scheme
+from mavfi_cli.vpm.vehicle import Vehicle
+
+WORLDS = ("sparse", "dense")
+FLOWN, TRAINING = "flown", "training"
+PLATFORM = "x86"  # whose latencies are scaled where no platform is named
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RedundancyPlan:
+    """What is to be flown.
+
+    Attributes:
+        missions: of each scheme in each world.
+        folder: of flights and pictures; what it has is not flown again.
+        models: of the detectors; None takes those that come with them.
+        train: flights of each training world to which detectors are fitted for each vehicle; 0
+            fits none.
+        stack: of all flights.
+    """
+
+    vehicles: Sequence[Vehicle]
+    choices: Choices
+    worlds: tuple[str, ...] = WORLDS
+    missions: int
+    first_seed: int
+    folder: Path
+    models: Path | None = None
+    train: int = 0
+    stack: str = DEFAULT
+
+    @property
+    def models_told(self) -> str:
+        """Where the detectors' models are from."""
+        if self.train:
+            worlds = ", ".join(TRAINING_WORLDS)
+            flown = f"{self.train} error-free flights in each of {worlds} at its safe velocity"
+            return f"fitted for each vehicle to {flown}"
+        if self.models is not None:
+            return f"of {self.models}"
+        return "the shipped ones, fitted to flights of the Solo at 3 m/s"
+
+    def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
+        """Mission by mission, so that pairs are complete wherever the list is cut off."""
+        seeds = range(self.first_seed, self.first_seed + self.missions)
+        return [
+            PlannedMission(
+                config=replace(plan.mission, world=world, seed=seed),
+                labels={"group": vehicle, "arm": scheme, "world": world},
+                pair=f"{world}/{seed}",
+            )
+            for seed in seeds
+            for world in self.worlds
+            for (vehicle, scheme), plan in flown.items()
+        ]
+
+
+def make_plans(
+    plan: RedundancyPlan, schemes: Sequence[Scheme], options: Options, spectator: Spectator
+) -> dict[Key, FlightPlan | str]:
+    """A plan, or why there is none, for each vehicle and scheme; their files are written.
+
+    Args:
+        options, spectator: of the flights to which detectors are fitted, where that is asked for.
+
+    Raises:
+        UnknownName, VehicleProcessError: a world, a stack or a simulated vehicle that does not
+            exist.
+        CannotLift: a vehicle that does not lift one board.
+        ModelError: a detector's model that cannot be used.
+    """
+    require_distinct(plan.worlds, "world")
+    if plan.train:
+        _require_held_out(plan)
+    for world in plan.worlds:
+        check_names(MissionConfig(world=world, seed=plan.first_seed, stack=plan.stack), ask_vehicle)
+    return {
+        (vehicle.name, scheme): each
+        for vehicle in plan.vehicles
+        for scheme, each in _plans_of(plan, vehicle, schemes, options, spectator)
+    }
+
+
+def _plans_of(
+    plan: RedundancyPlan,
+    vehicle: Vehicle,
+    schemes: Sequence[Scheme],
+    options: Options,
+    spectator: Spectator,
+) -> Iterator[tuple[str, FlightPlan | str]]:
+    """The schemes of a vehicle, one board without protection first."""
+    platform = plan.choices.platform or load_platform(PLATFORM)
+    chain = CHAINS[plan.choices.chain][0]
+    chain_s = chain([kernel.latency_s for kernel in platform.kernels.values()])
+    setting, models = setting_of(vehicle, plan.choices), plan.models
+    folder = plan.folder.absolute() / FLOWN
+    refused: dict[int, str | None] = {}  # by number of boards: what the simulator says
+    for scheme in schemes:
+        try:
+            each = flight_plan(setting, scheme, platform, chain_s, folder, models, plan.stack)
+        except CannotLift as error:
+            if scheme.name == BASE:
+                raise
+            yield scheme.name, str(error)
+            continue
+        if each.mission.detector is not None:
+            detector_of(each.mission.detector, each.mission.stack)
+        write_files(each)
+        if scheme.copies not in refused:
+            refused[scheme.copies] = _refusal(plan, each, bare=scheme.name == BASE)
+        yield scheme.name, refused[scheme.copies] or each
+        if scheme.name == BASE and plan.train:
+            models = fitted(plan, vehicle.name, each, options, spectator)
+
+
+def _refusal(plan: RedundancyPlan, flown: FlightPlan, *, bare: bool) -> str | None:
+    """Why the simulator does not fly so many boards; an error where it is one board."""
+    try:
+        ask_vehicle(replace(flown.mission, world=plan.worlds[0], seed=plan.first_seed))
+    except VehicleProcessError as error:
+        if bare:
+            raise
+        return str(error)
+    return None
+
+
+def fitted(
+    plan: RedundancyPlan, vehicle: str, flown: FlightPlan, options: Options, spectator: Spectator
+) -> Path:
+    """The folder of detectors that are fitted to error-free flights of a plan.
+
+    What is there is taken: the folder's name holds a digest of the mission and of the number of
+    flights.
+
+    Raises:
+        ModelError: too few flights reached their goals, or torch is missing.
+    """
+    text = canonical([changes_of(flown.mission), plan.train])
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    folder = plan.folder / TRAINING / f"{vehicle}-{digest}"
+    if not all((folder / f"{name}.json").is_file() for name in DETECTORS):
+        spectator.on_note(f"{vehicle}: error-free flights to which its detectors are fitted")
+        training = TrainingPlan(flights=plan.train, kinds=DETECTORS, base=flown.mission)
+        train(training, folder, options, spectator)
+    return folder
+
+
+def _require_held_out(plan: RedundancyPlan) -> None:
+    """Refuse missions with the seeds of training flights, whatever their worlds."""
+    first = TrainingPlan().first_seed
+    last = first + plan.train * len(TRAINING_WORLDS) - 1
+    if plan.first_seed <= last and first <= plan.first_seed + plan.missions - 1:
+        raise ConfigError(
+            f"seeds {first} to {last} are for training: choose another --first-seed",
+            key="first seed",
+        )

@@ -1,0 +1,144 @@
+"""Training of detectors: error-free flights, the data set of their samples, the fitted models.
+
+The paper's training set (section VI): two obstacle densities times two obstacle sizes, 25 flights
+each, the world of every flight from a seed of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.types import Outcome
+from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.dataset import Dataset, FlightSamples
+from mavfi_cli.detect.fit import KINDS, check, fit
+from mavfi_cli.detect.model import Model
+from mavfi_cli.detect.offline import columns_of, flight_of
+from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.record.plan_file import read_plans
+from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.stack import load_stack
+
+WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
+FLIGHTS = 25  # of each world
+FIRST_SEED = 10_000  # far from the seeds that people fly and evaluate with
+FLIGHTS_FOLDER, DATASET = "flights", "dataset.parquet"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingPlan:
+    """What is flown and fitted.
+
+    Attributes:
+        flights: of each world.
+        first_seed: seeds count up from here, over all worlds.
+        seed: of the split and of the first weights.
+        n_sigma: threshold of the Gaussian model; None takes its default.
+    """
+
+    worlds: tuple[str, ...] = WORLDS
+    flights: int = FLIGHTS
+    first_seed: int = FIRST_SEED
+    seed: int = 1
+    n_sigma: float | None = None
+    kinds: tuple[str, ...] = KINDS
+    base: MissionConfig = field(default_factory=MissionConfig)
+
+    def missions(self) -> list[PlannedMission]:
+        """The flights, world by world."""
+        return [
+            PlannedMission(
+                config=replace(
+                    self.base, world=world, seed=self.first_seed + place * self.flights + number
+                ),
+                labels={"world": world},
+            )
+            for place, world in enumerate(self.worlds)
+            for number in range(self.flights)
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainedDetectors:
+    """What came of it.
+
+    Attributes:
+        models: by detector, with the files that they were written to.
+        failed: flights that did not reach the goal, and so are no part of the data set.
+    """
+
+    dataset: Dataset
+    models: Mapping[str, tuple[Model, Path]]
+    failed: int
+
+
+def fly_training(
+    plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
+) -> tuple[Dataset, int]:
+    """Fly what is missing, and gather the samples of all flights that reached the goal.
+
+    Returns:
+        The data set, written to the folder as well, and how many flights are not in it.
+
+    Raises:
+        ModelError: no flight can be used.
+        UnknownName: there is no such stack.
+        ConfigError: the folder holds the flights of another plan; the stack makes no sense.
+        RecordError: a file cannot be written.
+    """
+    missions, stack = plan.missions(), load_stack(plan.base.stack).mark
+    ledger = run_campaign(
+        missions, folder / FLIGHTS_FOLDER, replace(options, keep=Keep.ALL), spectator
+    )
+    preprocess = PreprocessParams()
+    flights: list[FlightSamples] = []
+    with ledger:
+        for entry in ledger.results():
+            config = missions[entry.number].config
+            if entry.outcome == Outcome.SUCCESS.value and entry.path is not None:
+                run = load_run(folder / FLIGHTS_FOLDER / entry.path)
+                assert run.trace is not None
+                columns = columns_of(run.trace)
+                plans = read_plans(run.folder.plans)
+                flights.append(flight_of(columns, config.world, config.seed, preprocess, plans))
+    if not flights:
+        raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
+    dataset = Dataset(flights=tuple(flights), preprocess=preprocess, stack=stack)
+    dataset.save(folder / DATASET)
+    return dataset, len(missions) - len(flights)
+
+
+def train(
+    plan: TrainingPlan,
+    folder: Path,
+    options: Options,
+    spectator: Spectator,
+) -> TrainedDetectors:
+    """Fly, gather, fit, and write the models with their provenance.
+
+    Raises:
+        ModelError: too few flights, an unknown kind, or torch is missing; before anything is
+            flown, unless too many flights fail.
+        ConfigError: n sigma out of range; the folder holds the flights of another plan.
+        RecordError: a file cannot be written.
+    """
+    check(plan.kinds, len(plan.missions()), plan.n_sigma)
+    dataset, failed = fly_training(plan, folder, options, spectator)
+    fitted = {}
+    for kind in plan.kinds:
+        spectator.on_note(f"fitting {kind}")
+        fitted[kind] = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
+    models = {}
+    for kind, model in fitted.items():  # all of them, or none
+        path = folder / f"{kind}.json"
+        model_file.save(path, model)
+        models[kind] = (model, path)
+    return TrainedDetectors(dataset=dataset, models=models, failed=failed)

@@ -1,0 +1,97 @@
+"""Flights of a comparison, made up."""
+
+import pyarrow as pa
+import pytest
+
+from mavfi_cli.analysis.platforms import SCHEMA, figures
+from mavfi_cli.studies.compare_plan import ComparePlan
+
+PLAN = ComparePlan(inject=("planning",), missions=10)
+SEEDS = range(1, 11)
+
+
+def flight(platform, seed, time_s, setting="golden", **changes):
+    """A successful flight; with faults where the setting is not golden."""
+    faulty = setting != "golden"
+    values = {
+        "platform": platform,
+        "setting": setting,
+        "target": "planning" if faulty else "",
+        "seed": seed,
+        "fault_seed": 7 * seed if faulty else None,
+        "outcome": "success",
+        "counted": True,
+        "flight_time_s": time_s,
+        "distance_m": 50.0,
+        "energy_regression_j": 400.0 * time_s,
+        "energy_propeller_j": 100.0 * time_s,
+        "replans": 1.0,
+        "response_median_s": 0.4 if platform == "x86" else 1.6,
+        "response_p95_s": 0.5 if platform == "x86" else 2.0,
+    }
+    return values | changes
+
+
+def table(flights):
+    """Flights as columns, with whether they succeeded."""
+    found = pa.Table.from_pylist(flights, SCHEMA)
+    return found.append_column("succeeded", pa.array([f["outcome"] == "success" for f in flights]))
+
+
+def figures_of(plan, flights):
+    """The numbers of flights of a plan."""
+    return figures(plan.platforms, plan.settings, pa.Table.from_pylist(flights, SCHEMA))
+
+
+def made_up():
+    """TX2 is 1.5 times as slow; seed 2's fault costs as much again, and detectors save part."""
+    flights = []
+    for platform, factor in (("x86", 1.0), ("tx2", 1.5)):
+        for seed in SEEDS:
+            own_s = factor * (20.0 + seed)
+            flights.append(flight(platform, seed, own_s))
+            flights.append(flight(platform, seed, own_s * (2.0 if seed == 2 else 1.0), "none"))
+            flights.append(flight(platform, seed, own_s * (1.25 if seed == 2 else 1.0), "gad"))
+            flights.append(flight(platform, seed, own_s, "aad"))
+    return flights
+
+
+def lane(*spans):
+    return [list(span) for span in spans]
+
+
+def panel(platform, factor):
+    """A frame's way through kernels that take so many times as long as on x86."""
+    octomap, check = 0.3 * factor, 0.02 * factor
+    answer = round(octomap + check + 0.04, 2)
+    chain = {
+        "point_cloud": [0.0, 0.002],
+        "octomap": [0.02, 0.02 + octomap],
+        "collision_check": [0.02 + octomap, 0.02 + octomap + check],
+        "control": [answer, answer + 0.0005],
+        "planner": [answer, answer + 0.08 * factor],
+    }
+    return {
+        "platform": platform,
+        "frame_stamp_s": 12.0,
+        "response_s": answer,
+        "answer": "stops before an obstacle",
+        "plan_setpoint_s": answer + 0.1 * factor,
+        "shown_s": [-0.05, 2.5],
+        "chain_s": chain,
+        "lanes_s": {name: lane(span) for name, span in chain.items()},
+        "setpoints_s": [0.02 * tick for tick in range(125)],
+    }
+
+
+@pytest.fixture(scope="session")
+def whole():
+    """All that compare.json holds, of made-up flights; do not change it."""
+    return {
+        "schema": 1,
+        "plan": PLAN.told(),
+        "versions": {},
+        "errors": [],
+        **figures_of(PLAN, made_up()),
+        "timeline": {"seed": 4, "platforms": [panel("x86", 1.0), panel("tx2", 4.0)]},
+    }

@@ -1,0 +1,338 @@
+"""What a summary counts where, and which missions it compares."""
+
+import json
+import math
+import re
+
+import pytest
+from plain_values import named
+
+from mavfi_cli.analysis.comparison import against_golden, protection
+from mavfi_cli.analysis.failures import failures
+from mavfi_cli.analysis.groups import METRICS, groups
+from mavfi_cli.analysis.summary import qualities, summarise
+from mavfi_cli.campaign.begin import stopped
+from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
+from mavfi_cli.core.files import plain
+from mavfi_cli.fi.tracer.fault import FaultModel
+from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.report.tables.campaign import failure_lines, quality_lines, summary_lines
+
+ACTIVE, GOLDEN = Injected.ACTIVE, Injected.GOLDEN
+FI = {"setting": "FI", "stage": "control"}
+SAVED = {"setting": "D&R", "stage": "control", "detector": "gad"}
+
+
+def fill(book):
+    """Ten golden flights of 20 s; faulty ones 10 s longer, of which 3 fail; protected 2 s."""
+    for seed in range(10):
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN)
+        book.add(FI, seed, 30.0 + (seed == 9), outcome="collision" if seed < 3 else "success")
+        book.add(SAVED, seed, 22.0 + (seed == 9), outcome="timeout" if seed < 1 else "success")
+
+
+def test_faults_that_did_nothing_are_counted_apart(book):
+    fates = [ACTIVE, Injected.UNREAD, Injected.NOT_ACTIVATED, Injected.NOT_INJECTED, Injected.NULL,
+             Injected.CAUGHT]  # fmt: skip
+    for seed, injected in enumerate(fates):
+        outcome = "collision" if injected is ACTIVE else "success"
+        book.add(FI, seed, 20.0 + seed, injected=injected, outcome=outcome)
+    (cell,) = named(summarise(book.ledger)).cells
+    assert (cell.success.count, cell.success.total) == (2, 3)
+    assert (cell.inactive.count, cell.inactive.total) == (3, 3)
+    assert (cell.every.count, cell.every.total) == (5, 6)
+    assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
+    assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
+    assert cell.metrics["flight_time_s"].count == 2
+    told = summary_lines(summarise(book.ledger))
+    row = told[1]
+    assert "  2/3  " in row
+    assert "  83.3 %  " in row  # of all six, as the paper counts
+    assert row.endswith("  3")
+    assert told[3].endswith("  ended otherwise")
+    assert told[4].endswith("  collision 1, not activated 1, not injected 1, null 1")
+
+
+def test_errors_are_counted_nowhere_else(book):
+    fill(book)
+    book.ledger.plan([PlannedMission(config=MissionConfig(seed=99), labels={"setting": "golden"})])
+    book.ledger.add(
+        30, state=State.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
+        attempts=1, path=None,
+    )  # fmt: skip
+    golden = named(summarise(book.ledger)).cells[0]
+    assert (golden.planned, golden.errors, golden.every.total) == (11, 1, 10)
+
+
+def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
+    fill(book)
+    faulty, saved = named(against_golden(groups(book.ledger)))
+    assert (faulty.first, faulty.second) == ({"setting": "golden"}, FI)
+    assert (faulty.success.pairs, faulty.success.only_first) == (10, 3)
+    assert faulty.success.difference == pytest.approx(-0.3)
+    assert faulty.success.p_value == pytest.approx(0.25)
+    assert faulty.corrected_p == pytest.approx(0.5)
+    assert faulty.differences["flight_time_s"].value == pytest.approx(10.0 + 1 / 7)
+    assert faulty.differences["flight_time_s"].count == 7
+    assert faulty.differences["replans"].value == 0.0
+    assert faulty.over_own.increase == pytest.approx(11.0 / 20.0)
+    assert math.isnan(faulty.over_own.recovered)
+    assert saved.second == SAVED
+
+
+def test_protection_is_held_against_the_same_faults_without_it(book):
+    fill(book)
+    (saved,) = named(protection(groups(book.ledger)))
+    assert (saved.first, saved.second) == (FI, SAVED)
+    assert (saved.success.only_second, saved.success.neither) == (2, 1)
+    assert saved.differences["flight_time_s"].value == pytest.approx(-8.0)
+    for worst in (saved.over_own, saved.over_mean):
+        assert worst.recovered == pytest.approx((31.0 - 23.0) / 20.0)
+        assert worst.recovered_share == pytest.approx(8.0 / 11.0)
+    assert saved.over_mean.golden == 20.0
+
+
+def test_the_worst_case_is_no_missions_own_length(book):
+    """Missions of 10 and 30 s, and one that only the golden setting has flown so far."""
+    for seed, time_s in enumerate((10.0, 30.0)):
+        book.add({"setting": "golden"}, seed, time_s, injected=GOLDEN)
+        book.add(FI, seed, time_s)
+    book.add({"setting": "golden"}, 2, 100.0, injected=GOLDEN)
+    (faulty,) = named(against_golden(groups(book.ledger)))
+    assert faulty.over_own.increase == 0.0
+    assert faulty.over_mean.golden == 20.0
+    told = summary_lines(summarise(book.ledger))
+    assert told[-2].endswith("  worst over own golden")
+    assert told[-1].endswith("  +0.0 %")
+
+
+def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
+    """The short mission's fault costs most; the long mission is the longest flight throughout."""
+    for seed, (golden_s, faulty_s, saved_s) in enumerate([(10.0, 20.0, 12.0), (30.0, 33.0, 30.0)]):
+        book.add({"setting": "golden"}, seed, golden_s, injected=GOLDEN)
+        book.add(FI, seed, faulty_s)
+        book.add(SAVED, seed, saved_s)
+    book.add({"setting": "golden"}, 2, 20.0, injected=GOLDEN, outcome="timeout")
+    book.add(FI, 2, 99.0)  # without a golden flight to be held against
+    book.add(SAVED, 2, 98.0)
+    book.add({"setting": "golden"}, 3, 20.0, injected=GOLDEN)
+    book.add(FI, 3, 20.0, outcome="collision")  # a flight of its protection is still a pair
+    book.add(SAVED, 3, 26.0)
+    (saved,) = named(protection(groups(book.ledger)))
+    assert saved.over_own.increase == pytest.approx(1.0)
+    assert saved.over_own.protected_worst == pytest.approx(1.3)
+    assert saved.over_own.recovered_share == pytest.approx(0.7)
+    assert (saved.over_mean.golden, saved.over_mean.golden_worst) == (20.0, 30.0)
+    assert (saved.over_mean.faulty_worst, saved.over_mean.protected_worst) == (33.0, 30.0)
+    assert saved.over_mean.recovered_share == pytest.approx(3.0 / 13.0)
+    told = [re.split("  +", line)[-1] for line in summary_lines(summarise(book.ledger))]
+    assert told[-5:-3] == ["worst over own golden", "+100.0 %, recovered 70.0 points, 70.0 %"]
+    assert told[-2:] == ["worst over mean golden", "+65.0 %, recovered 15.0 points, 23.1 %"]
+
+
+def test_a_group_without_what_it_is_gathered_by_is_named(book):
+    fill(book)
+    names = [cell.name for cell in named(summarise(book.ledger, ["stage"])).cells]
+    assert names == ["golden", "stage=control"]
+    assert named(summarise(book.ledger, ["detector"])).cells[0].name == "no detector"
+    assert named(summarise(book.ledger, ["setting", "stage"])).cells[0].name == "setting=golden"
+    assert summary_lines(summarise(book.ledger, ["stage"]))[1].startswith("golden ")
+
+
+def test_means_are_called_means(book):
+    fill(book)
+    text = "\n".join(summary_lines(summarise(book.ledger)))
+    assert "mean time  mean distance  mean energy  mean replans" in text
+
+
+def test_no_line_is_wider_than_a_screen_and_common_labels_are_told_once(book):
+    for world in ("dense", "sparse"):
+        for seed in range(3):
+            common = {"world": world, "level": "instruction", "together": True}
+            book.add({"setting": "golden", "world": world}, seed, 20.0, injected=GOLDEN)
+            book.add({"setting": "FI", "stage": "control", **common}, seed, 22.0 + seed)
+            labels = {"setting": "D&R(G)", "detector": "gad", "stage": "control", **common}
+            book.add(labels, seed, 21.0, outcome="collision" if seed else "success")
+    found = groups(book.ledger)
+    told = summary_lines(summarise(book.ledger))
+    told += quality_lines(qualities(found))
+    assert max(map(len, told)) <= 100
+    assert told[0] == (
+        "in all settings that have it: detector=gad level=instruction stage=control together=true"
+    )
+    assert told[1].split()[:3] == ["setting", "world", "over"]
+    assert told[4].split()[:4] == ["D&R(G)", "dense", "3/3", "1/3"]
+    assert sum("collision 2" in line for line in told) == 2
+    assert sum("level" in line for line in told) == 1
+
+
+def test_a_label_that_alone_tells_settings_apart_has_a_column(book):
+    book.add({"setting": "FI"}, 1, 20.0)
+    book.add({"setting": "FI", "field": "sign"}, 1, 21.0)
+    told = summary_lines(summarise(book.ledger))
+    assert told[0] == "in all settings that have it: setting=FI"
+    assert [line.split()[0] for line in told[1:4]] == ["field", "1/1", "sign"]
+
+
+def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothing(book):
+    for seed in range(5):
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN)
+        for stage, idle, time_s in (("planning", seed == 0, 30.0), ("control", False, 50.0)):
+            fate = Injected.NOT_INJECTED if idle else ACTIVE
+            book.add({"setting": "FI", "stage": stage}, seed, time_s, injected=fate)
+            book.add({"setting": "D&R", "stage": stage, "detector": "gad"}, seed, time_s)
+    (saved,) = named(protection(groups(book.ledger, ["setting"])))
+    assert (saved.first, saved.second) == ({"setting": "FI"}, {"setting": "D&R"})
+    assert saved.success.pairs == 9
+    time = saved.differences["flight_time_s"]
+    assert (time.value, time.low, time.high) == (0.0, 0.0, 0.0)
+
+
+def test_the_detector_none_watches_nothing(book):
+    """An evaluation of detectors labels its bare flights so."""
+    for seed in range(4):
+        book.add({"kind": "golden", "detector": "none"}, seed, 20.0, injected=GOLDEN)
+        book.add({"kind": "fault", "detector": "none"}, seed, 22.0)
+    (faulty,) = named(against_golden(groups(book.ledger)))
+    assert faulty.success.pairs == 4
+
+
+def test_settings_are_gathered_by_labels(book):
+    for seed in range(4):
+        book.add({"setting": "FI", "stage": "planning", "world": "farm"}, seed, 20.0)
+        book.add({"setting": "FI", "stage": "control", "world": "farm"}, seed, 21.0)
+        book.add({"setting": "FI", "stage": "control", "world": "dense"}, seed, 22.0)
+    cells = named(summarise(book.ledger, ["setting", "world"])).cells
+    assert [(cell.labels["world"], cell.success.total) for cell in cells] == [
+        ("farm", 8), ("dense", 4),
+    ]  # fmt: skip
+    assert cells[0].labels == {"setting": "FI", "world": "farm"}
+    with pytest.raises(UnknownName, match="did you mean 'world'"):
+        summarise(book.ledger, ["wrld"])
+
+
+def test_a_faulty_mission_pairs_with_no_golden_flight_of_another_seed(book):
+    book.add({"setting": "golden"}, 1, 20.0, injected=GOLDEN)
+    book.add(FI, 2, 30.0)
+    assert against_golden(groups(book.ledger)) == []
+
+
+def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
+    fill(book)
+    summary = summarise(book.ledger)
+    text = "\n".join(summary_lines(summary))
+    assert "in all settings that have it: detector=gad stage=control" in text
+    assert "7/10" in text
+    assert "collision 3" in text
+    assert "recovered 40.0 points, 72.7 %" in text
+    assert json.loads(json.dumps(plain(summary), allow_nan=False))["missing"] == 0
+
+
+def test_a_campaign_that_has_just_begun_has_a_table(book):
+    book.ledger.plan([PlannedMission(config=MissionConfig(), labels={})])
+    assert "all missions" in "\n".join(summary_lines(summarise(book.ledger)))
+
+
+def test_quality_has_intervals_and_extremes_of_every_metric(book):
+    fill(book)
+    found = named(qualities(groups(book.ledger)))
+    assert [each.metric for each in found[::3]] == [*METRICS]
+    golden, faulty, _ = found[:3]
+    assert (golden.mean.value, golden.difference) == (20.0, None)
+    assert (faulty.least, faulty.median, faulty.most) == (30.0, 30.0, 31.0)
+    assert faulty.mean.count == 7
+    assert faulty.mean.value == pytest.approx(30.0 + 1 / 7)
+    assert 30.0 <= faulty.mean.low < faulty.mean.value < faulty.mean.high <= 31.0
+    assert faulty.difference.value == pytest.approx(10.0 + 1 / 7)
+    text = "\n".join(quality_lines(found))
+    assert "+10.14" in text
+    assert "replans" in text
+
+
+def test_quality_without_a_success_is_no_number(book):
+    book.add(FI, 1, 30.0, outcome="collision")
+    found = named(qualities(groups(book.ledger)))
+    assert all(math.isnan(each.most) for each in found)
+    assert quality_lines(found)[3].split()[-5:] == ["0", "-", "-", "-", "-"]
+
+
+def test_failures_are_of_missions_that_succeed_without_the_fault(book):
+    fill(book)
+    for seed, injected, golden in (
+        (20, ACTIVE, "collision"),  # it fails anyway
+        (21, Injected.NOT_ACTIVATED, "success"),  # a fault of the kernel that was benign
+        (22, Injected.NOT_INJECTED, "success"),  # no fault
+    ):
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN, outcome=golden)
+        outcome = "collision" if injected is ACTIVE else "success"
+        book.add(FI, seed, 20.0, injected=injected, outcome=outcome)
+    faulty, saved = named(failures(book.ledger, groups(book.ledger), upsets_per_hour=2.0))
+    assert (faulty.labels, faulty.failure.count, faulty.failure.total) == (FI, 3, 11)
+    assert (saved.failure.count, saved.failure.total) == (1, 10)
+    assert faulty.per_hour == pytest.approx((6 / 11, 2 * faulty.failure.low,
+                                             2 * faulty.failure.high))  # fmt: skip
+    assert faulty.layers is None
+    assert "3 of 11 faults fail the mission, 27.3 %" in "\n".join(failure_lines([faulty]))
+
+
+def native(book, seeds, **fault):
+    """A golden and an instruction-level mission of each seed; every second fault is fatal."""
+    for seed in seeds:
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN)
+        config = MissionConfig(
+            seed=seed, instruction=InstructionConfig(target="octomap", seed=seed, **fault)
+        )
+        outcome = "collision" if seed % 2 else "success"
+        book.add({"setting": "native"}, seed, 20.0, outcome=outcome, config=config)
+
+
+def kernels_folder(tmp_path, **changes):
+    """What `mavfi kernels` leaves: of 100 faults in octomap 80 corrupt its output in silence."""
+    plan = {
+        "rule": "instruction-uniform", "compat": None, "model": FaultModel().to_json(), **changes
+    }  # fmt: skip
+    kernels = [{"kernel": "octomap", "outcomes": {"sdc": {"count": 80, "of": 100}}}]
+    text = json.dumps({"plan": plan, "kernels": kernels})
+    (tmp_path / "kernels.json").write_text(text)
+    return tmp_path
+
+
+def test_failure_given_a_kernels_corruption(book, tmp_path):
+    native(book, range(10))
+    (row,) = named(failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path)))
+    assert row.kernel == "octomap"
+    assert row.layers.corruption.share == 0.8
+    assert row.layers.failure_given_corruption[0] == pytest.approx(0.5 / 0.8)
+    assert "failure given corruption 0.625 (" in "\n".join(failure_lines([row]))
+
+
+def test_kernels_that_other_faults_struck_are_refused(book, tmp_path):
+    native(book, range(2), bits=3)
+    with pytest.raises(ConfigError, match=r"kernels.json: .*not the same population"):
+        failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
+
+
+@pytest.mark.parametrize("text", [None, "no json", "{}", '{"plan": [], "kernels": []}'])
+def test_a_folder_without_kernels_is_refused(book, tmp_path, text):
+    native(book, range(2))
+    if text is not None:
+        (tmp_path / "kernels.json").write_text(text)
+    with pytest.raises(RecordError, match=r"kernels.json: "):
+        failures(book.ledger, groups(book.ledger), tmp_path)
+
+
+def test_settings_that_their_rule_has_stopped_are_named(book):
+    assert stopped(book.ledger) == []  # a program made the list
+    text = "repetitions = 40\n[stop]\nmargin = 0.1\nbatch = 20\n"
+    book.ledger.set_meta({"spec": text, "name": "stopping"})
+    for seed in range(20):
+        book.add(FI, seed, 20.0)
+        book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN,
+                 outcome="collision" if seed % 2 else "success")  # fmt: skip
+    for labels in (FI, {"setting": "golden"}):
+        left = [PlannedMission(config=MissionConfig(seed=s), labels=labels) for s in range(20, 40)]
+        book.ledger.plan(left)
+    assert stopped(book.ledger) == ["setting=FI stage=control"]

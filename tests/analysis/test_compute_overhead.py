@@ -1,0 +1,140 @@
+"""The overhead of detection and recovery, from records of flights."""
+
+import json
+
+import pytest
+from click import UsageError
+
+from mavfi_cli.analysis.overhead import compute_overheads, recorded_overheads
+from mavfi_cli.cli.vpm import overheads
+from mavfi_cli.core.errors import RecordError
+
+
+def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None, platform="x86"):
+    listed = [{"stage": stage, "response": response} for stage, response in alarms]
+    counts = {"recompute": 0, "hold": 0, "accept": 0}
+    for _, response in alarms:
+        counts[response] += 1
+    return {
+        "detection": detector
+        and {
+            "detector": detector,
+            "alarms": listed,
+            "responses": counts | (counted or {}),
+            "checks": {"tick": 1000},
+        },
+        "quality_of_flight": {"flight_time_s": 20.0},
+        "fault": fault,
+        "config": {"platform": platform},
+        "kernels": {
+            "point_cloud": {"invocations": 100, "busy_s": 1.0},
+            "octomap": {"invocations": 20, "busy_s": 6.0},
+            "collision_check": {"invocations": 10, "busy_s": 0.5},
+            "planner": {"invocations": 5, "busy_s": 1.0},
+            "control": {"invocations": 1000, "busy_s": 0.5},
+        },
+        "host": {"stage_wall_s": {"gate": gate_s, "octomap": 0.15, "planner": 0.05, "link": 9.0}},
+    }
+
+
+def test_checks_alone():
+    found = compute_overheads([flight()])["gad"]
+    assert found.share == pytest.approx(0.02 / 9.0)
+    assert found.checks_share == pytest.approx(found.share)
+    assert found.checks_host_share == pytest.approx(0.02 / 0.2)
+    assert (found.flights, found.alarms) == (1, 0)
+
+
+def test_recomputation_costs_a_run_of_the_stage():
+    """0.01 + 0.3 + 0.05 s for perception, 0.2 s for planning, 0.5 ms for control."""
+    alarms = [("perception", "recompute"), ("planning", "hold"), ("control", "recompute"),
+              ("control", "accept")]  # fmt: skip
+    found = compute_overheads([flight(alarms=alarms)])["gad"]
+    again_s = 0.36 + 0.2 + 0.0005
+    assert found.recompute_s == pytest.approx(again_s)
+    assert found.share == pytest.approx((0.02 + again_s) / (9.0 - again_s))
+    assert found.alarms == 3
+    assert "3 recomputations" in found.told("somewhere")
+
+
+def test_alarms_beyond_the_listed_ones_are_counted():
+    alarms = [("planning", "recompute")] * 3 + [("control", "recompute")]
+    found = compute_overheads([flight(alarms=alarms, counted={"recompute": 8})])["gad"]
+    assert found.recompute_s == pytest.approx(6 * 0.2 + 2 * 0.0005)
+    assert found.alarms == 8
+
+
+def test_flights_are_taken_together_and_faulty_ones_left_out():
+    found = compute_overheads(
+        [flight(), flight(gate_s=0.04), flight("aad"), flight(None), flight(fault={"state": "x"}),
+         {"outcome": "crash"}]
+    )  # fmt: skip
+    assert set(found) == {"gad", "aad"}
+    assert found["gad"].flights == 2
+    assert found["gad"].share == pytest.approx(0.06 / 18.0)
+    assert (
+        found["gad"]
+        .told("here")
+        .startswith("measured in 2 flights of here on x86: checks 0.3333 %")
+    )
+    assert found["aad"].told("here").startswith("measured in 1 flight of here on x86: ")
+
+
+def test_flights_on_another_platform_do_not_count():
+    """Recomputations and kernels are those of the flight's platform; the checks are not scaled."""
+    flights = [flight(), flight(gate_s=0.04, platform="tx2"), flight("aad")]
+    assert compute_overheads(flights)["gad"].platforms == ("tx2", "x86")
+    found = compute_overheads(flights, "tx2")
+    assert set(found) == {"gad"}
+    assert found["gad"].share == pytest.approx(0.04 / 9.0)
+    told = found["gad"].told("here")
+    assert told.startswith("measured in 1 flight of here on tx2 (1 on other platforms left out): ")
+    assert told.endswith("; checks take the time of the host that flew, not scaled to the platform")
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [("tx2 x 1.0222", True), ("tx2 x 2.1", False), ("tx2 x heavy", False), ("tx2-2c", False)],
+)
+def test_a_platform_scaled_for_a_detector_s_share_is_the_platform(tmp_path, name, counts):
+    """`mavfi vpm --fly` flies with such files; a file that is gone leaves its own name."""
+    path = tmp_path / "flown.toml"
+    path.write_text(f'name = "{name}"\nbase = "tx2"\ncores = 4\nscale = 1.0222\n')
+    assert ("gad" in compute_overheads([flight(platform=str(path))], "tx2")) is counts
+    path.unlink()
+    assert compute_overheads([flight(platform=str(path))])["gad"].platforms == ("flown",)
+
+
+@pytest.fixture(scope="module")
+def guarded(fly_short):
+    from mavfi_cli.mission.detector_config import DetectorConfig
+
+    return fly_short(detector=DetectorConfig(name="gad"))
+
+
+def test_a_real_record_has_what_it_takes(guarded):
+    result = json.loads(guarded.result.read_text())
+    found = compute_overheads([result])["gad"]
+    assert found.detection_s == result["host"]["stage_wall_s"]["gate"] > 0.0
+    assert found.compute_s == pytest.approx(sum(k["busy_s"] for k in result["kernels"].values()))
+    assert 0.0 < found.share < 0.5
+
+
+def measured(path, platform=None):
+    return recorded_overheads(path, ("gad", "aad"), platform)["gad"]
+
+
+def test_the_command_takes_a_run_folder(guarded, tmp_path):
+    found = measured(guarded.path)
+    assert found.told("here").startswith("measured in 1 flight of here on x86: checks ")
+    assert measured(guarded.result) == measured(guarded.path, "x86") == found
+    assert measured(guarded.path.parent).share > 0.0  # the folder of runs
+    given = overheads((str(guarded.path), "aad=0.5"))
+    assert given["aad"] == (0.5, "--overhead")
+    assert given["gad"] == (100.0 * found.share, found.told(str(guarded.path)))
+    with pytest.raises(RecordError, match="flew on x86, not on tx2"):
+        measured(guarded.path, "tx2")
+    with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
+        measured(tmp_path)
+    with pytest.raises(UsageError, match=r"no such file or folder; for per cent write aad=0\.0062"):
+        overheads((str(tmp_path / "nowhere"),))

@@ -1,0 +1,133 @@
+"""What a fault did, and whether it was seen."""
+
+import pyarrow as pa
+import pytest
+from evaluation_flights import flown, pair, struck
+
+from mavfi_cli.analysis.detector_pairs import WANTED, Harm, harm_of, pairs_of
+from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.mission.record.measures import measures_of
+
+GOLDEN = {"kind": "error-free", "world": "farm", "seed": 7}
+FAULT = {
+    **GOLDEN, "kind": "fault", "level": "source", "stage": "planning", "target": "planning",
+    "field": "sign",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("golden", "treated", "harm"),
+    [
+        (flown(), flown(time_s=104.9), Harm.NONE),
+        (flown(), flown(time_s=105.1), Harm.LONGER),
+        (flown(), flown(time_s=90.0), Harm.NONE),
+        (flown(), flown("collision", 10.0), Harm.LOST),
+        (flown(), flown("crash", None), Harm.LOST),
+        (flown("collision"), flown("timeout", 300.0), Harm.OTHERWISE),
+        (flown("collision"), flown("collision", 300.0), Harm.NONE),
+        (flown("collision"), flown(), Harm.NONE),  # a fault that saved the mission
+    ],
+)
+def test_harm_is_a_lost_mission_or_more_than_five_per_cent(golden, treated, harm):
+    assert harm_of(golden, treated) is harm
+
+
+def test_an_alarm_before_the_strike_detects_nothing():
+    early = pair(struck(), struck(alarms_s=(19.98,)))
+    assert not early["seen"]
+    assert early["alarm_s"] is early["latency_s"] is None
+    both = pair(struck(), struck(alarms_s=(19.98, 20.0, 20.5)))
+    assert both["alarm_s"] == 20.0
+    assert both["latency_s"] == 0.0
+
+
+def test_a_protected_flight_that_was_never_struck_has_nothing_to_detect():
+    parted = pair(struck(), flown(alarms_s=(25.0,), injected="not_injected"))
+    assert not parted["struck"]
+    assert not parted["seen"]
+
+
+def test_what_the_detector_does_anyway_is_by_chance():
+    assert pair(struck(), struck(alarms_s=(21.0,)), watched=flown(alarms_s=(50.0,)))["by_chance"]
+    assert not pair(struck(), struck(), watched=flown(alarms_s=(10.0,)))["by_chance"]
+
+
+@pytest.mark.parametrize(
+    ("injected", "active"),
+    [
+        (Injected.ACTIVE, True),
+        (Injected.UNREAD, True),
+        (Injected.NOT_ACTIVATED, False),
+        (Injected.NOT_INJECTED, False),
+    ],
+)
+def test_activity_is_that_of_the_unprotected_flight(injected, active):
+    withheld = struck(injected=Injected.NOT_ACTIVATED)  # the gate kept anybody from reading it
+    assert pair(struck(injected=injected), withheld)["active"] is active
+
+
+def labelled(labels, flight):
+    """A row of a ledger's table."""
+    return {**{f"label_{name}": value for name, value in labels.items()}, **flight}
+
+
+def test_pairs_need_all_of_their_flights():
+    rows = [
+        labelled({**FAULT, "detector": "gad"}, struck()),
+        labelled({**FAULT, "detector": "none"}, struck("collision")),
+        labelled({**GOLDEN, "detector": "none"}, flown()),
+    ]
+
+    def pairs(*detectors, complete=lambda _: True):
+        return [t.to_pylist() for t in pairs_of([pa.Table.from_pylist(rows)], detectors, complete)]
+
+    assert pairs("gad")[1] == []
+    rows.append(labelled({**GOLDEN, "detector": "gad"}, flown(alarms_s=(3.0,))))
+    (free,), (found,) = pairs("gad", complete=lambda seed: seed != 7)
+    told = [found[name] for name in ("world", "seed", "stage", "field")]
+    assert told == ["farm", 7, "planning", "sign"]
+    assert (found["faulty_outcome"], found["outcome"]) == ("collision", "success")
+    assert not found["complete"]
+    assert free["alarms"] == 1
+    _, (bare,) = pairs("none")
+    assert bare["outcome"] == bare["faulty_outcome"] == "collision"
+
+
+def record(fault, **result):
+    return measures_of({"quality_of_flight": {"flight_time_s": 12.0}, "fault": fault, **result})
+
+
+def test_a_record_of_a_source_level_fault():
+    strike = {
+        "stamp_s": 11.5, "phase": "flying", "tick": 3, "invocation": 1,
+        "changes": [{"bits": [3], "state": "command_vx", "index": 0, "before": 1.0, "after": 2.0,
+                     "before_hex": "0x0", "after_hex": "0x0"}],
+    }  # fmt: skip
+    fault = {"level": "source", "state": "applied", "states": ["command_vx"], "strikes": [strike]}
+    alarm = {"stamp_s": 12.5, "stage": "control", "score": 3.0}
+    detection = {
+        "alarms": [alarm], "alarm_count": 4,
+        "recoveries": {"control": {"count": 1}, "planning": {"count": 2}},
+    }  # fmt: skip
+    nodes = {"planner": {"crashes": [{"how": "killed"}]}, "control": {"crashes": []}}
+    read = record(fault, detection=detection, nodes=nodes)
+    assert set(WANTED) - {"outcome", "succeeded", "injected", "path"} <= set(read)
+    assert (read["struck_s"], read["struck_sites"]) == (11.5, ["command_vx"])
+    assert (read["first_bits"], read["flight_time_s"]) == ([3], 12.0)
+    assert (read["alarm_count"], read["episodes"], read["crashed"]) == (4, 3, True)
+    assert read["alarms"] == [{"stamp_s": 12.5, "stage": "control"}]
+
+
+def test_a_record_of_an_instruction_level_fault():
+    fault = {
+        "level": "instruction", "state": "applied", "node": "planner", "stamp_s": 8.0,
+        "corruption": {"bits": [5]},
+    }  # fmt: skip
+    read = record(fault)
+    assert (read["struck_s"], read["struck_sites"], read["first_bits"]) == (8.0, ["planner"], [5])
+    assert record({**fault, "state": "not_injected"})["struck_s"] is None
+
+
+def test_a_record_of_a_mission_that_was_cut_off_has_empty_columns():
+    read = measures_of({})
+    assert not any(value for value in read.values())

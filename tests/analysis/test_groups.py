@@ -1,0 +1,71 @@
+"""Which missions of two settings are one pair: the rule, written out with dicts, is the oracle."""
+
+import numpy as np
+import pyarrow as pa
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavfi_cli.analysis.groups import METRICS, Group, matched
+from mavfi_cli.campaign.outcome import Injected
+
+FATES = (Injected.ACTIVE.value, Injected.NOT_INJECTED.value)
+PAIRS = "abcd"
+MISSIONS = st.lists(st.tuples(st.sampled_from(PAIRS), st.booleans()), max_size=12)
+
+
+def group(missions, fates=FATES):
+    """A setting of missions of a pair each, which count or do not."""
+    counted, other = fates
+    count = len(missions)
+    columns = {
+        "number": np.arange(count),
+        "outcome": pa.array(["success"] * count, pa.string()),
+        "injected": pa.array([counted if c else other for _, c in missions], pa.string()),
+        "pair": np.array([PAIRS.index(pair) for pair, _ in missions], dtype=np.int64),
+        "strike": np.zeros(count, dtype=np.int64),
+        **{name: np.zeros(count) for name in METRICS},
+    }
+    return Group(
+        labels={}, lacked=(), planned=count, errors=0, watched=False, flights=pa.table(columns)
+    )
+
+
+def expected(first, second, *, golden):
+    """The k-th mission of a pair with the k-th; one golden one with all."""
+    found, met = [], dict.fromkeys(PAIRS, 0)
+    for place, (pair, counts) in enumerate(second):
+        if not counts:
+            continue
+        others = [at for at, each in enumerate(first) if each == (pair, True)]
+        wanted = 0 if golden else met[pair]
+        met[pair] += 1
+        if wanted < len(others):
+            found.append((others[wanted], place))
+    return found
+
+
+@given(first=MISSIONS, second=MISSIONS)
+def test_missions_of_a_pair_meet_one_by_one(first, second):
+    found = matched(group([*first, ("a", True)]), group(second))
+    assert list(zip(*map(np.ndarray.tolist, found), strict=True)) == expected(
+        [*first, ("a", True)], second, golden=False
+    )
+
+
+@given(pairs=st.lists(st.sampled_from(PAIRS), max_size=12), second=MISSIONS)
+def test_one_golden_flight_serves_all_of_its_pair(pairs, second):
+    first = [(pair, True) for pair in pairs]
+    found = matched(group(first, (Injected.GOLDEN.value,) * 2), group(second))
+    assert list(zip(*map(np.ndarray.tolist, found), strict=True)) == expected(
+        first, second, golden=True
+    )
+
+
+@given(missions=MISSIONS)
+def test_words_are_counted_as_they_stand(missions):
+    whole = group(missions)
+    fates = [FATES[not counts] for _, counts in missions]
+    assert whole.counts("injected") == {fate: fates.count(fate) for fate in sorted(set(fates))}
+    assert whole.counted.tolist() == [counts for _, counts in missions]
+    known = {PAIRS.index(pair) for pair, counts in missions if counts}
+    assert whole.pairs.tolist() == sorted(known)

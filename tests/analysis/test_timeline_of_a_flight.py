@@ -1,0 +1,96 @@
+"""The way of a frame through the kernels, found again in a time table."""
+
+import pytest
+
+from mavfi_cli.analysis.timeline import chain_of, timeline_of, timelines, typical
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.mission.companion.executor import Invocation
+from mavfi_cli.mission.companion.response import Reaction
+from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.record.timetable import Timetable, read_timetable, write_timetable
+
+
+def ran(node, start_s, end_s):
+    return Invocation(node=node, start_s=start_s, end_s=end_s)
+
+
+def reaction(frame_s, setpoint_s):
+    return Reaction(frame_stamp_s=frame_s, setpoint_stamp_s=setpoint_s)
+
+
+def test_a_time_table_is_read_as_it_was_written(tmp_path):
+    table = Timetable(
+        invocations=(ran("octomap", 1.0, 1.3), ran("control", 1.02, 1.0205)),
+        reactions=(reaction(1.0, 1.4),),
+    )
+    write_timetable(tmp_path / "a.parquet", table)
+    write_timetable(tmp_path / "b.parquet", table)
+    assert read_timetable(tmp_path / "a.parquet") == table
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+
+
+@pytest.mark.parametrize("bad", [None, b"", b"PAR1 and nothing more"])
+def test_a_damaged_time_table_is_one_line(tmp_path, bad):
+    path = tmp_path / "kernels.parquet"
+    if bad is not None:
+        path.write_bytes(bad)
+    with pytest.raises(RecordError, match="no time table can be read"):
+        read_timetable(path)
+
+
+def test_the_chain_takes_the_newest_output_that_was_there():
+    """The frame of 1.1 waits for the map; that of 1.0 was overtaken, that of 1.2 came too late."""
+    table = [
+        ran("point_cloud", 1.0, 1.01), ran("octomap", 0.7, 1.15), ran("point_cloud", 1.1, 1.11),
+        ran("octomap", 1.15, 1.6), ran("point_cloud", 1.2, 1.21),
+        ran("collision_check", 1.15, 1.2), ran("collision_check", 1.6, 1.65),
+        ran("control", 1.64, 1.641), ran("control", 1.66, 1.661), ran("control", 1.68, 1.681),
+    ]  # fmt: skip
+    assert chain_of(table, reaction(1.1, 1.66)) == [
+        ran("point_cloud", 1.1, 1.11), ran("octomap", 1.15, 1.6),
+        ran("collision_check", 1.6, 1.65), ran("control", 1.66, 1.661),
+    ]  # fmt: skip
+
+
+def test_the_typical_reaction_is_near_the_median_and_one_that_did_something():
+    slow, middle, acted = reaction(1.0, 1.9), reaction(2.0, 2.4), reaction(3.0, 3.5)
+    fast = reaction(4.0, 4.1)
+    assert typical([slow, middle, acted, fast]) is middle
+    assert typical([slow, middle, acted, fast], {3.5}) is acted
+    assert typical([]) is None
+
+
+@pytest.mark.slow
+def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_flight):
+    run = load_run(troubled_flight.path)
+    told = timeline_of(run)
+    stamp_s = told["frame_stamp_s"] + told["response_s"]
+    acted = {round(e["stamp_s"], 6): e["text"] for e in run.result["events"]
+             if e["kind"] in ("slow", "stop")}  # fmt: skip
+    assert told["answer"] == acted[round(stamp_s, 6)]
+    chain = told["chain_s"]
+    order = ("point_cloud", "octomap", "collision_check", "control", "planner")
+    assert tuple(chain) == order
+    ends = [0.0]
+    for kernel in order:
+        start, end = chain[kernel]
+        assert start >= ends[-1 if kernel != "planner" else -2] - 1e-9
+        assert [start, end] in told["lanes_s"][kernel]
+        ends.append(end)
+    assert chain["control"][0] == pytest.approx(told["response_s"])
+    assert told["plan_setpoint_s"] >= chain["planner"][1]
+    assert told["shown_s"][1] >= 1.0
+    again = timelines({"x86": run, "other": run})
+    assert [row["platform"] for row in again] == ["x86", "other"]
+    assert again[0]["shown_s"] == again[1]["shown_s"]
+
+
+@pytest.mark.slow
+def test_latencies_of_the_table_are_those_that_the_nodes_were_busy_for(troubled_flight):
+    run = load_run(troubled_flight.path)
+    table = read_timetable(run.folder.kernels)
+    for kernel, work in run.result["kernels"].items():
+        spans = [each for each in table.invocations if each.node == kernel]
+        assert len(spans) == work["invocations"]
+        assert sum(s.end_s - s.start_s for s in spans) == pytest.approx(work["busy_s"], abs=1e-6)
+    assert len(table.reactions) == run.result["response_time_s"]["count"]

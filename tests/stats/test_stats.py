@@ -1,0 +1,254 @@
+"""Statistics against scipy, closed forms, and the paper's own numbers."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.stats.bootstrap import BLOCKS, FEW, LARGE, interval, mean, median
+from mavfi_cli.stats.layers import cross_layer, failures_per_hour
+from mavfi_cli.stats.paired import holm, mcnemar, sign_flips
+from mavfi_cli.stats.shares import (
+    design_effect,
+    half_width,
+    missions_for_margin,
+    mixture,
+    pairs_for_difference,
+    rate,
+    wilson,
+)
+from mavfi_cli.stats.worst_case import worst_case
+
+COUNTS = st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
+
+
+@given(COUNTS, st.sampled_from([0.8, 0.95, 0.99]))
+def test_intervals_of_rates_are_wilsons(counts, confidence):
+    successes, total = counts
+    share = rate(successes, total, confidence)
+    oracle = stats.binomtest(successes, total).proportion_ci(confidence, method="wilson")
+    assert (share.low, share.high) == pytest.approx((oracle.low, oracle.high), abs=1e-12)
+
+
+@given(st.floats(0.005, 0.3), st.floats(0.0, 1.0), st.sampled_from([0.9, 0.95, 0.99]))
+def test_the_planned_number_is_the_fewest_with_such_a_margin(margin, expected, confidence):
+    count = missions_for_margin(margin, expected=expected, confidence=confidence)
+    z = stats.norm.ppf(0.5 + confidence / 2)
+
+    def half(n):
+        return z / (1 + z * z / n) * math.sqrt(expected * (1 - expected) / n + (z / n) ** 2 / 4)
+
+    assert half(count) <= margin + 1e-9
+    assert count == 1 or half(count - 1) > margin - 1e-9
+
+
+def test_the_planned_number_of_a_known_case():
+    assert missions_for_margin(0.05) == 381
+    assert half_width(rate(381 // 2, 381)) <= 0.05 < half_width(rate(190, 380))
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.5, -1.0, math.nan])
+def test_an_impossible_margin_is_refused(margin):
+    with pytest.raises(ConfigError, match="margin"):
+        missions_for_margin(margin)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=200))
+def test_mcnemar_is_the_sign_test_of_the_pairs_that_differ(pairs):
+    found = mcnemar([a for a, _ in pairs], [b for _, b in pairs])
+    differing = found.only_first + found.only_second
+    oracle = stats.binomtest(found.only_first, differing).pvalue if differing else 1.0
+    assert found.p_value == pytest.approx(oracle, rel=1e-9)
+    assert found.pairs == len(pairs)
+    if pairs:
+        expected = np.mean([b for _, b in pairs]) - np.mean([a for a, _ in pairs])
+        assert found.difference == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(("count", "least", "most"), [(3, 0.65, 0.85), (FEW, 0.86, 0.94)])
+def test_how_often_an_interval_of_few_values_holds_the_true_mean(count, least, most):
+    """Of 95 in a hundred that it promises; what the text says of few flights hangs on it."""
+    rng = np.random.default_rng(8)
+    found = [interval(rng.normal(size=count), resamples=999) for _ in range(400)]
+    assert least < np.mean([each.low <= 0.0 <= each.high for each in found]) < most
+
+
+@given(st.lists(st.integers(-20, 20), min_size=2, max_size=9))
+def test_sign_flips_are_scipys_permutation_test_of_pairs(differences):
+    if not any(differences):
+        assert sign_flips(differences) == 1.0
+        return
+    oracle = stats.permutation_test(
+        (np.array(differences, float), np.zeros(len(differences))),
+        lambda x, y: abs(np.sum(x - y)),
+        permutation_type="samples",
+        vectorized=False,
+        alternative="greater",
+    )
+    assert sign_flips([float(each) for each in differences]) == pytest.approx(oracle.pvalue)
+
+
+def test_sign_flips_of_many_differences_are_near_the_t_test():
+    differences = np.random.default_rng(3).normal(0.2, 1.0, 120)
+    oracle = stats.ttest_1samp(differences, 0.0).pvalue
+    assert sign_flips(differences.tolist()) == pytest.approx(oracle, abs=0.01)
+    assert sign_flips([*differences.tolist(), *[0.0] * 500]) == sign_flips(differences.tolist())
+
+
+def test_mcnemar_of_thousands_of_pairs():
+    pairs = [(True, False)] * 3000 + [(False, True)] * 2800
+    first, second = zip(*pairs, strict=True)
+    oracle = stats.binomtest(2800, 5800).pvalue
+    assert mcnemar(first, second).p_value == pytest.approx(oracle, rel=1e-6)
+
+
+def test_pairs_for_a_difference_reach_the_power_that_was_asked_for():
+    d, q = 0.1, 0.2
+    count = pairs_for_difference(d, q, power=0.8)
+    rng = np.random.default_rng(1)
+    kinds = rng.multinomial(count, [(q + d) / 2, (q - d) / 2, 1 - q], size=2000)
+    z = (kinds[:, 0] - kinds[:, 1]) / np.sqrt(kinds[:, 0] + kinds[:, 1])
+    assert np.mean(np.abs(z) > 1.96) == pytest.approx(0.8, abs=0.04)
+
+
+def test_holm_of_a_family_worked_by_hand():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))
+def test_holm_keeps_the_order_and_lies_between_nothing_and_bonferroni(p_values):
+    corrected = holm(p_values)
+    for p, q in zip(p_values, corrected, strict=True):
+        assert p <= q <= 1.0
+    ranked = [q for _, q in sorted(zip(p_values, corrected, strict=True))]
+    assert ranked == sorted(ranked)
+    least = min(range(len(p_values)), key=lambda i: p_values[i])
+    assert corrected[least] == pytest.approx(min(1.0, len(p_values) * p_values[least]))
+
+
+@pytest.mark.parametrize(("statistic", "oracle"), [(mean, np.mean), (median, np.median)])
+def test_bootstrap_intervals_agree_with_scipys(statistic, oracle):
+    values = np.random.default_rng(5).lognormal(3.0, 0.4, size=101)
+    found = interval(values, statistic)
+    expected = stats.bootstrap(
+        (values,), oracle, n_resamples=9999, method="BCa", rng=np.random.default_rng(7)
+    ).confidence_interval
+    width = expected.high - expected.low
+    assert found.value == oracle(values)
+    assert found.low == pytest.approx(expected.low, abs=0.06 * width)
+    assert found.high == pytest.approx(expected.high, abs=0.06 * width)
+
+
+def test_bootstrap_intervals_cover_as_often_as_they_say():
+    rng = np.random.default_rng(3)
+    covered = 0
+    for trial in range(300):
+        found = interval(rng.exponential(size=40), resamples=999, seed=trial)
+        covered += found.low <= 1.0 <= found.high
+    assert 0.89 <= covered / 300 <= 0.98
+
+
+def test_intervals_of_large_samples_are_nearly_those_of_the_bootstrap():
+    values = np.random.default_rng(2).lognormal(3.0, 0.4, size=LARGE)
+    normal, resampled = interval(values), interval(values[:-1], resamples=2000)
+    width = resampled.high - resampled.low
+    assert normal.low == pytest.approx(resampled.low, abs=0.1 * width)
+    assert normal.high == pytest.approx(resampled.high, abs=0.1 * width)
+
+
+def test_leaving_out_blocks_of_many_values_changes_no_interval_much():
+    values = np.random.default_rng(8).exponential(10.0, 2 * BLOCKS + 1)
+    found = interval(values, lambda drawn: drawn.std(axis=-1), resamples=1999)
+    oracle = stats.bootstrap(
+        (values,), np.std, n_resamples=1999, method="BCa", rng=np.random.default_rng(7)
+    ).confidence_interval
+    width = oracle.high - oracle.low
+    assert found.low == pytest.approx(oracle.low, abs=0.08 * width)
+    assert found.high == pytest.approx(oracle.high, abs=0.08 * width)
+
+
+def test_bootstrap_intervals_repeat_and_survive_few_values():
+    values = list(range(30))
+    assert interval(values) == interval(values)
+    assert interval(values, resamples=50, seed=2) != interval(values, resamples=50, seed=3)
+    assert math.isnan(interval([]).value)
+    assert interval([3.0]).value == 3.0
+    assert math.isnan(interval([3.0]).low)
+    assert (interval([2.0, 2.0]).low, interval([2.0, 2.0]).high) == (2.0, 2.0)
+
+
+def test_the_worst_case_is_the_papers():
+    """Factory: +73.8 %, recovered by 64.2 points (VII-A), which is 87.1 % of it (Fig. 14)."""
+    found = worst_case([99.0, 101.0], [100.0, 173.8], [100.0, 109.6])
+    assert found.increase == pytest.approx(0.738)
+    assert found.recovered == pytest.approx(0.642)
+    assert found.recovered_share == pytest.approx(0.871, abs=0.002)
+
+
+def test_no_worst_case_without_flights():
+    assert math.isnan(worst_case([], [1.0], [1.0]).increase)
+    assert math.isnan(worst_case([1.0], [2.0]).recovered)
+    assert math.isnan(worst_case([2.0], [1.0], [1.0]).recovered_share)
+    longest_world = worst_case([10.0, 30.0], [10.0, 30.0], [10.0, 29.0])
+    assert longest_world.increase == 0.5
+    assert math.isnan(longest_world.recovered_share)
+
+
+def test_failure_given_corruption():
+    found = cross_layer(400, 1000, 20, 100)
+    assert found.failure_given_corruption[0] == pytest.approx(0.5)
+    low, high = found.failure_given_corruption[1:]
+    assert low < 0.5 < high
+    assert cross_layer(0, 1000, 20, 100).failure_given_corruption is None
+    assert cross_layer(10, 1000, 20, 100).failure_given_corruption is None
+
+
+def test_failures_an_hour_are_the_upsets_that_fail_missions():
+    share = rate(20, 100)
+    assert failures_per_hour(3.0, share) == pytest.approx((0.6, 3.0 * share.low, 3.0 * share.high))
+    with pytest.raises(ConfigError, match="negative"):
+        failures_per_hour(-1.0, share)
+
+
+def test_a_mixture_of_one_part_is_that_part():
+    part = rate(7, 9)
+    whole = mixture([(90, part), (0, rate(0, 0))])
+    assert (whole.share, whole.low, whole.high) == pytest.approx((part.share, part.low, part.high))
+
+
+def test_a_mixture_weighs_by_size_not_by_sample():
+    whole = mixture([(900, rate(10, 10)), (100, rate(0, 50))])
+    assert whole.share == pytest.approx(0.9)
+    assert whole.low < 0.9 <= whole.high
+    assert math.isnan(mixture([(5, rate(0, 0)), (5, rate(1, 1))]).share)
+
+
+@pytest.mark.parametrize(("count", "total"), [(0, 10), (3, 10), (10, 10), (84, 1000)])
+def test_wilson_against_scipy(count, total):
+    ours = wilson(count, total)
+    theirs = stats.binomtest(count, total).proportion_ci(method="wilson")
+    assert ours.low == pytest.approx(theirs.low, abs=1e-12)
+    assert ours.high == pytest.approx(theirs.high, abs=1e-12)
+
+
+def test_runs_of_a_window_count_less_the_more_they_are_alike():
+    """Against the spread of the share over repeated samples of windows and of runs in them."""
+    rng = np.random.default_rng(4)
+    chances = rng.beta(0.5, 0.5, size=5000)  # of a crash, window by window
+
+    def campaign():
+        drawn = rng.choice(chances, size=20)
+        windows = rng.integers(20, size=400)
+        return rng.random(400) < drawn[windows], [("f", int(window)) for window in windows]
+
+    campaigns = [campaign() for _ in range(300)]
+    spread = np.var([hits.mean() for hits, _ in campaigns])
+    binomial = chances.mean() * (1.0 - chances.mean()) / 400
+    effects = [design_effect(hits.tolist(), windows) for hits, windows in campaigns]
+    assert spread / binomial > 5.0
+    assert np.mean(effects) == pytest.approx(spread / binomial, rel=0.2)

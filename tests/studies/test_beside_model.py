@@ -1,0 +1,195 @@
+"""Model and flight side by side: a flight that does what the model says differs by nothing."""
+
+import json
+import math
+import re
+
+import pyarrow as pa
+import pytest
+
+from mavfi_cli.analysis.overhead import ComputeOverhead
+from mavfi_cli.core.files import plain
+from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.mission.record.measures import measures_of
+from mavfi_cli.report.flight_plot import draw_flight_plot, write_flight_plot
+from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
+from mavfi_cli.studies.beside_model import Beside, side_by_side
+from mavfi_cli.studies.flight_plan import flight_plan
+from mavfi_cli.vpm.report import Choices, report, setting_of
+from mavfi_cli.vpm.schemes import SCHEMES
+from mavfi_cli.vpm.vehicle import load_vehicle
+
+HOVER_SHAFT_W = 20.0  # of the simulated vehicle, with one board
+STRAIGHT_M = 40.0 - 1.0
+
+
+def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
+    """What a flight as the model has it records; or a slower one, or one of a longer path."""
+    hover_w = HOVER_SHAFT_W * plan.rotors_w
+    velocity = row["velocity_mps"] / slower
+    time_s = longer * STRAIGHT_M / velocity
+    return {
+        "outcome": outcome,
+        "config": {"takeoff_height_m": 5.0, "goal_tolerance_m": 1.0},
+        "world": {"start": [1.0, 2.0, 0.0]},
+        "goal_enu_m": [41.0, 2.0, 5.0],
+        "quality_of_flight": {
+            "mean_speed_mps": velocity, "max_speed_mps": velocity, "flight_time_s": time_s,
+            "distance_m": longer * STRAIGHT_M, "energy_propeller_j": hover_w * time_s,
+        },
+        "referee": {"physics": {"hover_shaft_w": hover_w}},
+        "response_time_s": {"median": 1.0 / row["throughput_hz"]},
+        "pilot": {"replans": 2},
+        "detection": {"alarm_count": alarms} if row["scheme"] in ("gad", "aad") else None,
+    }  # fmt: skip
+
+
+def flights_of(records):
+    """Records as the columns of a ledger's table."""
+    return pa.Table.from_pylist(
+        [
+            {
+                "world": "w",
+                "seed": seed,
+                "outcome": record["outcome"],
+                "succeeded": record["outcome"] == "success",
+                **measures_of(record),
+            }
+            for seed, record in enumerate(records)
+        ]
+    )
+
+
+@pytest.fixture
+def spark(tmp_path):
+    """The model's report, the plans, and a function that puts flights beside them."""
+    vehicle, x86 = load_vehicle("spark"), load_platform("x86")
+    chain_s = sum(kernel.latency_s for kernel in x86.kernels.values())
+    told = report([vehicle], Choices(), SCHEMES)
+    setting = setting_of(vehicle, Choices())
+    rows = {row["scheme"]: row for row in told["vehicles"][0]["schemes"]}
+    plans = {
+        ("spark", scheme.name): flight_plan(setting, scheme, x86, chain_s, tmp_path)
+        for scheme in SCHEMES
+    }
+
+    def beside(change=None, refused=(), count=3):
+        flown = {
+            key: Beside(plan="too heavy to fly")
+            if key[1] in refused
+            else Beside(
+                plan=plan,
+                flights=flights_of(
+                    [
+                        flight(rows[key[1]], plan, **(change or {}).get(key[1], {}))
+                        for _ in range(count)
+                    ]
+                ),
+            )
+            for key, plan in plans.items()
+        }
+        overhead = ComputeOverhead(
+            detector="aad", flights=3, detection_s=0.01, recompute_s=0.0, compute_s=10.0,
+            host_compute_s=0.2, alarms=9, platforms=("x86",),
+        )  # fmt: skip
+        compared = side_by_side(told, flown, {"aad": overhead})
+        flights = {"worlds": ["w"], "missions_each": count, "first_seed": 1, "detectors": "mine",
+                   "stack": "mavbench", **compared}  # fmt: skip
+        return {**told, "flights": flights}
+
+    return beside
+
+
+def rows_of(told):
+    return {row["scheme"]: row for row in told["flights"]["vehicles"][0]["schemes"]}
+
+
+def test_flights_as_the_model_has_them_do_not_differ(spark):
+    for row in rows_of(spark()).values():
+        differences = [key for key in row if key.endswith("_difference_percent")]
+        assert len(differences) == 10
+        for key in differences:
+            assert row[key] == pytest.approx(0.0, abs=1e-9), key
+        assert row["success_percent"] == 100.0
+
+
+def test_tmr_takes_as_much_longer_as_the_paper_says(spark):
+    tmr = rows_of(spark())["tmr"]
+    assert tmr["flight_flight_time_over_aad_ratio"] == pytest.approx(1.91, rel=1e-3)
+    assert tmr["model_flight_time_over_aad_ratio"] == pytest.approx(1.91, rel=1e-3)
+
+
+def test_by_how_much_a_flight_differs(spark):
+    told = rows_of(spark({"tmr": {"slower": 1.25, "longer": 1.1}}))
+    tmr, none = told["tmr"], told["none"]
+    assert tmr["velocity_difference_percent"] == pytest.approx(-20.0)
+    assert tmr["path_ratio_difference_percent"] == pytest.approx(10.0)
+    assert tmr["flight_time_difference_percent"] == pytest.approx(37.5)
+    assert tmr["energy_difference_percent"] == pytest.approx(37.5)
+    assert none["flight_time_difference_percent"] == pytest.approx(0.0, abs=1e-9)
+    ratio = tmr["flight_flight_time_ratio"] / tmr["model_flight_time_ratio"]
+    assert ratio == pytest.approx(1.375)
+    assert tmr["flight_time_ratio_difference_percent"] == pytest.approx(37.5)
+    assert tmr["flight_velocity_ratio"] / tmr["model_velocity_ratio"] == pytest.approx(0.8)
+
+
+def test_only_successes_count(spark):
+    row = rows_of(spark({"dmr": {"outcome": "collision"}}))["dmr"]
+    assert row["success_percent"] == 0.0
+    assert row["outcomes"] == {"collision": 3}
+    assert math.isnan(row["flight_velocity_mps"])
+    assert row["pairs"] == 0
+
+
+def test_a_scheme_that_is_not_flown_says_why(spark):
+    told = spark(refused=("tmr",))
+    assert rows_of(told)["tmr"]["problem"] == "too heavy to fly"
+    lines = redundancy_lines(told["flights"])
+    assert "tmr: not flown: too heavy to fly" in lines
+    rows = redundancy_csv(told["flights"]).splitlines()
+    assert len(rows) == 6
+    assert "too heavy to fly" in rows[3]
+
+
+def test_the_table_tells_overheads_side_by_side(spark):
+    text = "\n".join(redundancy_lines(spark()["flights"]))
+    assert "aad       0.1 %     0.1 %         0.0062 %  9 in 3 flights  5 %" in text
+    assert "none: flown with acceleration 8 m/s² instead of 9.171 m/s²" in text
+    assert "no detector" in text
+    assert "3.0 a flight" in text
+    assert "alarms in a flight without a fault" not in text
+
+
+def test_what_has_no_number_has_none_in_the_table(spark):
+    lines = redundancy_lines(spark({"dmr": {"outcome": "collision"}}, count=1)["flights"])
+    text = "\n".join(lines)
+    assert "nan" not in text
+    assert max(map(len, lines)) <= 100
+    assert re.search(r"^dmr +6.50 m/s +- +-$", text, re.MULTILINE)  # no success
+    assert re.search(r"^tmr +x 0.5236 +x [\d.]+ +\(1 pairs\) ", text, re.MULTILINE)  # no interval
+
+
+def test_a_detector_that_does_not_know_these_flights(spark):
+    text = "\n".join(redundancy_lines(spark({"aad": {"alarms": 683}})["flights"]))
+    assert "aad: 683 alarms in a flight without a fault: its model was fitted to other" in text
+
+
+def test_the_picture(spark, tmp_path):
+    told = spark({"dmr": {"outcome": "collision"}}, refused=("tmr",), count=1)
+    write_flight_plot(told, tmp_path / "a.svg")
+    write_flight_plot(told, tmp_path / "b.svg")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    left, right = draw_flight_plot(spark()).axes
+    diamonds = [y for line in left.lines if line.get_marker() == "D" for y in line.get_ydata()]
+    drawn = [row["model_velocity_mps"] for row in rows_of(spark()).values()]
+    assert diamonds == pytest.approx(drawn)
+    heights = [bar.get_height() for bar in right.patches]
+    assert len(heights) == 15
+    assert max(heights) == pytest.approx(rows_of(spark())["tmr"]["flight_energy_ratio"])
+    words = [text.get_text() for text in draw_flight_plot(told).axes[0].texts]
+    assert "not flown" in words
+    assert "0 % of 1 succeed" in words
+
+
+def test_it_is_json(spark):
+    assert json.dumps(plain(spark({"dmr": {"outcome": "collision"}})["flights"]))

@@ -1,0 +1,170 @@
+"""`mavfi compare` as a user calls it: flown, resumed, extended, and every bad input in one line."""
+
+import csv
+import json
+import os
+import signal
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaign.progress import Spectator
+from mavfi_cli.campaign.run import Options
+from mavfi_cli.core.errors import Interrupted
+from mavfi_cli.core.files import plain
+from mavfi_cli.studies.compare import compare
+from mavfi_cli.studies.compare_plan import ComparePlan
+
+WORLD = (
+    'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
+    "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [16.0, 0.0, 5.0]\n"
+    "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
+)
+FEW = ("--platform", "x86", "--platform", "tx2", "--inject", "waypoint_position", "--detector",
+       "none,gad", "--missions", "2", "--first-seed", "2", "--out", "out")  # fmt: skip
+SETTINGS = ("golden", "none", "gad")
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare")
+    (folder / "posts.toml").write_text(WORLD)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def flown(home, mavfi):
+    """The run of the small comparison; its folder is home / "out"."""
+    run = mavfi("compare", "--world", "posts.toml", *FEW, "--json", cwd=home, timeout=600.0)
+    assert run.returncode == 0, run.stderr
+    return run
+
+
+@pytest.fixture(scope="module")
+def told(flown):
+    return json.loads(flown.stdout)
+
+
+@pytest.mark.slow
+def test_every_platform_flies_every_setting(told):
+    rows = {(r["platform"], r["setting"]): r for r in told["settings"]}
+    assert set(rows) == {(p, s) for p in ("x86", "tx2") for s in SETTINGS}
+    assert all(row["flown"] == 2 for row in rows.values())
+    assert told["errors"] == []
+    missions = {(f["platform"], f["setting"]): [] for f in told["flights"]}
+    for each in told["flights"]:
+        missions[each["platform"], each["setting"]].append((each["seed"], each["fault_seed"]))
+    for setting in SETTINGS:
+        assert missions["x86", setting] == missions["tx2", setting]
+
+
+@pytest.mark.slow
+def test_the_slower_platform_responds_later(told):
+    (golden,) = [r for r in told["ratios"] if r["setting"] == "golden"]
+    assert golden["quantities"]["response_median_s"]["value"] > 3.0
+    x86, tx2 = told["timeline"]["platforms"]
+    assert (x86["platform"], tx2["platform"]) == ("x86", "tx2")
+    assert tx2["response_s"] > 2.0 * x86["response_s"]
+    for row in (x86, tx2):
+        start, end = row["chain_s"]["octomap"]
+        assert end - start > 0.5 * row["response_s"]  # because of this kernel
+
+
+@pytest.mark.slow
+def test_the_folder_holds_tables_and_pictures(flown, told, home):
+    out = home / "out"
+    assert json.loads((out / "compare.json").read_text()) == told
+    with (out / "compare.csv").open() as file:
+        assert len(list(csv.DictReader(file))) > 50
+    for name in ("compare.svg", "timeline.svg"):
+        root = ET.parse(out / name).getroot()
+        said = ["".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")]
+        for wanted in ("x86: ", "tx2: "):
+            assert any(text.startswith(wanted) for text in said), (name, wanted)
+    for kernel in ("point cloud", "OctoMap", "collision check", "planner", "control"):
+        assert kernel in said
+    assert "12/12 missions" in flown.stderr
+
+
+@pytest.mark.slow
+def test_called_again_it_flies_nothing_and_says_the_same(flown, told, home, mavfi):
+    again = mavfi("compare", "--world", "posts.toml", *FEW, "--json", cwd=home)
+    assert json.loads(again.stdout) == told
+    assert "flying, " not in again.stderr
+    text = mavfi("compare", "--world", "posts.toml", *FEW, "--quiet", cwd=home)
+    assert (text.returncode, text.stderr) == (0, "")
+    assert "tx2 over x86, mission by mission" in text.stdout
+
+
+@pytest.mark.slow
+def test_other_settings_in_the_same_folder_are_refused_with_the_difference(flown, home, mavfi):
+    other = [*FEW[:5], "command_velocity", *FEW[6:]]
+    run = mavfi("compare", "--world", "posts.toml", *other, cwd=home)
+    assert (run.returncode, run.stdout) == (1, "")
+    assert run.stderr == (
+        "error: out: holds another comparison: site waypoint_position there, command_velocity "
+        "here; choose another --out\n"
+    )
+    fewer = mavfi("compare", "--world", "posts.toml", *FEW, "--missions", "1", cwd=home)
+    assert "missions 2 there, 1 here" in fewer.stderr
+
+
+class Stopper(Spectator):
+    """Asks to stop, as Ctrl-C does, once the first mission is over."""
+
+    def __init__(self):
+        self.asked = False
+
+    def on_progress(self, progress):
+        if progress.over and not self.asked:
+            self.asked = True
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.slow
+def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkeypatch):
+    monkeypatch.chdir(home)
+    plan = ComparePlan(world="posts.toml", inject=("waypoint_position",),
+                       detectors=("none", "gad"), missions=1, first_seed=2)  # fmt: skip
+    folder, options = home / "resumed", Options(jobs=2)
+    with pytest.raises(Interrupted):
+        compare(plan, folder, options, Stopper())
+    with Ledger(folder) as ledger:
+        assert 0 < ledger.over() < 6
+    compare(plan, folder, options, Spectator())
+    whole = ComparePlan(world="posts.toml", inject=("waypoint_position",),
+                        detectors=("none", "gad"), missions=2, first_seed=2)  # fmt: skip
+    assert plain(compare(whole, folder, options, Spectator())) == told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--missions", "0"], "error: missions: must be at least 1, got 0\n"),
+        (["--missions", "1000000000"], "error: missions: must be at most 100000, got 1000000000\n"),
+        (["--platform", "tx3"], "error: unknown platform 'tx3': did you mean 'tx2'? Known: "),
+        (["--platform", "x86", "--platform", "x86"], "error: platform: x86 is named twice\n"),
+        (["--platform", "mine.toml"], "error: mine.toml: no such file (in setting=golden "),
+        (["--detector", "gda"], "error: unknown detector 'gda': did you mean 'gad'? Known: "),
+        (["--detector", ","], "error: detector: name at least one\n"),
+        (["--inject", ""], "error: inject: name at least one, or none\n"),
+        (["--inject", "plannin"],
+         "error: unknown stage, state or group 'plannin': did you mean 'planning'? Known: "),
+        (["--world", "sparze"], "error: unknown world 'sparze': did you mean 'sparse'? Known: "),
+        (["--field", "exponnt"],
+         "error: unknown field 'exponnt': did you mean 'exponent'? Known: "),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_leaves_nothing(mavfi, tmp_path, arguments, told):
+    run = mavfi("compare", *arguments, cwd=tmp_path)
+    assert (run.returncode, run.stdout) == (1, "")
+    assert run.stderr.startswith(told)
+    assert run.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_formats_at_once_are_a_usage_error(mavfi, tmp_path):
+    run = mavfi("compare", "--json", "--csv", cwd=tmp_path)
+    assert run.returncode == 2
+    assert "--json or --csv, not both" in run.stderr
