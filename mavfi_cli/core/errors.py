@@ -43,7 +43,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
         if each.endswith(f"/{name}"):
             return each
     spelled = {each.lower(): each for each in known}
-    matches = difflib.get_close_matches(name.lower(), list(spelled), n=1, cutoff=0.6)
+    matches = difflib.get_close_matches(name.lower(), list(spelled), n=1, cutoff=0.5)
     return spelled[matches[0]] if matches else None
 
 
