@@ -44,8 +44,8 @@ class Beside:
         """A quantity of MODEL for each flight, (n,); NaN if a flight has none.
 
         Electrical energy of rotors and boards is shaft energy times the model's hover power over
-        the simulated vehicle's, which is the same for any number of boards; and the boards' power
-        for as long as the flight lasted.
+        the simulated vehicle's, which is the same for any number of boards, plus the boards' power
+        times the flight time.
         """
         if name == "velocity":
             return numbers(flights, "mean_speed_mps")
