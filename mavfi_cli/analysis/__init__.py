@@ -1,12 +1,12 @@
-"""A campaign's ledger as one table of columns, and the questions that are asked of it.
+"""Turn the ledger of a campaign into one table, and evaluate it.
 
-flights      the table: a row a flight; as a file
-groups       flights by setting; comparison, summary: what a campaign has found
-pairs        two treatments of the same missions, row beside row
+flights      the table, one row per flight; its export to a file
+groups       flights by setting; comparison, summary: results of a campaign
+pairs        two treatments of the same missions, row by row
 failures     faults that fail missions, across the layers
-overhead     what detection and recovery cost
-costs        what faults cost, and the worst cases; platforms: beside other computers
-detectors    detection, false alarms, recovery; scores: traces once more through detectors
+overhead     cost of detection and recovery
+costs        cost of faults, and worst cases; platforms: comparison of platforms
+detectors    detection, false alarms, recovery; scores: traces replayed through detectors
 timeline     from one depth frame to its setpoint
-trajectories which flights belong into one picture
+trajectories the flights of one picture
 """

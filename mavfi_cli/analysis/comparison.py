@@ -1,4 +1,4 @@
-"""Settings against each other, mission by mission: what faults cost, and what protection saves."""
+"""Compare settings mission by mission: the cost of faults and the benefit of protection."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RESAMPLES = 1999
 
 @dataclass(frozen=True, slots=True)
 class _Match:
-    """Two settings, the golden one of both, and the places of their pairs, (m,) in each."""
+    """Two settings, their golden setting, and the row indices of their pairs, (m,) in each."""
 
     first: Group
     second: Group
@@ -30,19 +30,19 @@ class _Match:
 
     @property
     def success(self) -> tuple[BoolArray, BoolArray]:
-        """Whether each of a pair succeeded, (m,) twice."""
+        """Success of the first and of the second flight of each pair, (m,) each."""
         return self.first.succeeded[self.at_first], self.second.succeeded[self.at_second]
 
     def differences(self, metric: str) -> FloatArray:
-        """Second minus first, of the pairs in which both succeeded and have the metric."""
+        """Second minus first, over the pairs in which both succeeded and have the metric."""
         first, second = self.success
         change = self.second.metrics[metric][self.at_second]
         return known((change - self.first.metrics[metric][self.at_first])[first & second])
 
     def worst(self) -> tuple[WorstCase, WorstCase]:
-        """The worst cases over own golden flights, and over the mean of these; of the pairs only.
+        """Worst cases over own golden flights, and over the mean of these, within the pairs.
 
-        A pair has a golden flight that succeeded, or it counts in neither.
+        A pair counts only if its golden flight succeeded.
         """
         if self.first.golden:
             golden, sides = self.at_first, [(self.second, self.at_second)]
@@ -62,7 +62,7 @@ class _Match:
         )
 
     def _golden_of_first(self) -> IntArray:
-        """The place of the golden flight of each pair, (m,); -1 where there is none."""
+        """Row index of the golden flight of each pair, (m,); -1 if there is none."""
         own = np.full(self.first.flights.num_rows, -1)
         at_golden, at_faulty = matched(self.golden, self.first)
         own[at_faulty] = at_golden
@@ -70,7 +70,7 @@ class _Match:
 
     @staticmethod
     def _times(group: Group, places: IntArray) -> FloatArray:
-        """Flight times of successful flights, (m,); not a number of others, or at -1."""
+        """Flight times of successful flights, (m,); NaN for others and at index -1."""
         found = np.full(len(places), np.nan)
         there = (places >= 0) & group.succeeded[places]
         found[there] = group.metrics["flight_time_s"][places[there]]
@@ -78,15 +78,15 @@ class _Match:
 
 
 def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
-    """Every setting with faults against the golden one with which it shares most pairs.
+    """Compare each setting with faults with the golden setting that shares most pairs.
 
     Returns:
         Plain values, over the missions that both flew. `first`, `second`: labels of the golden
-        setting, and of the other; `name`: of that in one phrase. `corrected_p`: of the family of
-        all comparisons of this kind, by Holm. `differences`: second minus first, over the pairs in
+        setting and of the other; `name`: phrase for the other. `corrected_p`: corrected by Holm
+        over all comparisons of this kind. `differences`: second minus first, over the pairs in
         which both succeeded. `over_own`: the largest flight time over that of the golden flight of
         the same mission, both successful. `over_mean`: the longest of the same flights over the
-        mean of the same golden ones, as the paper has it.
+        mean of the same golden ones, as in the paper.
     """
     found = []
     for group in groups:
@@ -97,10 +97,10 @@ def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[di
 
 
 def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
-    """Every protected setting against the unprotected one with the same faults.
+    """Compare each protected setting with the unprotected one that has the same faults.
 
     Returns:
-        As `against_golden`; the worst cases with what protection recovers of them.
+        As `against_golden`; the worst cases include what protection recovers.
     """
     bare = {
         untreated(group.labels): group for group in groups if not (group.watched or group.golden)
@@ -116,7 +116,7 @@ def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[s
 
 
 def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
-    """The golden setting that flew most of this setting's missions; None of itself golden."""
+    """The golden setting that flew most of this setting's missions; None for a golden one."""
     if group.golden:
         return None
     shared = [

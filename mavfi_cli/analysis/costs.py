@@ -1,9 +1,9 @@
-"""What faults cost on each platform, and the worst cases: the paper's Fig. 16.
+"""The cost of faults on each platform, and the worst cases: Fig. 16 of the paper.
 
 The cost of a fault is the flight time over that of the golden flight of the same mission on the
-same platform; both reached the goal. The paper flies one fixed world, so this is its measure where
-worlds differ. The longest flight of all is given too, over the mean golden one: a part of it is the
-mission's own length.
+same platform, if both reached the goal. It extends the measure of the paper, which flies one fixed
+world, to several worlds. The longest flight over the mean golden flight is also given. It depends
+on the length of the mission.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from mavfi_cli.stats.bootstrap import interval_of_rows
 from mavfi_cli.stats.paired import sign_flips
 from mavfi_cli.stats.worst_case import worst_case, worst_over_own
 
-LATE = 0.95  # the quantile beside the worst case, which has no interval
-MISSION = ("seed", "target")  # what the flights of all platforms and detectors share
-_SAME_S = 1e-6  # flight times that far apart are equal: a tick is 20 ms
+LATE = 0.95  # quantile given with the worst case, which has no interval
+MISSION = ("seed", "target")  # columns that identify a mission on all platforms
+_SAME_S = 1e-6  # flight times this close are equal: a tick is 20 ms
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Struck:
-    """The counted flights of a platform and setting beside their own golden ones.
+    """The counted flights of a platform and setting, with their own golden flights.
 
     Attributes:
-        costs: a row a pair that reached the goal: `seed`, `target`, `fault_seed`, `cost_s`,
+        costs: one row per pair that reached the goal: `seed`, `target`, `fault_seed`, `cost_s`,
             `over_own`.
         lost: flights that failed where the golden one reached the goal.
-        longest_s: of all that reached the goal, whether or not the golden one did.
+        longest_s: longest flight that reached the goal, whether or not the golden one did.
     """
 
     costs: pa.Table
@@ -46,22 +46,22 @@ class Struck:
 
     @property
     def worst(self) -> dict[str, Any] | None:
-        """The row that is longest over its own golden flight, the lowest seed of equal ones."""
+        """The row with the largest ratio to its golden flight; the lowest seed of equal ones."""
         rows = self.costs.sort_by([("over_own", "descending"), ("seed", "ascending")])
         return rows.slice(0, 1).to_pylist()[0] if rows.num_rows else None
 
     def largest(self, measure: str) -> float:
-        """Of a column; not a number where there is no pair."""
+        """Largest value of a column; NaN without pairs."""
         found = pc.max(self.costs[measure]).as_py()
         return math.nan if found is None else float(found)
 
 
 def struck(golden: pa.Table, counted: pa.Table) -> Struck:
-    """Hold flights against the golden flights of the same missions.
+    """Compare flights with the golden flights of the same missions.
 
     Args:
-        golden: successful ones.
-        counted: of one platform and setting.
+        golden: successful golden flights.
+        counted: counted flights of one platform and setting.
     """
     own, known = paired(golden, counted, ["seed"])
     won = known["succeeded"]
@@ -82,10 +82,10 @@ def struck(golden: pa.Table, counted: pa.Table) -> Struck:
 def cost_row(
     platform: str, setting: str, found: Struck, faults: Struck, *, protected: bool
 ) -> dict[str, Any]:
-    """What the faults of a setting cost on a platform.
+    """The cost of a setting's faults on a platform.
 
     Args:
-        faults: those without a detector on the same platform: what is recovered is theirs.
+        faults: the same without a detector on this platform, the reference of recovery.
         protected: whether the setting has a detector.
 
     Returns:
@@ -120,7 +120,7 @@ def cost_row(
 def cost_difference(
     platform: str, reference: str, setting: str, first: Struck, second: Struck
 ) -> dict[str, Any]:
-    """What the same faults cost on a platform beyond what they cost on the reference.
+    """The additional cost of the same faults compared with the reference platform.
 
     Returns:
         `extra_s`: the mean difference of costs; `differ`: how many of them are not zero; `p_value`:
@@ -157,12 +157,12 @@ def worst_row(
     *,
     protected: bool,
 ) -> dict[str, Any]:
-    """The longest successful flight of a setting, and over the mean golden one.
+    """The longest successful flight of a setting, and its ratio to the mean golden one.
 
     Args:
-        golden, faulty: of the platform, without a detector.
-        flights: of the setting. What a detector recovers is not a number where the faults' longest
-            flight is no longer than the longest golden one.
+        golden, faulty: flights of the platform without a detector.
+        flights: flights of the setting. The recovery is NaN if the longest flight with faults
+            is no longer than the longest golden one.
     """
     golden_s, faulty_s, times_s = (
         numbers(each, "flight_time_s").tolist() for each in (golden, faulty, flights)
@@ -180,11 +180,11 @@ def worst_row(
     }
 
 
-# Missions as what is drawn --------------------------------------------------------------------
+# Missions as the resampled unit ---------------------------------------------------------------
 
 
 def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
-    """(missions, targets) in the order of their seeds; not a number where there is no flight."""
+    """Values, (missions, targets), in the order of seeds; NaN if there is no flight."""
     seeds, row = np.unique(np.asarray(costs["seed"].to_pylist()), return_inverse=True)
     targets, column = np.unique(np.asarray(costs["target"].to_pylist()), return_inverse=True)
     table = np.full((len(seeds), len(targets)), np.nan)
@@ -193,19 +193,19 @@ def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
 
 
 def _over(count: int, statistic: Any) -> dict[str, Any]:
-    """A statistic of missions with its interval; `statistic` takes (..., missions) indices."""
+    """A statistic over missions with its interval; `statistic` takes (..., missions) indices."""
     return asdict(interval_of_rows(count, statistic, resamples=RESAMPLES))
 
 
 def _mean(values: FloatArray) -> FloatArray:
-    """Over the last two axes, of what is there."""
+    """Mean over the last two axes, without NaN."""
     return np.asarray(np.nanmean(values, axis=(-2, -1)))
 
 
 def _late(values: FloatArray) -> FloatArray:
-    """The LATE quantile over the last two axes, of what is there.
+    """The LATE quantile over the last two axes, without NaN.
 
-    `numpy.nanquantile` with several axes goes row by row; sorting puts what is missing at the end.
+    `numpy.nanquantile` with several axes goes row by row; sorting puts NaN at the end.
     """
     flat = np.sort(values.reshape((*values.shape[:-2], -1)), axis=-1)
     place = LATE * (np.count_nonzero(~np.isnan(flat), axis=-1) - 1)

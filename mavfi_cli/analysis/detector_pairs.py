@@ -1,4 +1,4 @@
-"""Flights of one mission side by side: golden, with a fault, and with a fault and a detector."""
+"""Pairs of flights of one mission: golden, faulty, and faulty with a detector."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pyarrow as pa
 
 from mavfi_cli.campaign.outcome import Injected
 
-LONGER = 0.05  # of the golden flight time: from here on a fault has done harm
-NONE = "none"  # no detector: what all others are held against
+LONGER = 0.05  # fraction of the golden flight time beyond which a fault is harmful
+NONE = "none"  # no detector: the reference of all others
 ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
 KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; a golden flight has two
 Flight = Mapping[str, Any]  # a row of `analysis.flights`
 Place = tuple[str, str, tuple[Any, ...]]  # kind, detector, KEY
-# Columns that a pair is read by; the labels are those of KEY, the kind and the detector.
+# Columns from which pairs are made; the labels are those of KEY, the kind and the detector.
 WANTED = (
     "outcome", "succeeded", "flight_time_s", "injected", "struck_s", "struck_sites", "first_bits",
     "crashed", "alarms", "alarm_count", "episodes", "path",
@@ -40,7 +40,7 @@ SCHEMA = pa.schema(
 
 
 class Harm(Enum):
-    """What a fault did to an unprotected flight, against its golden pair."""
+    """Effect of a fault on an unprotected flight, compared with its golden flight."""
 
     NONE = "none"
     LOST = "lost"  # the golden flight reached the goal, this one did not
@@ -49,9 +49,9 @@ class Harm(Enum):
 
 
 def harm_of(golden: Flight, flown: Flight) -> Harm:
-    """What a treatment did to a mission, against its golden flight.
+    """Effect of a treatment on a mission, compared with its golden flight.
 
-    A mission that failed and now succeeds has suffered no harm.
+    A mission that succeeds although its golden flight failed is not harmed.
     """
     if flown["succeeded"]:
         longer = golden["succeeded"] and (lengthening(golden, flown) or 0.0) > LONGER
@@ -62,7 +62,7 @@ def harm_of(golden: Flight, flown: Flight) -> Harm:
 
 
 def lengthening(golden: Flight, flown: Flight) -> float | None:
-    """By what part of the golden flight time another flight was longer; None if either failed."""
+    """Flight time over golden flight time, minus 1; None if either flight failed."""
     if not (golden["succeeded"] and flown["succeeded"]):
         return None
     if not golden["flight_time_s"] or flown["flight_time_s"] is None:
@@ -75,7 +75,7 @@ def _ended(prefix: str, flown: Flight) -> dict[str, Any]:
 
 
 def _first_alarm(flown: Flight, from_s: float | None) -> Mapping[str, Any] | None:
-    """The first alarm at that time or later; None where none is listed."""
+    """The first alarm at that time or later; None if there is none."""
     if from_s is None:
         return None
     return next((alarm for alarm in flown["alarms"] if alarm["stamp_s"] >= from_s - 1e-9), None)
@@ -84,7 +84,7 @@ def _first_alarm(flown: Flight, from_s: float | None) -> Mapping[str, Any] | Non
 def error_free_pair(
     world: str, seed: int, detector: str, golden: Flight, watched: Flight
 ) -> dict[str, Any]:
-    """A golden flight, and the same with a detector, as a row of SCHEMA."""
+    """A golden flight and the same with a detector, as a row of SCHEMA."""
     return {
         "kind": ERROR_FREE,
         "world": world,
@@ -110,18 +110,18 @@ def fault_pair(
     *,
     complete: bool = True,
 ) -> dict[str, Any]:
-    """A golden flight, the same with a fault, and with a detector besides, as a row of SCHEMA.
+    """A golden flight, the same with a fault, and with fault and detector, as a row of SCHEMA.
 
     `active`: the unprotected flight was struck, and something read it or may have. `struck`: the
     protected flight was; otherwise there was nothing to detect. `seen`: it had an alarm at or
-    after the strike. `by_chance`: without the fault the detector raises one from then on, too.
+    after the strike. `by_chance`: the detector also raises one after that time without the fault.
 
     Args:
         labels: KEY and the detector.
         watched: the golden flight with the detector.
         protected: the faulty flight itself for the detector `none`.
-        complete: of its mission all faults are flown with detectors; otherwise this one is,
-            because it is harmful.
+        complete: whether all faults of its mission are flown with detectors; otherwise only
+            harmful ones are.
     """
     active = faulty["injected"] in (Injected.ACTIVE.value, Injected.UNREAD.value)
     harm, remaining = harm_of(golden, faulty), harm_of(golden, protected)
@@ -164,10 +164,10 @@ def fault_pair(
 def pairs_of(
     flights: Iterable[pa.Table], detectors: Collection[str], complete: Callable[[int], bool]
 ) -> tuple[pa.Table, pa.Table]:
-    """All pairs of which every flight is there: without faults, and with one.
+    """All pairs whose flights are complete: without faults, and with one.
 
     Args:
-        flights: that ended, labelled with a kind, a detector and KEY; in the order of the pairs.
+        flights: ended flights with labels for kind, detector and KEY, in the order of the pairs.
         complete: whether all faults of the mission with this seed are flown with detectors.
     """
     known = {place: row for table in flights for place, row in _placed(table)}

@@ -1,9 +1,9 @@
-"""What a detector does with faults and without: numbers of pairs, each with its interval.
+"""Evaluate detectors with and without faults: counts of pairs, each with its interval.
 
-A fault that was not injected, or that nothing read, is counted apart and is in no other number.
-Harmful faults are all flown with the detectors; harmless ones only of the `complete` missions.
-Everything about what a fault *does* comes from the unprotected flight: in a protected one the
-detector may withhold the value before anybody reads it.
+Faults that were not injected or not read are counted separately and enter no other number.
+The detectors fly all harmful faults, and the harmless ones of the `complete` missions.
+The effect of a fault is taken from the unprotected flight, because a detector may withhold the
+value before it is read.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from mavfi_cli.stats.shares import Share, mixture, rate
 from mavfi_cli.stats.worst_case import worst_over_own
 
 RESAMPLES = 999
-TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick a state message
+TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick per state message
 ALL = "all"
-GROUPS = (ALL, "world", "stage", "field", "state")  # what faults are gathered by
+GROUPS = (ALL, "world", "stage", "field", "state")  # labels by which faults are grouped
 _NOTHING_SEEN = -math.log(0.025)  # upper 95 % limit of a Poisson count that was 0
-# Harmful faults with their scores, and the scores of error-free flights, of a detector.
+# Harmful faults with their scores, and the scores of error-free flights, for each detector.
 Scored = Callable[[str], tuple[pa.Table, list[float]]]
 
 
 def found(
     detectors: Sequence[str], error_free: pa.Table, faults: pa.Table, scored: Scored
 ) -> dict[str, Any]:
-    """What the pairs say of the detectors, a row a group and detector, as plain values.
+    """Results of the pairs, one row per group and detector, as plain values.
 
     Args:
         detectors: all of them, `none` first.
-        error_free, faults: as `detector_pairs.pairs_of` has them.
-        scored: by detector: its harmful faults with the columns `stage`, `field` and `score`, and
-            the scores of its error-free flights.
+        error_free, faults: as `detector_pairs.pairs_of` returns them.
+        scored: for each detector its harmful faults with the columns `stage`, `field` and `score`,
+            and the scores of its error-free flights.
     """
     return {
         "error_free": [
@@ -72,7 +72,7 @@ def found(
 def _grouped(
     detectors: Sequence[str], pairs: pa.Table, groups: Sequence[str]
 ) -> Iterator[tuple[str, str, str, pa.Table]]:
-    """Group, its value, detector, and the pairs, in the order in which values first come."""
+    """Group, value, detector and pairs, in the order of first occurrence of the values."""
     for by in groups:
         values = pc.unique(pairs[by]).to_pylist() if by != ALL else [ALL] * bool(pairs.num_rows)
         for value, detector in itertools.product(values, detectors):
@@ -84,7 +84,7 @@ def _part(pairs: pa.Table, by: str, value: str, detector: str) -> pa.Table:
 
 
 def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[dict[str, Any]]:
-    """Every two detectors on the same faults, with p-values corrected over all of them."""
+    """Compare every two detectors on the same faults, with p-values corrected over all."""
     rows: list[dict[str, Any]] = []
     for first, second in itertools.combinations(detectors, 2):
         tests = recoveries_compared(*(chosen(faults, detector=name) for name in (first, second)))
@@ -116,13 +116,14 @@ def _curves(harmful: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
 
 
 def error_free_metrics(pairs: pa.Table) -> dict[str, Any]:
-    """A detector on flights without faults, against the same flights without it.
+    """A detector on flights without faults, compared with the same flights without it.
 
     Returns:
-        `hours`: of flight with the detector, from taking over to the end of the mission. `alarms`,
-        `episodes`: all alarms, and with those in a row as one. `alarms_per_hour`: bootstrap over
-        flights; with no alarm at all, a Poisson upper limit. `with_alarm`: flights with at least
-        one. `lost`: golden successes that failed with the detector; `gained`: the other way round.
+        `hours`: flight time with the detector, from take-over to the end of the mission.
+        `alarms`, `episodes`: all alarms, and consecutive ones as one. `alarms_per_hour`: bootstrap
+        over flights; with no alarm at all, a Poisson upper limit. `with_alarm`: flights with at
+        least one. `lost`: golden successes that failed with the detector; `gained`: the other way
+        round.
         `success`: McNemar's test, golden first. `lengthening`: median of flight time over golden
         flight time, minus 1, of both successful.
     """
@@ -158,19 +159,19 @@ def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
 
 
 def fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
-    """A detector against faults.
+    """A detector on flights with faults.
 
     Args:
         bare: the faults without a detector, all of them.
         pairs: those that were flown with the detector.
 
     Returns:
-        `planned`: faults; of them `not_injected`, `not_activated` (nothing read what was struck)
-        and `active`. All that follows is about the active ones, where nothing else is said.
-        `crashed`: faults that killed a node: those are seen without any detector. `harmful`: lost,
-        longer or otherwise; their numbers follow. `flown`: with this detector: all harmful faults,
-        and the harmless ones of complete missions. `not_struck`: of them those that never struck,
-        because the protected flight had parted from the other; in no rate of detection.
+        `planned`: number of faults, divided into `not_injected`, `not_activated` (never read) and
+        `active`. Unless stated otherwise, all other numbers concern the active ones.
+        `crashed`: faults that killed a node, which are noticed without any detector. `harmful`:
+        lost, longer or otherwise; their numbers follow. `flown`: with this detector: all harmful
+        faults, and the harmless ones of complete missions. `not_struck`: those that never struck
+        because the protected flight had diverged; they enter no rate of detection.
         `detected_harmful`: with an alarm at or after the strike. `detected_active`: the same of all
         faults of complete missions. `detected_inactive`: the same of faults that were struck but
         not activated. `by_chance`: flights of complete missions that have an alarm in that time
@@ -234,7 +235,7 @@ def recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McN
     harm = here["harm"]
 
     def test(among: pa.Array, column: str) -> McNemar:
-        """McNemar's test of a column of flags, over some of the pairs."""
+        """McNemar's test of a column of flags over the selected pairs."""
         return mcnemar(*(flags(each.filter(among), column) for each in (here, there)))
 
     lost, harmful = pc.equal(harm, Harm.LOST.value), pc.not_equal(harm, Harm.NONE.value)
@@ -253,8 +254,8 @@ def _ends(pairs: pa.Table, first: str) -> McNemar:
 def _worst(pairs: pa.Table) -> dict[str, Any]:
     """The worst successful flight time and its recovery, as in the paper's section VII-A.
 
-    The paper flies one world with one seed. Here every mission has a seed of its own, so every
-    flight is held against its own golden pair.
+    The paper flies one world with one seed. Here every mission has its own seed, so every
+    flight is compared with its own golden flight.
 
     Returns:
         `faulty`, `protected`: the largest flight time over golden flight time, minus 1.
@@ -263,7 +264,7 @@ def _worst(pairs: pa.Table) -> dict[str, Any]:
         it hangs on single flights, not how bad it can become. `recovered_share`: of the increase;
         not a number where no flight was LONGER.
     """
-    # A flight that failed has no time: it is the longest of none.
+    # A failed flight has no flight time and is never the longest.
     faulty, protected = (
         np.nan_to_num(numbers(pairs, name), nan=-math.inf)
         for name in ("faulty_lengthening", "lengthening")
@@ -274,8 +275,8 @@ def _worst(pairs: pa.Table) -> dict[str, Any]:
     faulty, protected = faulty[usable], protected[usable]
 
     def recovered(rows: IntArray) -> FloatArray:
-        """What protection takes off the worst increase (k,), for resamples of missions (k, n)."""
-        # A sample without any successful flight of a kind has no worst one: as if none was longer.
+        """Reduction of the worst increase by protection, (k,), for resamples of missions (k, n)."""
+        # A resample without a successful flight of a kind counts as having no longer flight.
         worst = [np.maximum(each[rows].max(axis=-1), 0.0) for each in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])
 

@@ -1,8 +1,8 @@
-"""What faults cost beyond the golden flights, and what that means across layers and an hour.
+"""Failures caused by faults, across the layers and per flight hour.
 
-A fault counts against a mission whose golden flight succeeds, whatever became of it once it was
-injected: a flip that nothing read is one of the kernel's benign runs too. So a campaign and
-`mavfi kernels` count the same population.
+Every injected fault counts if the golden flight of its mission succeeds, even if it was not read,
+because such a flip is also one of the kernel's benign runs. So a campaign and `mavfi kernels` count
+the same population.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.stats.layers import cross_layer, failures_per_hour
 from mavfi_cli.stats.shares import rate
 
-KERNELS = "kernels.json"  # what `mavfi kernels --out` leaves
+KERNELS = "kernels.json"  # written by `mavfi kernels --out`
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 Runs = Mapping[str, tuple[int, int]]  # kernel -> silent corruptions, injected faults
 
@@ -36,22 +36,22 @@ def failures(
     upsets_per_hour: float | None = None,
     confidence: float = 0.95,
 ) -> list[dict[str, Any]]:
-    """Every setting with faults that has golden flights beside it.
+    """Failures of every setting with faults that has golden flights.
 
     Args:
         found: the settings of the ledger.
         kernels: folder of `mavfi kernels --out`.
-        upsets_per_hour: bit flips that reach what is attacked in an hour of flight.
+        upsets_per_hour: bit flips that reach the injection sites per flight hour.
 
     Returns:
-        Plain values. `name`: of the setting in one phrase. `failure`: injected faults that fail a
-        mission, of those whose golden flight succeeds. `kernel`: that all of its faults strike at
-        instruction level; None where there are several. `layers`: its own corruption beside that;
-        None without runs of the kernel by itself. `per_hour`: failures a flight hour, with the
-        ends of the interval; None where not asked for.
+        Plain values. `name`: phrase for the setting. `failure`: share of injected faults that fail
+        a mission whose golden flight succeeds. `kernel`: the only kernel that its faults strike at
+        instruction level; None if there are several. `layers`: SDC of the isolated kernel beside
+        it; None without runs of the isolated kernel. `per_hour`: failures per flight hour with
+        interval; None unless requested.
 
     Raises:
-        RecordError: no such folder, or what is in it cannot be read.
+        RecordError: the folder does not exist or cannot be read.
         ConfigError: the kernels were attacked with other faults; a negative rate.
     """
     alone = None if kernels is None else _Alone(kernels)
@@ -87,7 +87,7 @@ def failures(
 
 
 def _kernel(configs: Sequence[MissionConfig]) -> str | None:
-    """The one kernel that all these missions attack, as `mavfi kernels` calls it."""
+    """The only kernel that these missions attack, by its name in `mavfi kernels`."""
     faults = [config.instruction for config in configs]
     if not faults or any(fault is None for fault in faults):
         return None
@@ -100,7 +100,7 @@ def _kernel(configs: Sequence[MissionConfig]) -> str | None:
 
 
 class _Alone:
-    """What faults did to the kernels by themselves."""
+    """Effects of faults on the isolated kernels."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / KERNELS
@@ -118,7 +118,7 @@ class _Alone:
             raise RecordError(f"{self._path}: no summary of `mavfi kernels`: {error!r}") from None
 
     def require(self, config: MissionConfig) -> None:
-        """Have a mission's fault be drawn as those that struck the kernels."""
+        """Require that a mission's fault is drawn like those of the isolated kernels."""
         fault = config.instruction
         assert fault is not None
         drawn = fault.strategy()

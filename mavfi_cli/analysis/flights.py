@@ -1,7 +1,7 @@
-"""A ledger as one table of columns: a row a mission that is over, in the order of the list.
+"""A ledger as one table: one row per finished mission, in the order of the list.
 
-What the missions were comes from the list, what came of them from their records. The table is an
-`pyarrow.Table`: `to_pandas()` makes a data frame of it.
+The list supplies the configuration of the missions, the records their results. The table is a
+`pyarrow.Table`; `to_pandas()` turns it into a data frame.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ IntArray = NDArray[np.int64]
 
 
 def flights(ledger: Ledger, missions: Iterable[PlannedMission] | None = None) -> pa.Table:
-    """The missions that are over; those that could not begin have the state `error`.
+    """The finished missions; those that could not begin have the state `error`.
 
     Columns: what `mission.record.measures` tells of a record, of CONFIG and of the fault's FAULT
     what was asked for, each label as `label_NAME` and all of them as text in `labels`; `succeeded`;
     and `counted`: golden, or with a fault that struck something that was read or caught.
 
     Args:
-        missions: only these; the ledger may have others.
+        missions: selects these of the ledger.
     """
     wanted = None if missions is None else {_asked(mission) for mission in missions}
     labels = sorted({name for cell in ledger.cells() for name in cell})
@@ -94,7 +94,7 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
 
 
 def _column(values: Sequence[Any]) -> pa.Array:
-    """A column of one type: labels of mixed types become text."""
+    """A column of one type; labels of mixed types become text."""
     kinds = {type(value) for value in values if value is not None}
     if len(kinds) > 1 and kinds != {int, float}:
         values = [None if value is None else str(value) for value in values]
@@ -109,28 +109,28 @@ def chosen(table: pa.Table, **values: Any) -> pa.Table:
 
 
 def flown(table: pa.Table) -> pa.Table:
-    """The rows of missions that ended, well or badly; without those that could not begin."""
+    """The rows of missions that ended with any outcome, without those that could not begin."""
     return table.filter(pc.equal(table["state"], State.FLOWN.value))
 
 
 def numbers(table: pa.Table, name: str) -> FloatArray:
-    """A column as floats, (n,); not a number where it is empty."""
+    """A column as floats, (n,); NaN if a cell is empty."""
     column = table[name].cast(pa.float64())
     return np.asarray(column.fill_null(math.nan).to_numpy(), dtype=np.float64)
 
 
 def flags(table: pa.Table, name: str) -> BoolArray:
-    """A column of true and false, (n,)."""
+    """A column of truth values, (n,)."""
     return np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=bool)
 
 
 def known(values: FloatArray) -> FloatArray:
-    """The values that are numbers."""
+    """The values that are not NaN."""
     return values[~np.isnan(values)]
 
 
 def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Some columns, row by row."""
+    """The named columns, row by row."""
     found: list[Mapping[str, Any]] = table.select(names).to_pylist()
     return found
 
@@ -139,10 +139,10 @@ def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
 
 
 def export(ledger: Ledger, path: Path) -> int:
-    """Write the table of a campaign to a .parquet or .csv file; how many rows.
+    """Write the table of a campaign to a .parquet or .csv file; return the number of rows.
 
     Raises:
-        ConfigError: another kind of file.
+        ConfigError: the file has another suffix.
         RecordError: it cannot be written.
     """
     if path.suffix not in FORMATS:
@@ -166,7 +166,7 @@ def export(ledger: Ledger, path: Path) -> int:
 
 
 def export_csv(ledger: Ledger) -> bytes:
-    """The same as CSV."""
+    """The table of a campaign as CSV."""
     from pyarrow import csv
 
     text = io.BytesIO()
@@ -175,7 +175,7 @@ def export_csv(ledger: Ledger) -> bytes:
 
 
 def _exported(ledger: Ledger) -> pa.Table:
-    """One row a mission that is over, in the order of the list; the labels are columns too."""
+    """One row per finished mission, in the order of the list, with the labels as columns."""
     whole = flights(ledger)
     return whole.select(
         [

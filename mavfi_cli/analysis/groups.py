@@ -1,6 +1,6 @@
-"""The flown missions of a campaign, gathered by setting or by some of its factors.
+"""The flown missions of a campaign, grouped by setting or by labels.
 
-From the ledger's short rows: a campaign may have a million missions.
+Reads the short rows of the ledger, because a campaign may have a million missions.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
-# Labels in which protected flights differ.
+# Labels in which protected flights differ from unprotected ones.
 TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
 INACTIVE = frozenset(each.value for each in Injected) - COUNTED
 _WHOLE = ("cell", "number")
 _WORDS = ("outcome", "injected", "pair")
 
 
-@dataclass(frozen=True)  # no slots: what is asked of all missions is computed once
+@dataclass(frozen=True)  # no slots: cached properties need a dict
 class Group:
     """Missions that are counted together.
 
     Attributes:
-        labels: what they have in common.
-        lacked: labels by which missions are gathered and that these have not.
-        planned, errors: on the list; of them such that could not begin.
+        labels: common labels.
+        lacked: grouping labels that these missions lack.
+        planned, errors: missions on the list; those of them that could not begin.
         watched: whether a detector watches all of them.
         flights: the flown ones, in the order of the list: `number`, `outcome`, `injected`, METRICS;
             `pair` and `strike` are codes: of what golden, faulty and protected flights share, and
@@ -53,15 +53,15 @@ class Group:
 
     @property
     def name(self) -> str:
-        """What they are in one phrase: their labels, and what they lack of what was asked for."""
-        if not self.lacked or "setting" in self.labels:  # its name tells it apart
+        """A phrase of their labels and of the grouping labels that they lack."""
+        if not self.lacked or "setting" in self.labels:  # its name identifies it
             return label_text(self.labels)
         less = "golden" if self.flights.num_rows and self.golden else f"no {', '.join(self.lacked)}"
         return f"{label_text(self.labels)} {less}" if self.labels else less
 
     @cached_property
     def metrics(self) -> Mapping[str, FloatArray]:
-        """METRICS, (n,) each; not a number where a mission has none."""
+        """METRICS, (n,) each; NaN if a mission has none."""
         return {name: numbers(self.flights, name) for name in METRICS}
 
     @cached_property
@@ -76,39 +76,39 @@ class Group:
 
     @cached_property
     def golden(self) -> bool:
-        """Whether no fault was asked for."""
+        """Whether the missions have no fault."""
         return bool(self.among("injected", (Injected.GOLDEN.value,)).all())
 
     @cached_property
     def pairs(self) -> IntArray:
-        """The pairs of which a mission counts here, each once."""
+        """The distinct pairs of the counted missions."""
         return np.unique(self.codes("pair")[self.counted])
 
     def codes(self, name: str) -> IntArray:
-        """A column of whole numbers, (n,)."""
+        """An integer column, (n,)."""
         return np.asarray(self.flights[name].to_numpy(), dtype=np.int64)
 
     def among(self, name: str, words: Iterable[str]) -> BoolArray:
-        """Whether each mission has one of these in a column of words, (n,)."""
+        """Whether each mission has one of these words in a text column, (n,)."""
         found = pc.is_in(self.flights[name], value_set=pa.array(sorted(words), pa.string()))
         return np.asarray(found.to_numpy(), dtype=bool)
 
     def counts(self, name: str) -> dict[str, int]:
-        """How often each word comes in a column."""
+        """Number of occurrences of each word in a column."""
         found = pc.value_counts(self.flights[name]).to_pylist()
         return dict(sorted((each["values"], each["counts"]) for each in found))
 
     def successes(self, metric: str) -> FloatArray:
-        """A metric of the successful ones among those that count, where they have it."""
+        """A metric of the counted successful missions that have it."""
         return known(self.metrics[metric][self.succeeded & self.counted])
 
 
 def matched(first: Group, second: Group) -> tuple[IntArray, IntArray]:
-    """Missions of equal pairs that count: places in the first, places in the second, (m,) each.
+    """Counted missions of equal pairs: row indices in the first and in the second, (m,) each.
 
-    In the order of the second. Missions with faults are of equal pairs where the same faults strike
-    them. Of a pair that either flew more than once, the first time of one goes with the first of
-    the other, and so on; one golden flight serves all.
+    The order is that of the second. Missions with faults match if the same faults strike them.
+    If a pair was flown several times, the first flights match, then the second ones, and so on.
+    One golden flight matches all.
     """
     alike = ("pair",) if first.golden else ("pair", "strike")
     here, there = _timed(first, alike), _timed(second, alike)
@@ -121,7 +121,7 @@ def matched(first: Group, second: Group) -> tuple[IntArray, IntArray]:
 
 
 def _timed(group: Group, alike: Sequence[str]) -> pa.Table:
-    """Place and `alike` of each mission that counts, and how often that came before it."""
+    """Row index and `alike` of each counted mission, and the number of earlier equal ones."""
     places = np.flatnonzero(group.counted)
     columns = {name: group.codes(name)[places] for name in alike}
     order = np.lexsort([*columns.values()])  # stable
@@ -135,12 +135,12 @@ def _timed(group: Group, alike: Sequence[str]) -> pa.Table:
 
 
 def untreated(labels: Mapping[str, Any]) -> str:
-    """What protected and unprotected flights with the same faults have in common, as one text."""
+    """The labels that protected and unprotected flights with the same faults share, as text."""
     return canonical({name: value for name, value in labels.items() if name not in TREATMENT})
 
 
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
-    """The settings, or those together that have equal values of the labels `by`.
+    """The settings, merged if they have equal values of the labels `by`.
 
     Raises:
         UnknownName: no setting has such a label.

@@ -1,9 +1,9 @@
-"""What detection and recovery cost: of the flight time, and of the kernels' time (Table V).
+"""The cost of detection and recovery, relative to flight time and to kernel time (Table V).
 
-Of the flight time, by setting: a mission is the unit, each number is the mean over the missions of
-the success rate, with its bootstrap interval. Of the kernels' time: of all error-free flights of a
-detector together. Kernels and recomputations take as long as on the flight's platform; the checks
-take as long as they took on the host.
+Relative to flight time, each number of a setting is the mean over the missions of the success rate,
+with its bootstrap interval. Relative to kernel time, each number covers all error-free flights of a
+detector. Kernels and recomputations have the latencies of the flight's platform. The checks have
+their duration on the host.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, 
 from mavfi_cli.mission.record.run_folder import RESULT, load_run
 from mavfi_cli.stats.bootstrap import interval
 
-MEASURED = "measured"  # how the source of a measured overhead begins
-TIMES = " x "  # between a platform's name and the one factor on its latencies, in a file's name
-NEAR = 0.1  # a factor of the flights' latencies that far from 1 is still the platform
+MEASURED = "measured"  # first word of the source of a measured overhead
+TIMES = " x "  # separates a platform's name from its latency factor in a file name
+NEAR = 0.1  # latency factors within this distance of 1 are still the platform
 _STAGES = tuple(stage.value for stage in Stage)
-# Where ledgers lie below: a campaign, an evaluation of detectors, flights of `mavfi vpm --fly`.
+# Places of ledgers: a campaign, an evaluation of detectors, flights of `mavfi vpm --fly`.
 _LEDGERS = (LEDGER, f"protected/*/{LEDGER}", f"flights/{LEDGER}")
 
 
-# Of the flight time ---------------------------------------------------------------------------
+# Relative to flight time ----------------------------------------------------------------------
 
 
 def flight_overheads(
     ledger: Ledger, found: Sequence[Group], confidence: float = 0.95
 ) -> list[dict[str, Any]]:
-    """Every setting with a detector; a setting that gathers several has a row for each.
+    """Overheads of every setting with a detector; one row for each detector of a setting.
 
     Args:
         found: the settings of the ledger.
 
     Returns:
-        Plain values; shares are of the flight time: 0.01 is one per cent. `labels`: of the
-        setting, with the detector. `flights`: in which it checked anything. `checks_per_s`: of
-        flight time. `check_host_s`: mean time of a check on the host that flew.
-        `detection_host_share`: all checks, time of the host that flew. `recomputations`: in all
-        flights, by stage. `recovery_share`: simulated latency of what was computed again, by stage;
-        `recovery_share_in_all`: of all stages. `share_in_all`: detection and recovery, host time
-        and simulated time added up as the paper does.
+        Plain values; shares are relative to flight time, and 0.01 is one per cent. `labels`:
+        labels of the setting and the detector. `flights`: flights with checks. `checks_per_s`:
+        checks per second of flight. `check_host_s`: mean time of a check on the host that flew.
+        `detection_host_share`: all checks, time of the host that flew. `recomputations`: number in
+        all flights, by stage. `recovery_share`: simulated latency of recomputations, by stage;
+        `recovery_share_in_all`: sum over the stages. `share_in_all`: detection and recovery, host
+        time and simulated time added up as the paper does.
     """
     rows = []
     for group in found:
@@ -68,7 +68,7 @@ def _of_setting(
     labels: Mapping[str, Any], costs: Sequence[DetectionCost], confidence: float
 ) -> dict[str, Any]:
     def mean(values: Iterable[float]) -> dict[str, Any]:
-        """Over the flights, with its interval."""
+        """Mean over the flights, with its interval."""
         return asdict(interval([*values], confidence=confidence, resamples=RESAMPLES))
 
     return {
@@ -89,21 +89,21 @@ def _of_setting(
     }
 
 
-# Of the kernels' time -------------------------------------------------------------------------
+# Relative to kernel time -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComputeOverhead:
-    """What a detector cost in a number of flights.
+    """The compute overhead of a detector, summed over flights.
 
     Attributes:
         detection_s: all checks of the gate, host time.
         recompute_s: recomputations, each at the mean latency of its stage's kernels, simulated.
         compute_s: all kernels, recomputations included, simulated.
         host_compute_s: all kernels, host time.
-        alarms: after which something was computed again.
-        platforms: names of those on which the flights flew, in alphabetical order.
-        left_out: flights on other platforms, which do not count.
+        alarms: alarms with a recomputation.
+        platforms: names of the flights' platforms, in alphabetical order.
+        left_out: number of ignored flights on other platforms.
     """
 
     detector: str
@@ -118,21 +118,21 @@ class ComputeOverhead:
 
     @property
     def share(self) -> float:
-        """Of the compute time without detection and recovery; 0.01 is one per cent."""
+        """Overhead relative to the compute time without detection and recovery; 0.01 is 1 %."""
         return (self.detection_s + self.recompute_s) / (self.compute_s - self.recompute_s)
 
     @property
     def checks_share(self) -> float:
-        """The part of `share` that the checks take; the rest is recomputation."""
+        """The part of `share` due to checks; the rest is due to recomputation."""
         return self.detection_s / (self.compute_s - self.recompute_s)
 
     @property
     def checks_host_share(self) -> float:
-        """The checks over the host's own kernel time, whose workload is far below the paper's."""
+        """Checks over kernel time on the host, whose workload is far below the paper's."""
         return self.detection_s / self.host_compute_s
 
     def told(self, where: str) -> str:
-        """Where the number comes from, for the table."""
+        """The source of the number, for the table."""
         again = self.share - self.checks_share
         left = f" ({self.left_out} on other platforms left out)" if self.left_out else ""
         return (
@@ -147,17 +147,17 @@ class ComputeOverhead:
 def compute_overheads(
     records: Iterable[Mapping[str, Any]], platform: str | None = None
 ) -> dict[str, ComputeOverhead]:
-    """The overhead of every detector in these records, over all of its flights together.
+    """The overhead of every detector in these records, summed over its flights.
 
-    Flights with a fault do not count: their alarms are the fault's.
+    Flights with a fault are ignored, because the fault may cause their alarms.
 
     Args:
         records: result.json of flights.
-        platform: only flights on this one count; None: all.
+        platform: use only flights on this platform; None uses all.
     """
     counted: dict[str, list[DetectionCost]] = {}
     left_out: Counter[str] = Counter()
-    names: dict[str, str] = {}  # of platforms, by what missions call them
+    names: dict[str, str] = {}  # platform in a mission -> name
     for cost in filter(None, map(detection_cost, records)):
         if cost.faulty or cost.compute_s <= cost.recovered_s or cost.host_compute_s <= 0.0:
             continue
@@ -183,7 +183,7 @@ def compute_overheads(
 
 
 def _platform_name(called: str) -> str:
-    """The name in a platform's file where that is still there; without it, what it was called."""
+    """The name in a platform's file if the file still exists, else the recorded name."""
     if not called.endswith(".toml"):
         return called
     try:
@@ -193,27 +193,27 @@ def _platform_name(called: str) -> str:
 
 
 def _same(name: str, platform: str) -> bool:
-    """Whether it is this platform, or what `mavfi vpm --fly` makes of it for a detector's share."""
+    """Whether it is this platform, or its variant that `mavfi vpm --fly` makes for a detector."""
     base, times, factor = name.rpartition(TIMES)
     if name == platform or not times or base != platform:
         return name == platform
     try:
         return abs(float(factor) - 1.0) <= NEAR
-    except ValueError:  # a name of the user's own
+    except ValueError:  # a name that the user chose
         return False
 
 
 def recorded_overheads(
     path: Path, detectors: Sequence[str], platform: str | None = None
 ) -> dict[str, ComputeOverhead]:
-    """The overheads of detectors in the error-free flights that lie at a path.
+    """The overheads of detectors in the error-free flights at a path.
 
     Args:
         path: a run folder, a folder of them, a campaign, or the folder of another command.
-        platform: only flights on this one count; None: all.
+        platform: use only flights on this platform; None uses all.
 
     Raises:
-        RecordError: there are none; says what is there.
+        RecordError: there are none; the message says what is there.
     """
     of_each = compute_overheads(_records(path), platform)
     known = {name: each for name, each in of_each.items() if name in detectors}
@@ -237,7 +237,7 @@ def recorded_overheads(
 
 
 def _records(path: Path) -> Iterator[Mapping[str, Any]]:
-    """result.json of a run folder, of all runs in a folder, or of all missions of a campaign."""
+    """Records of a run folder, of all runs in a folder, or of all missions of a campaign."""
     if path.is_file() or (path / RESULT).is_file():
         yield load_run(path).result
         return

@@ -1,4 +1,4 @@
-"""Two treatments of the same missions, row beside row."""
+"""Two treatments of the same missions, row by row."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mavfi_cli.stats.paired import McNemar, mcnemar
 
 
 def paired(first: pa.Table, second: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:
-    """The rows of two tables that have equal keys, side by side, in the order of the second.
+    """Join the rows of two tables by equal keys, in the order of the second.
 
     Args:
         on: names of the key columns; no two rows of `first` have the same keys.
@@ -43,14 +43,14 @@ def ratio(
     second: Iterable[float],
     resamples: int = RESAMPLES,
 ) -> Interval:
-    """Second over first: the geometric mean; its interval is that of the mean logarithm.
+    """Geometric mean of second over first; its interval is that of the mean logarithm.
 
-    Pairs in which either is no positive number are left out. Several pairs of one mission are not
-    independent: their mean counts as one value.
+    Pairs with a value that is not positive are left out. Several pairs of one mission are not
+    independent, so their mean counts as one value.
 
     Args:
-        missions: what pairs that are not independent have in common, (n,).
-        first, second: of each pair, (n,).
+        missions: key that dependent pairs share, (n,).
+        first, second: values of each pair, (n,).
     """
     pairs = zip(missions, first, second, strict=True)
     logs = [(mission, math.log(b / a)) for mission, a, b in pairs if a > 0.0 and b > 0.0]
@@ -69,14 +69,14 @@ def difference(
     second: Iterable[float],
     resamples: int = RESAMPLES,
 ) -> Interval:
-    """Second minus first: the mean; otherwise as `ratio`, for what may be zero."""
+    """Mean of second minus first, for values that may be zero; otherwise as `ratio`."""
     pairs = zip(missions, first, second, strict=True)
     changes = [(mission, b - a) for mission, a, b in pairs if not math.isnan(b - a)]
     return interval(_means(changes), resamples=resamples)
 
 
 def _means(values: Iterable[tuple[Hashable, float]]) -> list[float]:
-    """The mean of each mission, in the order in which missions first come."""
+    """The mean of each mission, in the order of first occurrence."""
     found: dict[Hashable, list[float]] = {}
     for mission, value in values:
         found.setdefault(mission, []).append(value)

@@ -1,7 +1,7 @@
-"""The numbers of a comparison: settings, ratios between platforms, and what faults cost.
+"""The numbers of a comparison: settings, ratios between platforms, and costs of faults.
 
-Flight time, distance, energy and replans are of successful flights; response times of all counted
-ones. A faulty flight is counted where its fault struck something that was read or caught.
+Flight time, distance, energy and replans cover successful flights, response times all counted
+flights. A faulty flight is counted if its fault struck a value that was read or caught.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, mean, median
 from mavfi_cli.stats.shares import rate
 
-GOLDEN, NONE = "golden", "none"  # without a fault; with one and without a detector
+GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detector
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quantity:
-    """Something that is measured of each flight.
+    """A quantity that is measured in each flight.
 
     Attributes:
-        name: of its column.
-        any_end: measured of failed flights too.
-        ratio: whether platforms are compared by ratio; else by difference.
+        name: name of its column.
+        any_end: whether failed flights have it, too.
+        ratio: whether platforms are compared by ratio or by difference.
     """
 
     name: str
@@ -64,7 +64,7 @@ SCHEMA = pa.schema(
 
 
 def compared(flights: pa.Table) -> pa.Table:
-    """The columns of SCHEMA of the missions that ended; a golden flight has an empty target."""
+    """The columns of SCHEMA for the missions that ended; golden flights have an empty target."""
     table = flown(flights)
     bare = pc.if_else(pc.is_null(table["level"]), GOLDEN, NONE)
     setting = pc.coalesce(table["detector"].cast(pa.string()), bare)
@@ -77,10 +77,10 @@ def compared(flights: pa.Table) -> pa.Table:
 def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table) -> dict[str, Any]:
     """All numbers of the flights, as plain values.
 
-    `settings` has a row a platform and setting, `ratios` a row a setting and platform other than
-    the first, `costs` and `worst` a row a platform and setting, `cost_differences` a row a setting
-    and platform other than the first, `flights` a row a flight. Shares, increases and ratios have
-    no unit; everything else ends in its unit, or has it beside.
+    `settings`, `costs` and `worst` have one row per platform and setting. `ratios` and
+    `cost_differences` have one row per setting and platform other than the first. `flights` has
+    one row per flight. Shares, increases and ratios have no unit; all other names end in the unit
+    or have it in a key of its own.
 
     Args:
         flights: with the columns of SCHEMA.
@@ -168,7 +168,7 @@ def _spread(values: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -
 def _ratio(
     platform: str, reference: str, setting: str, first: pa.Table, second: pa.Table
 ) -> dict[str, Any]:
-    """The second platform over the first, mission by mission."""
+    """Ratio of the second platform to the first, mission by mission."""
     pairs = paired(first, second, MISSION)
     test = success_test(*pairs)
     return {
@@ -183,7 +183,7 @@ def _ratio(
 
 
 def _changed(quantity: Quantity, first: pa.Table, second: pa.Table) -> dict[str, Any]:
-    """The geometric mean of ratios with its interval; of what may be zero, the mean difference."""
+    """Geometric mean ratio with its interval, or mean difference for values that may be zero."""
     if not quantity.any_end:
         both = pa.array(both_succeed(first, second))
         first, second = first.filter(both), second.filter(both)
@@ -195,11 +195,11 @@ def _changed(quantity: Quantity, first: pa.Table, second: pa.Table) -> dict[str,
     return {"kind": "difference", "unit": quantity.unit, **found}
 
 
-# What the platforms are -----------------------------------------------------------------------
+# Descriptions of the platforms ----------------------------------------------------------------
 
 
 def platforms_told(platforms: Sequence[str]) -> list[dict[str, Any]]:
-    """A row of plain values a platform."""
+    """One row of plain values per platform."""
     names, profiles = titles(platforms), {name: load_platform(name) for name in platforms}
     return [
         {
@@ -215,7 +215,7 @@ def platforms_told(platforms: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def titles(platforms: Sequence[str]) -> dict[str, str]:
-    """What platforms are called in tables and pictures: a file by its stem, where that tells."""
+    """Names of platforms in tables and pictures: the stem of a file, if that is unique."""
     short = [name.removesuffix(".toml").rpartition("/")[2] for name in platforms]
     return {
         name: stem if short.count(stem) == 1 else name

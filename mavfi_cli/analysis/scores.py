@@ -1,8 +1,8 @@
-"""Traces of unprotected flights once more through the detectors: one score a flight.
+"""Replay traces of unprotected flights through the detectors: one score per flight.
 
-The score is the highest of the flight's messages, in units of the detector's threshold: above 1
-the gate would have raised an alarm. Nothing is withheld on the way, so the scores do not depend on
-the threshold. The looks through the flown plan are among them.
+The score is the highest of the flight's messages, in units of the detector's threshold. Above 1 the
+gate would have raised an alarm. Nothing is withheld during the replay, so the scores do not depend
+on the threshold. They include the checks of the plan in flight.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from mavfi_cli.mission.record.plan_file import read_plans
 from mavfi_cli.mission.record.run_folder import load_run
 
 SCORES = "scores.json"
-_WAY = "looks ahead"  # how scores are taken; those of another way are not mixed with them
+_WAY = "looks ahead"  # scoring method; scores of other methods are not mixed with these
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Kept:
-    """What was kept of a flight, as far as a gate sees it."""
+    """The stored part of a flight that a gate sees."""
 
     columns: Columns
     plans: Sequence[Trajectory]
@@ -56,18 +56,18 @@ def _kept_of(path: Path) -> _Kept:
 
 
 def _value(state: str, pattern: str) -> float | int | bool:
-    """From its bits: a record has no numbers that are not finite."""
+    """Decode a value from its bits, because a record has finite numbers only."""
     kind = bits.NUMPY_TYPES[BY_NAME[state].dtype.value]
     return bits.value_of(int(pattern, 16), kind)
 
 
 class Scores:
-    """Scores of flights by detector; what was scored once is kept in the folder.
+    """Scores of flights by detector; the folder stores them.
 
     Args:
-        detectors: without `none`.
-        stack: that the flights flew.
-        folder: of the evaluation.
+        detectors: all except `none`.
+        stack: stack of the flights.
+        folder: folder of the evaluation.
     """
 
     def __init__(self, detectors: Sequence[DetectorConfig], stack: str, folder: Path) -> None:
@@ -84,11 +84,11 @@ class Scores:
     def score_all(
         self, flights: Iterable[tuple[str | None, float | None]], tell: Callable[[str], None]
     ) -> None:
-        """Score what was not scored yet; flights without a trace are passed over.
+        """Score the flights without scores; flights without a trace are skipped.
 
         Args:
-            flights: run folder, and when the fault struck, s.
-            tell: hears how many flights are replayed.
+            flights: run folder and time of the strike, s.
+            tell: receives a text with the number of replayed flights.
         """
         missing = [
             (Path(path), struck_s)
@@ -137,13 +137,13 @@ class Scores:
 
 
 def model_digest(detector: DetectorConfig, stack: str) -> str:
-    """A name for the contents of a detector's model file; `none` without one."""
+    """Digest of a detector's model file; `none` without one."""
     path = model_path(detector, stack)
     return "none" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _read(path: Path) -> dict[str, dict[str, float | None]]:
-    """What was kept; damaged or missing, nothing."""
+    """The stored scores; empty if the file is damaged or missing."""
     try:
         kept: dict[str, dict[str, float | None]] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

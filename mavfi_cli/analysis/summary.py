@@ -1,4 +1,4 @@
-"""What a campaign has found so far: settings, what faults cost, what protection saves."""
+"""Summary of a campaign: settings, cost of faults, benefit of protection."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from mavfi_cli.stats.shares import rate
 
 
 def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) -> dict[str, Any]:
-    """The campaign of a ledger as far as it is flown.
+    """Summarise the flown missions of a ledger.
 
     Args:
-        by: gather settings by these labels; all labels where none is named.
+        by: labels by which settings are grouped; empty means all.
 
     Returns:
-        Plain values. `cells`: a row a setting. `faults`, `protection`: as `comparison` has them.
+        Plain values. `cells`: one row per setting. `faults`, `protection`: see `comparison`.
 
     Raises:
         UnknownName: no setting has such a label.
@@ -55,7 +55,7 @@ def _cell(group: Group, confidence: float) -> dict[str, Any]:
     """
 
     def success(fates: frozenset[str]) -> dict[str, Any]:
-        """Success rate over the missions of some fates."""
+        """Success rate over the selected missions."""
         chosen = group.succeeded[group.among("injected", fates)]
         return asdict(rate(int(chosen.sum()), len(chosen), confidence))
 

@@ -1,7 +1,7 @@
-"""From one depth frame to its setpoint: which kernel ran when, as a time table tells.
+"""Kernel invocations from a depth frame to its setpoint, from a recorded time table.
 
-An invocation's input is the output of the last invocation of the kernel before it that had ended
-when this one started: the queues hold one message, and the newest wins.
+The input of an invocation is the newest output of the preceding kernel at its start, because the
+queues keep only the newest message.
 """
 
 from __future__ import annotations
@@ -18,19 +18,23 @@ from mavfi_cli.mission.platform import KERNELS
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.record.timetable import read_timetable
 
-CHAIN = ("point_cloud", "octomap", "collision_check")  # from a frame to the verdict on the way
-LEAST_S = 1.0  # of flight that a timeline shows
-_ANSWERS = ("slow", "stop")  # events: what the pilot does about a foreseen collision
+CHAIN = (
+    "point_cloud",
+    "octomap",
+    "collision_check",
+)  # from a frame to the verdict on the trajectory
+LEAST_S = 1.0  # least duration of a timeline
+_ANSWERS = ("slow", "stop")  # events: reactions of the pilot to a foreseen collision
 _PLAN_WITHIN_S = 3.0
 _MARGIN_S = 0.05
 _SAME_S = 1e-9
 
 
 def timelines(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """The timelines of several platforms over the same time, a row each; of those that answered.
+    """Timelines of the platforms that answered, one row each, over the same time.
 
     Args:
-        runs: by platform.
+        runs: run of each platform.
     """
     alone = {name: timeline_of(run) for name, run in runs.items()}
     longest_s = max((row["shown_s"][1] for row in alone.values() if row), default=LEAST_S)
@@ -42,19 +46,18 @@ def timelines(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
 
 
 def timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any] | None:
-    """One second of a flight, from a typical depth frame on; longer where its answer takes longer.
+    """The second of a flight after a typical depth frame; longer if the answer takes longer.
 
-    Where a verdict had the vehicle slow down or stop, the frame is of such a verdict, and what
-    follows is shown up to the first setpoint of the new plan. Times count from the frame's stamp,
-    s. `chain_s` holds the invocations that led to the setpoints, `lanes_s` all that ran in the
-    window.
+    If a verdict made the vehicle slow down or stop, the frame is one with such a verdict, and the
+    timeline ends with the first setpoint of the new plan. Times in s count from the frame's stamp.
+    `chain_s` holds the invocations that led to the setpoints, `lanes_s` all that ran in the window.
 
     Args:
-        run: with its time table and trace.
-        least_s: so much is shown from the frame on.
+        run: run with time table and trace.
+        least_s: least duration after the frame.
 
     Returns:
-        Plain values; None where no frame was ever answered.
+        Plain values; None if no frame was answered.
 
     Raises:
         RecordError: the time table cannot be read.
@@ -91,7 +94,7 @@ def typical(reactions: Sequence[Reaction], told: Collection[float] = ()) -> Reac
     """The reaction whose time is nearest the median of the flight's; the first of equals.
 
     Args:
-        told: stamps of setpoints; where there are reactions that end in one, it is one of those.
+        told: stamps of setpoints; reactions that end in one of them are preferred.
     """
     if not reactions:
         return None
@@ -107,7 +110,7 @@ def _time_s(reaction: Reaction) -> float:
 def chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
     """The invocations through which a frame reached its setpoint, in order; control's is the last.
 
-    Fewer where the time table does not hold them all.
+    The list is shorter if the time table lacks some.
     """
     found: list[Invocation] = []
     before_s = reaction.setpoint_stamp_s
@@ -125,13 +128,13 @@ def chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invo
 
 
 def _last(invocations: Sequence[Invocation], kernel: str, before_s: float) -> Invocation | None:
-    """The newest output of a kernel at a moment."""
+    """The newest output of a kernel at a time."""
     over = [e for e in invocations if e.node == kernel and e.end_s <= before_s + _SAME_S]
     return max(over, key=lambda each: each.end_s, default=None)
 
 
 def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation | None:
-    """The first planning after a verdict was answered, at once or once the vehicle stands."""
+    """The first planning after the reaction to a verdict, in motion or at rest."""
     for each in invocations:
         if each.node == "planner" and each.start_s >= answer_s - _SAME_S:
             return each if each.start_s <= answer_s + _PLAN_WITHIN_S else None
@@ -141,7 +144,7 @@ def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation |
 def _answered(
     invocations: Sequence[Invocation], stamps_s: Sequence[float], ready_s: float
 ) -> float | None:
-    """The first setpoint that knows of an output that was ready at a moment."""
+    """The first setpoint that uses an output that was ready at a time."""
     for each in invocations:
         if each.node == "control" and each.start_s >= ready_s - _SAME_S:
             delay_s = each.end_s - each.start_s
@@ -153,7 +156,7 @@ def _answered(
 def _spans(
     invocations: Sequence[Invocation], kernel: str, shown: tuple[float, float], zero_s: float
 ) -> list[list[float]]:
-    """Start and end of what a kernel did in a window, s from its zero."""
+    """Start and end of a kernel's invocations in a window, s from its zero."""
     return [
         [each.start_s - zero_s, each.end_s - zero_s]
         for each in invocations
@@ -162,9 +165,9 @@ def _spans(
 
 
 def timeline_seed(flown: Sequence[Mapping[str, Any]], platforms: Sequence[str]) -> int | None:
-    """The first mission that all platforms fly well and with a new plan on the way.
+    """Seed of the first mission that succeeds and replans on all platforms.
 
-    Where there is none, the first that all fly well; None where there is none of those.
+    Without one, the first that succeeds on all platforms; else None.
 
     Args:
         flown: golden and other flights, with the columns of `platforms.SCHEMA`.

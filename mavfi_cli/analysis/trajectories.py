@@ -1,4 +1,4 @@
-"""Which flights belong into one picture: a mission golden, with its faults, protected (Fig. 13)."""
+"""The flights of one picture: a mission golden, with faults, and protected (Fig. 13)."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
     """The flights that share world, start and noise with a mission, panel by panel.
 
     Args:
-        number: of the mission; None: of the pair, among those whose run folders are all kept, in
-            which a fault prolongs a flight most without failing it, by its share of the golden
-            flight time; the first of the list where none does.
+        number: number of the mission. None selects the pair in which a fault prolongs a flight
+            most without failing it, relative to the golden flight time, among the pairs with all
+            run folders; the first pair of the list if no fault does.
 
     Returns:
         `panels`: a row a fault with its `title`, what is struck, empty of golden flights; and its
@@ -34,7 +34,7 @@ def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
 
     Raises:
         ConfigError: the list has no such mission.
-        RecordError: nothing of it is flown, or not all of its run folders were kept.
+        RecordError: its pair is not flown, or not all of its run folders were kept.
     """
     number = _most_prolonged(ledger) if number is None else number
     if not 0 <= number < ledger.planned():
@@ -66,7 +66,7 @@ def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
 
 
 def _cut_off(each: MissionResult) -> bool:
-    """Whether its process ended before it wrote what is drawn."""
+    """Whether its process ended before it wrote the trace."""
     return each.path is not None and each.path.is_dir() and not (each.path / RESULT).is_file()
 
 
@@ -75,7 +75,7 @@ def _told(numbers: Sequence[int]) -> str:
 
 
 def _most_prolonged(ledger: Ledger) -> int:
-    """A mission of the pair that is drawn where none is named.
+    """A mission of the pair that is drawn by default.
 
     Raises:
         RecordError: no pair has all of its run folders.
@@ -129,7 +129,7 @@ def _panels(flown: Sequence[MissionResult]) -> list[dict[str, Any]]:
 
 
 def _common(labels: Sequence[Mapping[str, Any]]) -> set[str]:
-    """The labels that all of them have, with equal values."""
+    """The labels with equal values in all missions."""
     first, *others = labels
     return {
         name
@@ -166,7 +166,7 @@ def _panel(title: str, flown: Sequence[MissionResult]) -> dict[str, Any]:
 
 
 def _setting(each: MissionResult) -> str:
-    """What the specification calls it; else what it is."""
+    """The name in the specification, else a description."""
     named = each.mission.labels.get("setting")
     if named is not None:
         return str(named)
@@ -176,6 +176,6 @@ def _setting(each: MissionResult) -> str:
 
 
 def _treatment(each: MissionResult) -> str:
-    """What else its treatment is, where settings of one name stand side by side."""
+    """The rest of its treatment, to tell settings of one name apart."""
     labels = each.mission.labels
     return ", ".join(str(labels[name]) for name in TREATMENT[1:] if labels.get(name) is not None)

@@ -1,4 +1,4 @@
-"""The command line: one thin module a command, imported only when it is called."""
+"""The command line: one thin module per command, imported when the command is called."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
 # name -> (module, what it does); the help page must not import the modules
 _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
-    "sitl": ("mavfi_cli.cli.sitl", "The simulated vehicle alone, for any MAVLink client."),
+    "sitl": ("mavfi_cli.cli.sitl", "Run the simulated vehicle alone, for any MAVLink client."),
     "world": ("mavfi_cli.cli.world", "List, make, check and draw worlds."),
     "replay": ("mavfi_cli.cli.replay", "Repeat a run and compare the records."),
-    "kernels": ("mavfi_cli.cli.kernels", "Attack one kernel at a time, one bit flip a run."),
+    "kernels": ("mavfi_cli.cli.kernels", "Flip bits in isolated kernels, one fault per run."),
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
-    "detect": ("mavfi_cli.cli.detect", "Detectors: which there are, what they are worth."),
-    "campaign": ("mavfi_cli.cli.campaign", "Plan and run thousands of missions."),
-    "compare": ("mavfi_cli.cli.compare", "The same missions on several computers."),
-    "vpm": ("mavfi_cli.cli.vpm", "What DMR and TMR cost in speed, time and energy."),
-    "platforms": ("mavfi_cli.cli.platforms", "Compute platforms and their latencies."),
-    "stacks": ("mavfi_cli.cli.stacks", "Stacks: how the companion can be wired."),
+    "detect": ("mavfi_cli.cli.detect", "List the detectors and evaluate them."),
+    "campaign": ("mavfi_cli.cli.campaign", "Plan, run and summarise thousands of missions."),
+    "compare": ("mavfi_cli.cli.compare", "Fly the same missions on several platforms."),
+    "vpm": ("mavfi_cli.cli.vpm", "Model the cost of DMR and TMR in speed, time and energy."),
+    "platforms": ("mavfi_cli.cli.platforms", "List the compute platforms and their latencies."),
+    "stacks": ("mavfi_cli.cli.stacks", "List and compare the stacks of the companion."),
     "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),
-    "show": ("mavfi_cli.cli.show", "Read a run and say what happened."),
-    "doctor": ("mavfi_cli.cli.doctor", "Test this machine: what works here, and why not."),
+    "show": ("mavfi_cli.cli.show", "Summarise a recorded run."),
+    "doctor": ("mavfi_cli.cli.doctor", "Test what works on this machine."),
 }
 
 
 class _LazyGroup(click.Group):
-    """Loads a command's module when the command is used or its own help is asked for."""
+    """A group that imports a command's module when the command or its help is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names, in the order of the help."""
+        """The names, in the order of the help."""
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import the command's module; None where there is no such command."""
+        """Import the command's module; None if there is no such command."""
         if cmd_name not in _COMMANDS:
             return None
         module = importlib.import_module(_COMMANDS[cmd_name][0])
@@ -48,14 +48,14 @@ class _LazyGroup(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The list in the help, from the table: importing every command would be slow."""
+        """Write the list from the table, because importing every command would be slow."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does, but an unknown command names the nearest one."""
+        """Resolve as click does, but suggest the nearest name for an unknown command."""
         if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
             ctx.fail(str(UnknownName("command", args[0], _COMMANDS)))
         return super().resolve_command(ctx, args)
@@ -64,13 +64,13 @@ class _LazyGroup(click.Group):
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="mavfi")
 def cli() -> None:
-    """What a bit flip does to a flying robot, and what it costs to survive it."""
+    """Find out what a bit flip does to a flying robot, and what surviving it costs."""
 
 
 def main() -> NoReturn:
-    """Entry point: a known error is one line and exit code 1, a usage error exit code 2.
+    """Entry point: errors are one line with exit code 1, usage errors with exit code 2.
 
-    A name that does not exist is a usage error.
+    An unknown name is a usage error.
     """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up

@@ -1,62 +1,69 @@
-"""`mavfi campaign`: plan, run, watch and export thousands of missions."""
+"""`mavfi campaign`: plan, run, summarise and export thousands of missions."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
 
 if TYPE_CHECKING:
     from mavfi_cli.campaign.ledger import Ledger
     from mavfi_cli.campaign.specification.spec import Spec
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
-_SET = click.option("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
-                    help="Replace a factor of the preset or file, as world=dense; repeat it. "
-                         "A value with a comma is quoted, or all are a TOML list. "
-                         "The folder's name tells it.")  # fmt: skip
+_what = partial(click.option, cls=GroupedOption, group="Missions")
+_execution = partial(click.option, cls=GroupedOption, group="Execution")
+_output = partial(click.option, cls=GroupedOption, group="Output")
+_SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
+             help="Replace a factor of the preset or file, as in world=dense. May be repeated. "
+                  "Quote a value with a comma, or give all values as a TOML list. The change "
+                  "becomes part of the folder name.")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
 
 
 @click.group()
 def campaign() -> None:
-    """Thousands of missions: planned, paired, resumable, counted.
+    """Plan, fly and evaluate thousands of paired missions.
 
     WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16 speeds hardening ablation), a
-    campaign.toml, or the folder of a campaign that was begun. Presets and files fly into
-    campaigns/NAME, and that is where status, draw and export look for them. A folder with a
-    preset's name is ./NAME.
+    campaign.toml, or the folder of an existing campaign. Presets and files fly into
+    campaigns/NAME, where status, draw and export look for them. Write ./NAME for a folder with
+    the name of a preset.
     """
 
 
-@campaign.command()
+@campaign.command(cls=GroupedCommand)
 @click.argument("what", metavar="WHAT")
-@click.option("--out", type=_FOLDER, help="Folder of the campaign  [campaigns/NAME].")
-@click.option("--scale", type=float, help="So much of the repetitions: 0.1 runs a tenth.")
+@_what("--scale", type=float, help="Fraction of the repetitions to run: 0.1 runs a tenth.")
 @_SET
-@click.option("--jobs", type=click.IntRange(min=1),
-              help="Missions at the same time  [one a core].")  # fmt: skip
-@click.option("--cluster", metavar="URL",
-              help="Fly on a scheduler of dask.distributed, as tcp://host:8786.")  # fmt: skip
-@click.option("--keep", type=click.Choice(_KEEP),
-              help="Run folders that are kept  [as the campaign says].")  # fmt: skip
-@click.option("--limit", "limit_s", type=click.FloatRange(min=0.0, min_open=True), default=900.0,
-              show_default=True, help="Wall time of a mission, s; a longer one hangs.")  # fmt: skip
-@click.option("--missing-only", is_flag=True,
-              help="Go on with a campaign that was begun; refuse to begin one.")  # fmt: skip
-@click.option("--append", is_flag=True,
-              help="Add the missions that the folder's list does not have.")  # fmt: skip
-@click.option("--retry-errors", is_flag=True, help="Fly those again that could not begin.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+@_what("--missing-only", is_flag=True,
+       help="Resume a campaign; fail if there is none in the folder.")  # fmt: skip
+@_what("--append", is_flag=True, help="Add the missions that the folder's list lacks.")
+@_what("--retry-errors", is_flag=True, help="Repeat the missions that could not begin.")
+@_execution("--jobs", type=click.IntRange(min=1),
+            help="Number of parallel missions  [one per core].")  # fmt: skip
+@_execution("--cluster", metavar="URL",
+            help="Fly on a dask.distributed scheduler, such as tcp://host:8786.")  # fmt: skip
+@_execution("--limit", "limit_s", type=click.FloatRange(min=0.0, min_open=True), default=900.0,
+            show_default=True,
+            help="Wall time limit of a mission, s; missions that exceed it are recorded as "
+                 "`hang`.")  # fmt: skip
+@_output("--out", type=_FOLDER, help="Folder of the campaign  [campaigns/NAME].")
+@_output("--keep", type=click.Choice(_KEEP),
+         help="Run folders to keep  [as the campaign says].")  # fmt: skip
+@_output("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@_output("--quiet", is_flag=True, help="No progress on stderr.")
 def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Fly what is missing of a campaign: all of it, or what an earlier run left.
+    """Fly the missing missions of a campaign: all, or those that an earlier run left.
 
-    Ctrl-C lets the missions that are flying finish; a second one kills them. Either way the next
-    run goes on.
+    Ctrl-C waits for the missions in flight; a second one kills them. The next run resumes the
+    campaign in either case.
     """
     from mavfi_cli.campaign.begin import begin, chosen
     from mavfi_cli.campaign.keep import Keep
@@ -85,25 +92,26 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 
 @campaign.command()
 @click.argument("what", metavar="WHAT")
-@click.option("--by", metavar="LABEL,LABEL", help="Gather settings by these labels  [all].")
+@click.option("--by", metavar="LABEL,LABEL", help="Group settings by these labels  [all].")
 @click.option("--confidence", default=0.95, show_default=True,
-              type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True))  # fmt: skip
+              type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+              help="Confidence level of the intervals.")  # fmt: skip
 @click.option("--quality", is_flag=True,
-              help="Also time, distance, energy, replans: intervals and extremes.")  # fmt: skip
+              help="Add intervals and extremes of time, distance, energy and replans.")  # fmt: skip
 @click.option("--overhead", is_flag=True,
-              help="Also what detection and recovery cost of the flight time, stage by "
+              help="Add the share of flight time that detection and recovery take, by "
                    "stage.")  # fmt: skip
 @click.option("--failures", is_flag=True,
-              help="Also which share of faults fail missions that succeed without.")  # fmt: skip
+              help="Add the share of faults that fail otherwise successful missions.")  # fmt: skip
 @click.option("--kernels", type=_FOLDER,
-              help="With --failures: folder of `mavfi kernels --out`, for the probability of "
-                   "failure given a kernel's silent corruption.")  # fmt: skip
+              help="With --failures: folder of `mavfi kernels --out`. Adds the probability of "
+                   "failure given an SDC of a kernel.")  # fmt: skip
 @click.option("--upsets", type=click.FloatRange(min=0.0),
-              help="With --failures: bit flips an hour that reach what is attacked, for failures "
-                   "a flight hour.")  # fmt: skip
+              help="With --failures: bit flips per hour that reach the injection sites. "
+                   "Adds failures per flight hour.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def status(what: str, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
-    """What a campaign has found so far; also while it runs."""
+    """Summarise the results of a campaign, also while it runs."""
     from mavfi_cli.campaign.begin import folder_of
     from mavfi_cli.campaign.ledger import Ledger
 
@@ -118,7 +126,7 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 @click.argument("what", metavar="WHAT")
 @click.argument("path", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
 def export(what: str, path: Path) -> None:
-    """Write one row a mission to PATH, a .parquet or .csv file, or - for CSV on stdout."""
+    """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli.analysis.flights import export as write
     from mavfi_cli.analysis.flights import export_csv
     from mavfi_cli.campaign.begin import folder_of
@@ -134,16 +142,16 @@ def export(what: str, path: Path) -> None:
 @campaign.command()
 @click.argument("what", metavar="WHAT")
 @click.option("--pair", "number", type=click.IntRange(min=0), metavar="NUMBER",
-              help="The flights that share world, start and noise with this mission; its number is "
-                   "the first part of its run folder's name  [the pair in which a fault costs most "
-                   "flight time].")  # fmt: skip
+              help="Draw the pair of this mission. The number is the first part of the run "
+                   "folder's name  [the pair in which a fault costs most flight "
+                   "time].")  # fmt: skip
 @click.option("--output", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
-              required=True, help="The picture, an SVG.")  # fmt: skip
+              required=True, help="SVG file to write.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
 def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
-    """Draw golden, faulty and protected flights of one pair over each other, from above.
+    """Draw the golden, faulty and protected flights of one pair from above.
 
-    From the run folders that were kept, all settings of the pair; a panel for each fault.
+    Reads the kept run folders of all settings of the pair. Each fault has a panel.
     """
     from mavfi_cli.analysis.trajectories import pair
     from mavfi_cli.campaign.begin import folder_of
@@ -172,25 +180,26 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 
 @campaign.command()
 @click.argument("what", metavar="[WHAT]", required=False)
-@click.option("--scale", type=float, help="So much of the repetitions.")
+@click.option("--scale", type=float, help="Fraction of the repetitions to run.")
 @_SET
 @click.option("--margin", type=float,
-              help="How many missions a setting needs for an interval of so much to either "
-                   "side.")  # fmt: skip
+              help="Print the missions per setting for a confidence interval of this half "
+                   "width.")  # fmt: skip
 @click.option("--expect", "expected", default=0.5, show_default=True,
-              help="With --margin: the success rate that is expected.")  # fmt: skip
+              help="With --margin: expected success rate.")  # fmt: skip
 @click.option("--difference", type=float,
-              help="How many pairs of missions find such a difference of rates.")  # fmt: skip
+              help="Print the pairs that detect this difference of success rates.")  # fmt: skip
 @click.option("--discordant", default=0.2, show_default=True,
-              help="With --difference: the share of pairs whose outcomes differ.")  # fmt: skip
+              help="With --difference: expected share of pairs whose outcomes differ.")  # fmt: skip
 @click.option("--power", default=0.8, show_default=True,
-              help="With --difference: how surely it is found.")  # fmt: skip
-@click.option("--confidence", default=0.95, show_default=True)
+              help="With --difference: probability of detecting it.")  # fmt: skip
+@click.option("--confidence", default=0.95, show_default=True,
+              help="Confidence level.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -> None:
-    """What a campaign would fly, without flying; or how many missions a question needs.
+    """List the missions of a campaign without flying, or compute a sample size.
 
-    What `run` would refuse is refused here too.
+    Rejects whatever `run` would reject.
     """
     from mavfi_cli.stats.shares import (
         missions_for_margin,
@@ -297,7 +306,7 @@ def _add_more(
     told: dict[str, Any],
     lines: list[str],
 ) -> None:
-    """What --quality, --overhead and --failures ask for, as plain values and as text."""
+    """Add the results of --quality, --overhead and --failures, as plain values and as text."""
     from mavfi_cli.analysis.failures import failures
     from mavfi_cli.analysis.groups import groups
     from mavfi_cli.analysis.overhead import flight_overheads

@@ -1,49 +1,55 @@
-"""`mavfi compare`: the same missions on several computers, side by side."""
+"""`mavfi compare`: fly the same missions on several platforms."""
 
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
 
-@click.command()
-@click.option("--platform", "platforms", multiple=True, metavar="NAME|FILE",
-              help="A computer; repeat it. The others are held against the first  "
-                   "[x86, tx2].")  # fmt: skip
-@click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
-              help="How the companion is wired; the same on all platforms.")  # fmt: skip
-@click.option("--world", default="sparse", show_default=True, metavar="NAME|FILE",
-              help="Where to fly.")  # fmt: skip
-@click.option("--inject", metavar="TARGET,TARGET",
-              help="Stages, states or groups that a fault strikes, one a flight; none for golden "
-                   "flights only  [perception,planning,control].")  # fmt: skip
-@click.option("--field", help="Bit field that is struck: sign, exponent, mantissa  [any].")
-@click.option("--detector", "detectors", metavar="NAME,NAME",
-              help="What protects; none, no protection, is always flown  "
-                   "[none,gad,aad].")  # fmt: skip
-@click.option("--missions", default=100, show_default=True,
-              help="Of each platform, setting and target.")  # fmt: skip
-@click.option("--first-seed", default=1, show_default=True,
-              help="Of the missions; seeds count up from here.")  # fmt: skip
-@click.option("--seed", default=1, show_default=True, help="Of the faults.")
-@click.option("--jobs", type=click.IntRange(min=1),
-              help="Missions at the same time  [one a core].")  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False),
-              default=Path("comparison"), show_default=True,
-              help="Folder of flights, tables and pictures; what it has is not flown "
-                   "again.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
-@click.option("--csv", "as_csv", is_flag=True, help="Print a row a number as CSV.")
-@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+_missions = partial(click.option, cls=GroupedOption, group="Missions")
+_settings = partial(click.option, cls=GroupedOption, group="Faults and detectors")
+_output = partial(click.option, cls=GroupedOption, group="Output")
+
+
+@click.command(cls=GroupedCommand)
+@_missions("--platform", "platforms", multiple=True, metavar="NAME|FILE",
+           help="Platform; may be repeated. The others are compared with the first  "
+                "[x86, tx2].")  # fmt: skip
+@_missions("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+           help="Stack on all platforms; `mavfi stacks` lists them.")  # fmt: skip
+@_missions("--world", default="sparse", show_default=True, metavar="NAME|FILE",
+           help="World of the missions.")  # fmt: skip
+@_missions("--missions", default=100, show_default=True,
+           help="Missions per platform, setting and target.")  # fmt: skip
+@_missions("--first-seed", default=1, show_default=True,
+           help="Seed of the first mission; each further mission adds 1.")  # fmt: skip
+@_missions("--jobs", type=click.IntRange(min=1),
+           help="Number of parallel missions  [one per core].")  # fmt: skip
+@_settings("--inject", metavar="TARGET,TARGET",
+           help="Stages, states or groups to corrupt, one per mission; none flies golden runs "
+                "only  [perception,planning,control].")  # fmt: skip
+@_settings("--field", help="Field of the bits: sign, exponent, mantissa  [any].")
+@_settings("--seed", default=1, show_default=True, help="Seed of the faults.")
+@_settings("--detector", "detectors", metavar="NAME,NAME",
+           help="Detectors; none, the flight without detector, is always included  "
+                "[none,gad,aad].")  # fmt: skip
+@_output("--out", type=click.Path(path_type=Path, file_okay=False),
+         default=Path("comparison"), show_default=True,
+         help="Folder of flights, tables and pictures. Recorded missions are not flown "
+              "again.")  # fmt: skip
+@_output("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
+@_output("--csv", "as_csv", is_flag=True, help="Print the comparison as CSV, one number per row.")
+@_output("--quiet", is_flag=True, help="No progress on stderr.")
 def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any) -> None:
     """Fly the same missions on each platform: golden, with faults, and with detectors.
 
-    World, start, noise and faults are the same on all of them; only the computer differs.
-    Interrupted, it goes on where it stopped when it is called again. Writes compare.json,
-    compare.csv, compare.svg and timeline.svg.
+    World, start, noise and faults are the same on all platforms. The same command resumes an
+    interrupted comparison. Writes compare.json, compare.csv, compare.svg and timeline.svg.
     """
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view

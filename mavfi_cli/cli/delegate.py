@@ -1,4 +1,4 @@
-"""Commands that live on the vehicle's side: this process becomes theirs."""
+"""Commands of the vehicle's side, which replace this process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NoReturn
 
 
 def run_module(module: str, arguments: Sequence[str]) -> NoReturn:
-    """Become `python -m module arguments`: its streams, its signals, its exit code."""
+    """Become `python -m module arguments`, with its streams, signals and exit code."""
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

@@ -1,26 +1,29 @@
-"""`mavfi detect`: the detectors, and what they are worth on flights that training never saw."""
+"""`mavfi detect`: list the detectors and evaluate them on missions outside the training data."""
 
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
+
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
 @click.group()
 def detect() -> None:
-    """The detectors that can protect a flight, and what they are worth."""
+    """List the detectors and evaluate them."""
 
 
 @detect.command("list")
 @click.option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
-@click.option("--json", "as_json", is_flag=True, help="Print with the whole provenance.")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON, with the full provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
-    """Detectors, their model files, stacks and thresholds, and where they come from."""
+    """List the detectors with model files, stacks, thresholds and origin."""
     from mavfi_cli.detect.listing import listing
 
     rows = listing(models)
@@ -36,49 +39,56 @@ def list_(models: Path | None, as_json: bool) -> None:
         click.echo(f"{'':<9} {row['told']}")
 
 
-@detect.command()
-@click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
-              help="Where to fly; may be repeated  [sparse, dense, factory, farm].")  # fmt: skip
-@click.option("--detector", "detectors", metavar="NAME,NAME",
-              help="Which detectors  [none,range,l2,gad,aad].")  # fmt: skip
-@click.option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
-@click.option("--protect", default="perception,planning,control", show_default=True,
-              help="Stages whose states are watched.")  # fmt: skip
-@click.option("--flights", default=25, show_default=True, type=click.IntRange(min=0),
-              help="Missions of each world with faults: of each, one for every kind.")  # fmt: skip
-@click.option("--harmless-flights", default=5, show_default=True, type=click.IntRange(min=0),
-              help="Of these missions the first so many are flown with the detectors for every "
-                   "fault, the others only for faults that do harm without.")  # fmt: skip
-@click.option("--golden-flights", default=100, show_default=True, type=click.IntRange(min=1),
-              help="Error-free missions of each world, --flights at least.")  # fmt: skip
-@click.option("--first-seed", default=500_000, show_default=True, type=click.IntRange(min=0),
-              help="Of the missions; seeds count up from here. Those that trained a model are "
-                   "refused.")  # fmt: skip
-@click.option("--seed", default=1, show_default=True, help="Of the faults.")
-@click.option("--level", type=click.Choice(["source", "instruction"]), default="source",
-              show_default=True,
-              help="Faults in states between kernels, or in instructions of a node.")  # fmt: skip
-@click.option("--field", "fields", default="sign,exponent,mantissa,integer", show_default=True,
-              help="Bit fields that are struck at the source level; integer: states that have none "
-                   "of the others.")  # fmt: skip
-@click.option("--platform", metavar="NAME|FILE", help="The companion computer  [x86].")
-@click.option("--stack", metavar="NAME|FILE",
-              help="How the companion is wired; its shipped models are taken  "
-                   "[mavbench].")  # fmt: skip
-@click.option("--jobs", type=click.IntRange(min=1),
-              help="Missions at the same time  [one a core].")  # fmt: skip
-@click.option("--out", type=_FOLDER, default=Path("evaluation"), show_default=True,
-              help="Folder of flights, tables and pictures; what it has is not flown "
-                   "again.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the evaluation as JSON.")
-@click.option("--csv", "as_csv", is_flag=True, help="Print a row a pair as CSV.")
-@click.option("--quiet", is_flag=True, help="No progress on stderr.")
-def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any) -> None:
-    """Fly held-out missions golden, with faults, and with faults and detectors; count.
+_missions = partial(click.option, cls=GroupedOption, group="Missions")
+_fault = partial(click.option, cls=GroupedOption, group="Faults")
+_detector = partial(click.option, cls=GroupedOption, group="Detectors")
+_output = partial(click.option, cls=GroupedOption, group="Output")
 
-    Interrupted, it goes on where it stopped when it is called again with the same folder; called
-    with more flights, worlds or detectors, it adds them. Writes evaluation.json, evaluation.csv,
-    roc.svg and recovery.svg.
+
+@detect.command(cls=GroupedCommand)
+@_missions("--world", "worlds", multiple=True, metavar="NAME|FILE",
+           help="World; may be repeated  [sparse, dense, factory, farm].")  # fmt: skip
+@_missions("--flights", default=25, show_default=True, type=click.IntRange(min=0),
+           help="Faulty missions per world. Each is flown once per kind of fault.")  # fmt: skip
+@_missions("--harmless-flights", default=5, show_default=True, type=click.IntRange(min=0),
+           help="Number of these missions, the first ones, that the detectors fly with every "
+                "fault. They fly the others only with faults that do harm without "
+                "detector.")  # fmt: skip
+@_missions("--golden-flights", default=100, show_default=True, type=click.IntRange(min=1),
+           help="Error-free missions per world, at least --flights.")  # fmt: skip
+@_missions("--first-seed", default=500_000, show_default=True, type=click.IntRange(min=0),
+           help="Seed of the first mission; each further mission adds 1. Seeds that trained a "
+                "model are rejected.")  # fmt: skip
+@_missions("--platform", metavar="NAME|FILE", help="Platform of the companion  [x86].")
+@_missions("--stack", metavar="NAME|FILE",
+           help="Stack; its shipped models are used. `mavfi stacks` lists them  "
+                "[mavbench].")  # fmt: skip
+@_missions("--jobs", type=click.IntRange(min=1),
+           help="Number of parallel missions  [one per core].")  # fmt: skip
+@_fault("--level", type=click.Choice(["source", "instruction"]), default="source",
+        show_default=True,
+        help="`source` corrupts states between kernels, `instruction` operands of a node's "
+             "instructions.")  # fmt: skip
+@_fault("--field", "fields", default="sign,exponent,mantissa,integer", show_default=True,
+        help="Fields of the bits at source level; integer means states that have no other "
+             "field.")  # fmt: skip
+@_fault("--seed", default=1, show_default=True, help="Seed of the faults.")
+@_detector("--detector", "detectors", metavar="NAME,NAME",
+           help="Detectors to evaluate  [none,range,l2,gad,aad].")  # fmt: skip
+@_detector("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
+@_detector("--protect", default="perception,planning,control", show_default=True,
+           help="Stages that the detectors watch.")  # fmt: skip
+@_output("--out", type=_FOLDER, default=Path("evaluation"), show_default=True,
+         help="Folder of flights, tables and pictures. Recorded missions are not flown "
+              "again.")  # fmt: skip
+@_output("--json", "as_json", is_flag=True, help="Print the evaluation as JSON.")
+@_output("--csv", "as_csv", is_flag=True, help="Print the evaluation as CSV, one pair per row.")
+@_output("--quiet", is_flag=True, help="No progress on stderr.")
+def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any) -> None:
+    """Evaluate detectors on held-out missions: golden, faulty, and faulty with detector.
+
+    The same command resumes an interrupted evaluation. More flights, worlds or detectors are added
+    to those in the folder. Writes evaluation.json, evaluation.csv, roc.svg and recovery.svg.
     """
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view

@@ -1,4 +1,4 @@
-"""`mavfi doctor`: what works on this machine, and what to do about what does not."""
+"""`mavfi doctor`: test what works on this machine, and suggest remedies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 
 from mavfi_cli.core.columns import WIDTH
 
-_INDENT = 29  # what a check found begins here
+_INDENT = 29  # column of a check's finding
 _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}
 
 
@@ -18,7 +18,7 @@ _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("r
 def doctor(as_json: bool) -> None:
     """Test this machine: wheels, cores, physics, loopback, ptrace, breakpoints.
 
-    Exits with 1 where flying would not work; what is only limited does not count.
+    Exits with code 1 if mavfi cannot fly here. Limitations do not count.
     """
     from mavfi_cli.mission.machine import CheckResult, check_machine
 

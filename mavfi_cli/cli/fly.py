@@ -48,7 +48,7 @@ class _Stages(click.ParamType[Any]):
     name = "STAGE,..."
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, ...]:
-        """The names, in the order in which they are given."""
+        """The names, in the given order."""
         if isinstance(value, tuple):
             return value
         return tuple(part.strip() for part in str(value).split(",") if part.strip())
@@ -63,30 +63,30 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 @click.command(cls=GroupedCommand)
 @_mission("--config", metavar="FILE", type=click.Path(path_type=Path, exists=True, dir_okay=False),
-          help="A TOML file of the whole mission; other options replace what it says. "
-               "docs/flight.md lists its keys, also those that are no options.")  # fmt: skip
+          help="TOML file of the whole mission. Other options override it. docs/flight.md lists "
+               "its keys, including those without an option.")  # fmt: skip
 @_mission("--world", default="dense", show_default=True, metavar="NAME|FILE",
-          help="A world, or a TOML file of boxes; `mavfi world list` shows them.")  # fmt: skip
-@_mission("--seed", default=3, show_default=True, help="Root seed of everything random.")
-@_mission("--world-seed", type=int, help="Seed of the world alone  [--seed].")
+          help="World, or a TOML file of boxes; `mavfi world list` lists the worlds.")  # fmt: skip
+@_mission("--seed", default=3, show_default=True, help="Root seed of all random draws.")
+@_mission("--world-seed", type=int, help="Seed of the world only  [--seed].")
 @_mission("--planner", default="rrtstar", show_default=True,
-          help="rrtstar, rrt, rrtconnect, or a plug-in's name.")  # fmt: skip
+          help="rrtstar, rrt, rrtconnect, or the name of a plug-in.")  # fmt: skip
 @_mission("--platform", default="x86", show_default=True, metavar="NAME|FILE|measured:FACTOR",
-          help="The companion computer whose latencies the flight has. `measured` takes this "
-               "host's kernel times, times the factor; it needs --realtime.")  # fmt: skip
+          help="Compute platform whose latencies the flight has. `measured` multiplies the "
+               "kernel times of this host by FACTOR and needs --realtime.")  # fmt: skip
 @_mission("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
-          help="How the companion is wired and what it checks; `mavfi stacks` shows "
-               "them.")  # fmt: skip
+          help="Structure, checks and gains of the companion; `mavfi stacks` lists the "
+               "stacks.")  # fmt: skip
 @_mission("--vehicle", default="solo", show_default=True, metavar="NAME|FILE",
           help="solo, spark, or a TOML profile.")  # fmt: skip
 @_mission("--start", type=_Place(), help="Take-off position, ENU, m  [the world's].")
 @_mission("--goal", type=_Place(),
-          help="Goal, ENU, m  [the world's]. A generated world is made around start and goal: "
-               "other places move its bounds, and towers within 3 m of them are left "
+          help="Goal, ENU, m  [the world's]. A generated world follows start and goal: other "
+               "positions move its bounds, and towers within 3 m of them are left "
                "out.")  # fmt: skip
 @_mission("--v-max", "v_max_mps", default=3.0, show_default=True, help="Speed limit, m/s.")
 @_mission("--time-limit", "time_limit_s", default=300.0, show_default=True,
-          help="Simulated seconds after take-off.")  # fmt: skip
+          help="Limit of simulated time after take-off, s.")  # fmt: skip
 @_mission("--realtime", is_flag=True, help="Pace the simulated vehicle by the wall clock.")
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
@@ -98,23 +98,23 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
              "process.NODE (the node's process is killed).")  # fmt: skip
 @_fault("--at", default="random", show_default=True,
         metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
-        help="When the fault strikes, counted from the companion's taking over.")  # fmt: skip
+        help="Trigger; time and ticks count from when the companion takes control.")  # fmt: skip
 @_fault("--fault-seed", default=1, show_default=True,
-        help="Seed of all that is drawn for the fault.")  # fmt: skip
+        help="Seed of all random draws of the fault.")  # fmt: skip
 @_fault("--bits", default=1, show_default=True, help="Number of bits that are flipped.")
 @_fault("--field", default="any", show_default=True,
         help="Field of the bits: sign, exponent, mantissa, any.")  # fmt: skip
 @_fault("--bit", "exact_bits", multiple=True, type=int,
-        help="This bit instead of a drawn one. May be repeated.")  # fmt: skip
+        help="Flip this bit instead of a random one. May be repeated.")  # fmt: skip
 @_fault("--all-components", "together", is_flag=True,
-        help="Strike all states of the group, each with its own bits.")  # fmt: skip
+        help="Corrupt all states of the group, each with its own bits.")  # fmt: skip
 @_fault("--effect", default="flip", show_default=True, help="flip, zero, random.")
 @_fault("--persistence", default="transient", show_default=True,
         help="transient, stuck-at, intermittent.")  # fmt: skip
 @_fault("--duration", "duration_s", type=float,
-        help="Duration of a stuck-at or intermittent fault, s  [to the end].")  # fmt: skip
+        help="Duration of a stuck-at or intermittent fault, s  [until the end].")  # fmt: skip
 @_fault("--restart", "node_restart_s", default=1.0, show_default=True,
-        help="Time until a node that died works again, s; 3600 is never.")  # fmt: skip
+        help="Time until a dead node works again, s; 3600 means never.")  # fmt: skip
 @_instruction("--level", type=click.Choice(["source", "instruction"]), default="source",
               show_default=True,
               help="`instruction` corrupts an operand of one machine instruction of a kernel: "
@@ -125,25 +125,26 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
                    "be repeated.")  # fmt: skip
 @_instruction("--role", "roles", multiple=True, help="source or destination  [both].")
 @_detector("--detector", metavar="NAME",
-           help="Watch the states and recover: gad, aad, range, l2, or a plug-in's name "
-                "[none].")  # fmt: skip
+           help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
+                "the name of a plug-in  [none].")  # fmt: skip
 @_detector("--protect", type=_Stages(), default="perception,planning,control", show_default=True,
            help="Stages that the detector watches.")  # fmt: skip
 @_detector("--threshold", type=float,
-           help="Alarm above this score; for gad the number of sigmas  [the model's].")  # fmt: skip
+           help="Score above which the detector raises an alarm; for gad the number of sigmas  "
+                "[the model's].")  # fmt: skip
 @_detector("--model", type=click.Path(exists=True, dir_okay=False),
-           help="A model file of the detector's  [the one shipped for the stack].")  # fmt: skip
+           help="Model file of the detector  [the one shipped for the stack].")  # fmt: skip
 @_detector("--any-stack-model", "any_stack", is_flag=True,
-           help="Accept a model of another stack. Without --model it is that of the stack on which "
+           help="Accept a model of another stack. Without --model, use that of the stack on which "
                 "this one is based.")  # fmt: skip
 @_detector("--watch", default="paper", show_default=True, metavar="paper|extended",
-           help="States that the detector watches: the paper's 13, or also collision and the "
-                "sequence numbers of plans.")  # fmt: skip
+           help="States that the detector watches: the 13 of the paper; extended adds collision "
+                "and the sequence numbers of plans.")  # fmt: skip
 @_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
-         show_default=True, help="Folder in which the run folder is made.")  # fmt: skip
+         show_default=True, help="Parent of the new run folder.")  # fmt: skip
 @_output("--picture/--no-picture", default=True, help="Draw flight.svg.", show_default=True)
 @_output("--expect", type=click.Choice(_OUTCOMES),
-         help="Exit with 1 if the mission ends otherwise.")  # fmt: skip
+         help="Exit with code 1 if the outcome differs.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print result.json instead of the summary.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def fly(
@@ -155,9 +156,9 @@ def fly(
     config: Path | None,
     **_options: Any,
 ) -> None:
-    """Fly one mission from take-off to the goal, through obstacles that nobody told it about.
+    """Fly one mission from take-off to the goal, through unknown obstacles.
 
-    A mission that fails is a result: the exit code is 0 unless --expect asks otherwise.
+    A mission that fails still exits with code 0, unless --expect names another outcome.
     """
     from mavfi_cli.cli.progress import progress_view
     from mavfi_cli.mission.record.run_folder import load_run
@@ -186,11 +187,11 @@ def fly(
 
 
 def _mission_of(path: Path | None) -> MissionConfig:
-    """The mission of the file, with what the options replace.
+    """The mission of the file, with the options in place.
 
     Raises:
-        ConfigError: the file cannot be used.
-        UsageError: an option cannot be used; names it.
+        ConfigError: the file is not valid.
+        UsageError: an option is not valid; the message names it.
     """
     from mavfi_cli.core.config import load_toml
     from mavfi_cli.mission.config import MissionConfig
@@ -240,7 +241,7 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
 def _faults(
     base: MissionConfig, given: dict[str, Any]
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
-    """The mission's fault at either level; says now what is wrong with it."""
+    """The mission's fault at source or instruction level, checked."""
     from mavfi_cli.mission.fault_config import FaultConfig
     from mavfi_cli.mission.instruction_config import InstructionConfig
 
@@ -287,7 +288,7 @@ def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig |
 
 
 def _refuse(unused: set[str], given: dict[str, Any], needs: str) -> None:
-    """An option that would do nothing is a mistake."""
+    """Reject options that would have no effect."""
     for name in given:
         if name in unused:
             raise click.UsageError(f"{spelling(name)} needs {needs}")

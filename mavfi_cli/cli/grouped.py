@@ -1,4 +1,4 @@
-"""Options in groups: the help of a command with many options reads section by section."""
+"""Options in groups: the help shows one section per group."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from click.core import ParameterSource
 
 
 class GroupedOption(click.Option):
-    """An option that the help shows in a section of its own.
+    """An option that the help shows in the section of its group.
 
     Args:
         group: title of the section.
@@ -21,13 +21,13 @@ class GroupedOption(click.Option):
 
 
 class GroupedCommand(click.Command):
-    """A command whose help shows its options in their groups, in the order of declaration."""
+    """A command whose help shows its options by group, in the order of declaration."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write one section a group."""
+        """Write one section per group."""
         sections: dict[str, list[tuple[str, str]]] = {}
         for param in self.get_params(ctx):
-            record = param.get_help_record(ctx)
+            record = None if isinstance(param, click.Argument) else param.get_help_record(ctx)
             if record is not None:
                 sections.setdefault(getattr(param, "group", "Output"), []).append(record)
         for title, records in sections.items():
@@ -46,7 +46,7 @@ def given_options() -> dict[str, Any]:
 
 
 def spelling(name: str) -> str:
-    """How the user spells a parameter of the current command, as `--v-max`; else the name."""
+    """The option of a parameter of the current command, such as `--v-max`; else the name."""
     for param in click.get_current_context().command.params:
         if param.name == name:
             return param.opts[0]

@@ -1,4 +1,4 @@
-"""`mavfi kernels`: one fault a run in an isolated kernel, and what it did to the output."""
+"""`mavfi kernels`: inject one fault per run into an isolated kernel and compare its output."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import os
 import shlex
 import tempfile
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
 from mavfi_cli.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,66 +25,67 @@ if TYPE_CHECKING:
     from mavfi_cli.attack.target import AttackTarget
 
 
-@click.command()
-@click.option("--kernel", multiple=True, metavar="NAME",
-              help="point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar or control, or "
-                   "a Python file with a kernel of your own. May be repeated  [all].")  # fmt: skip
-@click.option("--world", default="dense", show_default=True, metavar="NAME|FILE",
-              help="World of the golden flight that feeds the kernels.")  # fmt: skip
-@click.option("--world-seed", default=3, show_default=True, help="Its seed.")
-@click.option("--program", help="Attack this native program instead of our kernels.")
-@click.option("--args", help="Its arguments, quoted as in a shell.")
-@click.option("--compare", multiple=True, metavar="OUTPUT",
-              help="What of it is compared: stdout, or file:PATH that it writes, relative to the "
-                   "scratch folder in which it then runs. May be repeated  [stdout].")  # fmt: skip
-@click.option("--ignore-lines", multiple=True, metavar="REGEX",
-              help="Program: lines in which this is found are not compared. May be "
-                   "repeated.")  # fmt: skip
-@click.option("--stdin", "stdin_file", metavar="FILE",
-              type=click.Path(exists=True, dir_okay=False, path_type=Path),
-              help="Program: its standard input  [none].")  # fmt: skip
-@click.option("--tolerance", default=0.0, type=click.FloatRange(min=0.0),
-              help="Relative error of a number that is still counted as benign.")  # fmt: skip
-@click.option("--runs", default=1000, show_default=True, type=click.IntRange(min=1),
-              help="Of each kernel, or of the program: one fault a run.")  # fmt: skip
-@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1),
-              help="Runs at the same time; the results are the same.")  # fmt: skip
-@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0),
-              help="Of the faults.")  # fmt: skip
-@click.option("--scope", multiple=True, help="Program: shared object in scope.")
-@click.option("--function", help="Program: attack only inside calls of this function.")
-@click.option(
-    "--windows",
-    default=16,
-    show_default=True,
-    help="Windows (of a program: calls of --function) that are stepped, where all is too much.",
-)
-@click.option(
-    "--sampling",
-    default="instruction-uniform",
-    show_default=True,
-    help="instruction-uniform, cpu-time or wall-clock.",
-)
-@click.option("--site", multiple=True,
-              help="general, flags, vector, x87, mask, instruction-pointer, opcode, memory. May be "
-                   "repeated  [the first five: registers].")  # fmt: skip
-@click.option("--role", multiple=True, help="source or destination  [both].")
-@click.option("--field", default="any", show_default=True,
-              help="Of which field bits are flipped: sign, exponent, mantissa, any.")  # fmt: skip
-@click.option("--bits", default=1, show_default=True, type=click.IntRange(min=1),
-              help="How many bits are flipped.")  # fmt: skip
-@click.option("--compat", help="Repeat another injector's habits: rosfi-2021.")
-@click.option("--null", is_flag=True, help="Do everything but the flip.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False),
-              help="Folder for records, JSON, CSV, plot; what it has is not repeated.")  # fmt: skip
-@click.option("--replay", type=click.Path(path_type=Path, file_okay=False),
-              help="Repeat the recorded runs of such a folder and compare; with --kernel these "
-                   "kernels, with --runs so many of each.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-def kernels(**options: Any) -> None:
-    """Flip bits in one kernel at a time, one fault a run, and compare its output.
+_target = partial(click.option, cls=GroupedOption, group="Kernels")
+_native = partial(click.option, cls=GroupedOption, group="Native program")
+_fault = partial(click.option, cls=GroupedOption, group="Fault")
+_runs = partial(click.option, cls=GroupedOption, group="Runs")
+_output = partial(click.option, cls=GroupedOption, group="Output")
 
-    Attacks the kernels of the autonomy, or with --program any native program.
+
+@click.command(cls=GroupedCommand)
+@_target("--kernel", multiple=True, metavar="NAME",
+         help="point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar, control, or a "
+              "Python file with your own kernel. May be repeated  [all].")  # fmt: skip
+@_target("--world", default="dense", show_default=True, metavar="NAME|FILE",
+         help="World of the golden run that supplies the kernels' inputs.")  # fmt: skip
+@_target("--world-seed", default=3, show_default=True, help="Seed of that golden run.")
+@_native("--program", help="Native program to attack instead of the kernels.")
+@_native("--args", help="Arguments of the program, quoted as in a shell.")
+@_native("--stdin", "stdin_file", metavar="FILE",
+         type=click.Path(exists=True, dir_okay=False, path_type=Path),
+         help="Standard input of the program  [none].")  # fmt: skip
+@_native("--compare", multiple=True, metavar="OUTPUT",
+         help="Output to compare: stdout, or file:PATH for a file that the program writes. PATH "
+              "is relative to the scratch folder in which the program then runs. May be repeated  "
+              "[stdout].")  # fmt: skip
+@_native("--ignore-lines", multiple=True, metavar="REGEX",
+         help="Do not compare lines that contain a match. May be repeated.")  # fmt: skip
+@_native("--scope", multiple=True, help="Shared object to attack. May be repeated.")
+@_native("--function", help="Attack only code that executes during calls of this function.")
+@_fault("--sampling", default="instruction-uniform", show_default=True,
+        help="instruction-uniform, cpu-time or wall-clock.")  # fmt: skip
+@_fault("--windows", default=16, show_default=True,
+        help="Number of windows to single-step if the whole execution is too long. A window of a "
+             "program is a call of --function.")  # fmt: skip
+@_fault("--site", multiple=True,
+        help="general, flags, vector, x87, mask, instruction-pointer, opcode, memory. May be "
+             "repeated  [the first five: registers].")  # fmt: skip
+@_fault("--role", multiple=True, help="source or destination  [both].")
+@_fault("--field", default="any", show_default=True,
+        help="Field of the bits: sign, exponent, mantissa, any.")  # fmt: skip
+@_fault("--bits", default=1, show_default=True, type=click.IntRange(min=1),
+        help="Number of bits that are flipped.")  # fmt: skip
+@_fault("--seed", default=1, show_default=True, type=click.IntRange(min=0),
+        help="Seed of the faults.")  # fmt: skip
+@_fault("--compat", help="Follow the rules of another injector: rosfi-2021.")
+@_fault("--null", is_flag=True, help="Do everything except the flip.")
+@_runs("--runs", default=1000, show_default=True, type=click.IntRange(min=1),
+       help="Runs per kernel, or of the program. Each run has one fault.")  # fmt: skip
+@_runs("--jobs", default=1, show_default=True, type=click.IntRange(min=1),
+       help="Number of parallel runs. It does not change the results.")  # fmt: skip
+@_runs("--tolerance", default=0.0, type=click.FloatRange(min=0.0),
+       help="Relative error still counted as benign.")  # fmt: skip
+@_runs("--replay", type=click.Path(path_type=Path, file_okay=False),
+       help="Repeat the recorded runs in this folder and compare them. --kernel selects kernels, "
+            "--runs limits the runs per kernel.")  # fmt: skip
+@_output("--out", type=click.Path(path_type=Path, file_okay=False),
+         help="Folder for records, JSON, CSV and plot. Recorded runs are not "
+              "repeated.")  # fmt: skip
+@_output("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def kernels(**options: Any) -> None:
+    """Inject one fault per run into an isolated kernel and compare its output.
+
+    Attacks the kernels of the companion, or any native program with --program.
 
     Outcomes: benign, crash, hang, SDC (silent data corruption), not injected.
     """
@@ -109,7 +112,7 @@ def _given(name: str) -> bool:
 
 
 def _refuse(names: Sequence[str], why: str) -> None:
-    """An option that would do nothing is a mistake: exit code 2."""
+    """Reject options that would have no effect, with exit code 2."""
     for option in click.get_current_context().command.params:
         if option.name in names and _given(option.name):
             raise click.UsageError(f"{option.opts[0]} {why}")
@@ -133,7 +136,7 @@ def _plan(options: dict[str, Any]) -> Plan:
         windows=options["windows"],
         null=options["null"],
     )
-    plan.strategy()  # says now what is wrong
+    plan.strategy()  # reports errors before any run
     return plan
 
 
@@ -163,7 +166,7 @@ def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.report.kernel_plot import write_kernel_plot
 
     plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
-    # Check, planner and tracker are attacked with the parameters of `hardened`.
+    # Collision check, planner and control have the parameters of `hardened`.
     config = MissionConfig(world=options["world"], seed=options["world_seed"], stack="hardened")
     with _folder(out) as folder:
         click.echo(f"inputs: world {config.world}, seed {config.seed}", err=True)
@@ -244,7 +247,7 @@ def _tell(summary: dict[str, Any], table: str, files: str, options: dict[str, An
 
 
 def _replay_folder(folder: Path, kernels: tuple[str, ...], runs: int) -> bool:
-    """Repeat recorded runs and say which came out differently; True where none did."""
+    """Repeat recorded runs and print those that differ; True if none does."""
     from mavfi_cli.attack.replay import replay_runs
 
     equal = total = 0

@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from rich.live import Live
 
 PLAIN_EVERY_S = 10.0
-_MOST_SETTINGS = 6  # whose success rates are told one by one; `campaign status` tells all
+_MOST_SETTINGS = 6  # more settings have no rates here; `campaign status` shows all
 
 
 class _Plain(Spectator):
-    """A line every ten seconds, and one at the end; of several campaigns in turn."""
+    """Print a line every ten seconds, and one at the end of each campaign."""
 
     def __init__(self) -> None:
         self._next_s = self._last_s = 0.0
 
     def on_progress(self, progress: Progress) -> None:
-        """A line now and then, and one at the end."""
+        """Print a line every ten seconds, and one at the end."""
         if progress.elapsed_s < self._last_s:  # the next campaign
             self._next_s = 0.0
         self._last_s = progress.elapsed_s
@@ -34,12 +34,12 @@ class _Plain(Spectator):
             click.echo(progress_line(progress), err=True)
 
     def on_end(self, progress: Progress) -> None:
-        """What the flying took."""
+        """Print the time that the missions took."""
         if line := end_line(progress):
             click.echo(line, err=True)
 
     def on_note(self, text: str) -> None:
-        """A line of its own."""
+        """Print a line."""
         click.echo(text, err=True)
 
 
@@ -54,19 +54,19 @@ class _Live(Spectator):
         self._live.update(progress_line(progress), refresh=True)
 
     def on_end(self, progress: Progress) -> None:
-        """Print what the flying took; it stays."""
+        """Print the time that the missions took above the line."""
         if line := end_line(progress):
             self.on_note(line)
 
     def on_note(self, text: str) -> None:
-        """Print above the line; not markup, whatever it says."""
+        """Print above the line, without markup."""
         from rich.text import Text
 
         self._live.console.print(Text(text))
 
 
 def progress_line(progress: Progress) -> str:
-    """How far it is: missions, rate, time left, success rates so far."""
+    """One line: missions, rate, remaining time, success rates so far."""
     parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
     if progress.eta_s is not None:
         parts.append(f"{progress.rate_per_h:.0f} an hour")
@@ -80,7 +80,7 @@ def progress_line(progress: Progress) -> str:
 
 
 def _by_setting(progress: Progress) -> str:
-    """The rate of each setting, where there are a few."""
+    """The rate of each setting, if there are few."""
     if not 2 <= len(progress.outcomes) <= _MOST_SETTINGS:
         return ""
     rates = [f"{name} {_percent(rate)}" for name, rate in progress.success_rates.items()]
@@ -92,7 +92,7 @@ def _percent(share: float) -> str:
 
 
 def end_line(progress: Progress) -> str:
-    """What the flying took; empty where nothing was flown."""
+    """The time that the missions took; empty if none was flown."""
     flown = progress.over - progress.before
     if not flown:
         return ""
@@ -109,7 +109,7 @@ def _duration(seconds: float) -> str:
 
 @contextmanager
 def missions_view(*, quiet: bool) -> Iterator[Spectator]:
-    """The spectator that suits stderr: none, plain lines, or a live line."""
+    """The spectator for stderr: none, plain lines, or a live line."""
     if quiet:
         yield Spectator()
     elif not sys.stderr.isatty():

@@ -1,4 +1,4 @@
-"""`mavfi platforms`: the compute platforms, and where their latencies come from."""
+"""`mavfi platforms`: the compute platforms, and the source of their latencies."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _P95 = 1.6449  # standard normal: 90 % lie within
 
 @click.command()
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
-@click.option("--json", "as_json", is_flag=True, help="Print all of it as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def platforms(names: tuple[str, ...], as_json: bool) -> None:
-    """List the compute platforms, or explain the named ones kernel by kernel."""
+    """List the compute platforms, or show the named ones kernel by kernel."""
     from mavfi_cli.mission.platform import load_platform, platform_names
 
     profiles = [load_platform(name) for name in names or platform_names()]
@@ -75,7 +75,7 @@ def _title(profile: Any) -> str:
 
 
 def _hardware(profile: Any) -> Iterator[str]:
-    """A line a number of the computer itself, with its source; nothing is lifted on the ground."""
+    """One line per number of the computer, with its source; masses only if it is carried."""
     rows = [("cores", f"{profile.cores}", "cores"), ("power", f"{profile.power_w:g} W", "power_w")]
     if profile.carried:
         rows += [

@@ -22,25 +22,25 @@ _TOLD = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcom
 
 
 class _Plain(Watcher):
-    """A line for what happens, and one every ten simulated seconds."""
+    """Print a line per event, and one every ten simulated seconds."""
 
     def __init__(self, title: str) -> None:
         self._title = title
         self._next_s = _PLAIN_EVERY_S
 
     def on_progress(self, progress: FlightProgress) -> None:
-        """A line now and then, by simulated time."""
+        """Print a line every ten simulated seconds."""
         if progress.stamp_s >= self._next_s:
             self._next_s = progress.stamp_s + _PLAIN_EVERY_S
             click.echo(_line(progress), err=True)
 
     def on_note(self, text: str) -> None:
-        """A line."""
+        """Print a line."""
         click.echo(text, err=True)
 
     def on_event(self, event: Event) -> None:
-        """A line, where people want to hear of it."""
-        if self._title:  # only now, so that a mission that cannot begin gets one line
+        """Print a line for events of interest."""
+        if self._title:  # not earlier: a mission that cannot begin prints one line only
             click.echo(self._title, err=True)
             self._title = ""
         if event.kind in _TOLD:
@@ -48,7 +48,7 @@ class _Plain(Watcher):
 
 
 class _Live(Watcher):
-    """One line that is rewritten, with the events scrolling above it."""
+    """One line that is rewritten, with events scrolling above it."""
 
     def __init__(self, live: Live, title: str) -> None:
         self._live = live
@@ -65,8 +65,8 @@ class _Live(Watcher):
         self._live.console.print(Text(text))
 
     def on_event(self, event: Event) -> None:
-        """Print above the line, where people want to hear of it."""
-        from rich.text import Text  # not markup: an autopilot may say anything
+        """Print events of interest above the line."""
+        from rich.text import Text  # no markup: an autopilot may send any text
 
         if self._title:
             self._live.console.print(Text(self._title, "bold"))
@@ -99,6 +99,6 @@ def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
     from rich.live import Live
 
     console = Console(stderr=True)
-    # No thread that refreshes: a mission may fork, and a fork must find one thread only.
+    # No refresh thread: a mission may fork, and a process that forks must have one thread only.
     with Live("starting", console=console, auto_refresh=False, transient=True) as live:
         yield _Live(live, title)

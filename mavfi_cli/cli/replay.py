@@ -1,4 +1,4 @@
-"""`mavfi replay`: fly a recorded mission again and hold the records against each other."""
+"""`mavfi replay`: fly a recorded mission again and compare the records."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from pathlib import Path
 
 import click
 
-_TELL_ACTIVATION = ("events", "fault")  # sections that say who read the flip, besides other things
+_TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of the flip
 
 
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path))
-@click.option("--without-fault", is_flag=True, help="Fly the paired golden mission instead.")
+@click.option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
-              show_default=True, help="Where the new run folder goes.")  # fmt: skip
+              show_default=True, help="Parent of the new run folder.")  # fmt: skip
 @click.option("--gdb", is_flag=True,
               help="Instruction level: stop the node at the injected instruction and wait for a "
-                   "debugger. Who read the flip is then not followed, nor compared.")  # fmt: skip
+                   "debugger. The activation is then neither followed nor compared.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
 def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) -> None:
-    """Repeat RUN, a run folder, and say whether the record is the same to the byte.
+    """Repeat RUN, a run folder, and compare the records byte for byte.
 
-    Exits with 1 where a repetition differs. With --without-fault a difference is the point: it is
-    what the fault did. Interrupted, it leaves nothing behind.
+    Exits with code 1 if the repetition differs. With --without-fault the difference shows the
+    effect of the fault. An interrupted replay leaves no files.
     """
     from mavfi_cli.core.errors import Interrupted
     from mavfi_cli.fi.tracer.record import read

@@ -14,21 +14,21 @@ from mavfi_cli.cli.missions_view import PLAIN_EVERY_S
 
 
 class RunsView(Protocol):
-    """What a person sees of the runs, kernel by kernel."""
+    """Progress of the runs, kernel by kernel."""
 
     def show(self, kernel: str, done: int) -> None:
-        """A kernel's so many runs are there; 0: it begins."""
+        """The kernel has `done` recorded runs; 0: it begins."""
 
     def stage(self, what: str) -> None:
-        """What goes on before the first run of the kernel that has begun."""
+        """Name the step before the first run of the current kernel."""
 
 
 class PlainRuns:
-    """A line where a kernel begins, one every ten seconds, and one at the end.
+    """Print a line when a kernel begins, every ten seconds, and at the end.
 
     Args:
-        kernels: in the order in which they are attacked.
-        runs: of each.
+        kernels: the kernels, in the order of attack.
+        runs: number of runs per kernel.
         clock: host time, s.
     """
 
@@ -40,7 +40,7 @@ class PlainRuns:
         self._kernel = ""
 
     def show(self, kernel: str, done: int) -> None:
-        """Say so where a kernel begins, where ten seconds have passed, and where all is over."""
+        """Print a line when a kernel begins, after ten seconds, and at the end."""
         now_s, total = self._clock(), self._runs * len(self._kernels)
         over = self._kernels.index(kernel) * self._runs + done
         if kernel != self._kernel:
@@ -53,7 +53,7 @@ class PlainRuns:
         self._last_s = now_s
 
     def stage(self, what: str) -> None:
-        """Say what goes on where ten seconds have passed."""
+        """Print the step after ten seconds."""
         now_s = self._clock()
         if now_s - self._last_s >= PLAIN_EVERY_S:
             click.echo(f"{self._kernel}: {what}", err=True)
@@ -61,10 +61,10 @@ class PlainRuns:
 
 
 class LiveRuns:
-    """A bar over all runs that names the kernel, and what goes on before its first run.
+    """A bar over all runs that names the kernel, and the step before its first run.
 
     Args:
-        bar: click's.
+        bar: progress bar of click.
         kernels, runs: as for `PlainRuns`.
     """
 
@@ -73,21 +73,21 @@ class LiveRuns:
         self._kernel, self._reached = "", 0
 
     def show(self, kernel: str, done: int) -> None:
-        """Move the bar to a kernel's so many runs."""
+        """Move the bar to `done` runs of the kernel."""
         self._kernel = kernel
         position = self._kernels.index(kernel) * self._runs + done
         self._bar.update(position - self._reached, kernel)
         self._reached = position
 
     def stage(self, what: str) -> None:
-        """Say it beside the bar."""
+        """Show the step beside the bar."""
         self._bar.current_item = f"{self._kernel}: {what}"
         self._bar.render_progress()
 
 
 @contextmanager
 def runs_view(kernels: Sequence[str], runs: int) -> Iterator[RunsView]:
-    """The view that suits stderr: plain lines, or a bar."""
+    """The view for stderr: plain lines, or a bar."""
     if not sys.stderr.isatty():
         yield PlainRuns(kernels, runs)
         return

@@ -1,4 +1,4 @@
-"""`mavfi show`: what happened in a run."""
+"""`mavfi show`: summarise a recorded run."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import click
 
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print result.json as it is.")
+@click.option("--json", "as_json", is_flag=True, help="Print result.json unchanged.")
 @click.option("--pair", is_flag=True,
-              help="Fly the golden pair, say what the fault changed, and keep it.")  # fmt: skip
-@click.option("--events", is_flag=True, help="Also list every event of the flight.")
+              help="Fly the golden run of the pair, keep it, and report what the fault "
+                   "changed.")  # fmt: skip
+@click.option("--events", is_flag=True, help="Add a list of all events of the flight.")
 @click.option("--picture", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
-              help="Draw the flight from above, as SVG.")  # fmt: skip
+              help="SVG file for a drawing of the flight from above.")  # fmt: skip
 def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
-    """Say what happened in RUN, a run folder."""
+    """Summarise RUN, a run folder."""
     from mavfi_cli.mission.golden import kept_golden, paired_golden
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.summary import difference_lines, event_lines, summary_lines

@@ -1,4 +1,4 @@
-"""`mavfi stacks`: how the companion can be wired, and where each choice comes from."""
+"""`mavfi stacks`: the stacks of the companion, and the source of each value."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 _WIDTH = 100
-_GROUPS = {  # every key, in the order in which it is told
+_GROUPS = {  # all keys, in the order of the output
     "Follower": (
         "stretches_clock", "skips_endless_slices", "guards_tracking", "tracking_guard_m",
         "position_gain_per_s", "climb_gain_per_s", "integral_gain_per_s2", "damping_gain",
@@ -34,12 +34,12 @@ _VALUE = 7  # columns of a truth value or a number
 
 @click.command()
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
-@click.option("--json", "as_json", is_flag=True, help="Print all of it as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def stacks(names: tuple[str, ...], as_json: bool) -> None:
-    """List the stacks, explain one key by key, or say in which keys several differ.
+    """List the stacks, explain the keys of one, or show the keys in which several differ.
 
-    NAME:KEY=VALUE,KEY=VALUE names a variant: that stack with other values of some keys, as
-    mavbench:guards_tracking=true. A file can be varied in the same way.
+    NAME:KEY=VALUE,KEY=VALUE names a variant: that stack with other values of some keys, such as
+    mavbench:guards_tracking=true. FILE:KEY=VALUE works in the same way.
     """
     from mavfi_cli.mission.stack import load_stack, stack_names
 
@@ -58,7 +58,7 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
 
 
 def _explained(stack: Any) -> Iterator[str]:
-    """Every key with its value and source."""
+    """All keys with value and source."""
     base = f"; the other values from {stack.base}" if stack.base else ""
     yield from textwrap.wrap(_title(stack) + base, _WIDTH)
     for group, keys in _GROUPS.items():
@@ -73,7 +73,7 @@ def _explained(stack: Any) -> Iterator[str]:
 
 
 def _compared(found: Sequence[Any]) -> Iterator[str]:
-    """The keys in which stacks differ, a column a stack."""
+    """The keys in which stacks differ, one column per stack."""
     for number, stack in enumerate(found, start=1):
         yield from textwrap.wrap(f"{number}  {_title(stack)}", _WIDTH, subsequent_indent="   ",
                                  break_long_words=True)  # fmt: skip
@@ -91,7 +91,7 @@ def _compared(found: Sequence[Any]) -> Iterator[str]:
 
 
 def _row(key: str, cells: Sequence[Sequence[str]], width: int) -> str:
-    """A line for a key, or several where a value is wider than its column."""
+    """One line for a key, or several if a value is wider than its column."""
     lines = [
         f"{'' if line else key:<{_KEY}}"
         + "".join(f"{cell[line] if line < len(cell) else '':<{width}}" for cell in cells)

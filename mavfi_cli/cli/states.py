@@ -10,7 +10,7 @@ import click
 @click.command()
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
 def states(as_json: bool) -> None:
-    """List the states that one kernel hands to the next: the sites of source-level faults."""
+    """List the monitored states, which are the injection sites of source-level faults."""
     from mavfi_cli.core.states import STATES
 
     rows = [

@@ -10,22 +10,28 @@ import click
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
-              show_default=True, help="Where flights, data set and models go.")  # fmt: skip
+              show_default=True, help="Folder for flights, data set and models.")  # fmt: skip
 @click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
-              help="What is flown, and what the models are for; see `mavfi stacks`.")  # fmt: skip
+              help="Stack to fly and to fit models for; `mavfi stacks` lists them.")  # fmt: skip
 @click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
-              help="Where to fly; may be repeated  [the paper's four: two densities, two "
+              help="World; may be repeated  [the paper's four: two densities, two "
                    "sizes].")  # fmt: skip
 @click.option("--flights", type=click.IntRange(min=1), default=25, show_default=True,
-              help="Of each world.")  # fmt: skip
+              help="Flights per world.")  # fmt: skip
 @click.option("--first-seed", default=10_000, show_default=True,
-              help="Of the flights; seeds count up from here.")  # fmt: skip
-@click.option("--kind", "kinds", multiple=True, help="gad, aad, range, l2  [all].")
+              help="Seed of the first flight; each further flight adds 1.")  # fmt: skip
+@click.option(
+    "--kind",
+    "kinds",
+    multiple=True,
+    help="Detector to fit: gad, aad, range, l2. May be repeated  [all].",
+)
 @click.option("--n-sigma", type=float, help="Threshold of the Gaussian model  [its default].")
 @click.option("--seed", default=1, show_default=True,
-              help="Of the split and of the autoencoder's first weights.")  # fmt: skip
-@click.option("--jobs", type=click.IntRange(min=1), help="Missions at the same time  [one a core].")
-@click.option("--json", "as_json", is_flag=True, help="Print the models' provenance.")
+              help="Seed of the split and of the autoencoder's initial weights.")  # fmt: skip
+@click.option("--jobs", type=click.IntRange(min=1),
+              help="Number of parallel missions  [one per core].")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the provenance of the models as JSON.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def train(
     out: Path,
@@ -42,8 +48,8 @@ def train(
 ) -> None:
     """Fly error-free missions and fit the detectors to them.
 
-    Interrupted, it goes on where it stopped when it is called again with the same folder. Fitting
-    the autoencoder needs torch: pip install 'mavfi[train]'.
+    The same command resumes an interrupted training. Fitting the autoencoder needs torch:
+    pip install 'mavfi[train]'.
     """
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+
 
 class _Positive(click.FloatRange):
-    """A number from a millionth to a million; click's own range lets "nan" through."""
+    """A number from a millionth to a million; click's own range accepts "nan"."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """As click does, and refuse NaN."""
+        """Convert as click does, and reject NaN."""
         number = float(super().convert(value, param, ctx))
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
@@ -25,52 +28,57 @@ _FLYING = ("worlds", "stack", "missions", "first_seed", "models", "train", "jobs
 _ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
 
 
-@click.command()
-@click.option("--vehicle", "vehicles", multiple=True, metavar="NAME|FILE",
-              help="airsim, spark, cal20 or a TOML file; may be repeated  "
-                   "[airsim, spark: the paper's Fig. 15].")  # fmt: skip
-@click.option("--platform", metavar="NAME|FILE",
-              help="Its latencies are the response time; its board flies  "
-                   "[the vehicle's own].")  # fmt: skip
-@click.option("--chain", type=click.Choice(["serial", "pipelined"]), default="serial",
-              show_default=True,
-              help="With --platform: its response time is the sum of its kernels' latencies, or "
-                   "the slowest.")  # fmt: skip
-@click.option("--board", metavar="NAME|FILE",
-              help="Mass and power of a computer: a57, ncs, raspi3b, tx2, xavier or a TOML "
-                   "file  [the platform's, or the vehicle's own].")  # fmt: skip
-@click.option("--response", type=_ABOVE_ZERO, metavar="S", help="Response time of the computer, s.")
-@click.option("--range", "range_", type=_ABOVE_ZERO, metavar="M", help="Sensing range, m.")
-@click.option("--distance", type=_ABOVE_ZERO, default=50.0, show_default=True, metavar="M",
-              help="Length of a mission, m.")  # fmt: skip
-@click.option("--overhead", "overheads", multiple=True, metavar="DETECTOR=PERCENT|PATH",
-              help="Compute overhead of gad or aad: per cent, or measured in the flights of a run "
-                   "folder, a campaign or an evaluation  [--fly: in its own flights; else the "
-                   "paper's Table V].")  # fmt: skip
-@click.option("--fly", "fly", is_flag=True,
-              help="Fly every row in JSBSim with its mass at its safe velocity, and put model and "
-                   "flight side by side.")  # fmt: skip
-@click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
-              help="With --fly: where; may be repeated  [sparse, dense].")  # fmt: skip
-@click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
-              help="With --fly: how the companion is wired.")  # fmt: skip
-@click.option("--missions", type=click.IntRange(1, 100_000), default=10, show_default=True,
-              help="With --fly: of each scheme in each world.")  # fmt: skip
-@click.option("--first-seed", type=click.IntRange(0, 2**31 - 200_000), default=1,
-              show_default=True, help="With --fly: seeds count up from here.")  # fmt: skip
-@click.option("--models", type=click.Path(path_type=Path, file_okay=False, exists=True),
-              help="With --fly: folder of detectors' models NAME.json  [the shipped].")  # fmt: skip
-@click.option("--train", type=click.IntRange(min=0), default=0, metavar="FLIGHTS",
-              help="With --fly: fit the detectors for each vehicle to so many error-free flights "
-                   "of each training world at its safe velocity first  [0: none].")  # fmt: skip
-@click.option("--jobs", type=click.IntRange(min=1),
-              help="With --fly: missions at the same time  [one a core].")  # fmt: skip
-@click.option("--quiet", is_flag=True, help="With --fly: no progress on stderr.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False),
-              help="Folder for vpm.json, vpm.csv and pictures; with --fly also for the flights, "
-                   "which are not flown again  [none; --fly: vpm].")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-@click.option("--csv", "as_csv", is_flag=True, help="Print a row a scheme as CSV.")
+_model = partial(click.option, cls=GroupedOption, group="Model")
+_flights = partial(click.option, cls=GroupedOption, group="Flights, with --fly")
+_output = partial(click.option, cls=GroupedOption, group="Output")
+
+
+@click.command(cls=GroupedCommand)
+@_model("--vehicle", "vehicles", multiple=True, metavar="NAME|FILE",
+        help="airsim, spark, cal20 or a TOML file; may be repeated  "
+             "[airsim, spark: the paper's Fig. 15].")  # fmt: skip
+@_model("--platform", metavar="NAME|FILE",
+        help="Platform whose latencies give the response time and whose board the vehicle "
+             "carries  [the vehicle's own].")  # fmt: skip
+@_model("--chain", type=click.Choice(["serial", "pipelined"]), default="serial",
+        show_default=True,
+        help="Response time of --platform: the sum of its kernels' latencies, or the largest of "
+             "them.")  # fmt: skip
+@_model("--board", metavar="NAME|FILE",
+        help="Mass and power of a computer: a57, ncs, raspi3b, tx2, xavier or a TOML "
+             "file  [the platform's, or the vehicle's own].")  # fmt: skip
+@_model("--response", type=_ABOVE_ZERO, metavar="S", help="Response time of the computer, s.")
+@_model("--range", "range_", type=_ABOVE_ZERO, metavar="M", help="Sensing range, m.")
+@_model("--distance", type=_ABOVE_ZERO, default=50.0, show_default=True, metavar="M",
+        help="Length of a mission, m.")  # fmt: skip
+@_model("--overhead", "overheads", multiple=True, metavar="DETECTOR=PERCENT|PATH",
+        help="Compute overhead of gad or aad: a percentage, or a run folder, campaign or "
+             "evaluation that measured it  [--fly: measured in its flights; else the paper's "
+             "Table V].")  # fmt: skip
+@_flights("--fly", "fly", is_flag=True,
+          help="Fly every row in JSBSim with its mass at its safe velocity, and compare model and "
+               "flight.")  # fmt: skip
+@_flights("--world", "worlds", multiple=True, metavar="NAME|FILE",
+          help="World; may be repeated  [sparse, dense].")  # fmt: skip
+@_flights("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+          help="Stack; `mavfi stacks` lists them.")  # fmt: skip
+@_flights("--missions", type=click.IntRange(1, 100_000), default=10, show_default=True,
+          help="Missions per scheme and world.")  # fmt: skip
+@_flights("--first-seed", type=click.IntRange(0, 2**31 - 200_000), default=1, show_default=True,
+          help="Seed of the first mission; each further mission adds 1.")  # fmt: skip
+@_flights("--models", type=click.Path(path_type=Path, file_okay=False, exists=True),
+          help="Folder of detector models NAME.json  [the shipped].")  # fmt: skip
+@_flights("--train", type=click.IntRange(min=0), default=0, metavar="FLIGHTS",
+          help="First fit the detectors for each vehicle to this many error-free flights of each "
+               "training world at its safe velocity  [0: none].")  # fmt: skip
+@_flights("--jobs", type=click.IntRange(min=1),
+          help="Number of parallel missions  [one per core].")  # fmt: skip
+@_flights("--quiet", is_flag=True, help="No progress on stderr.")
+@_output("--out", type=click.Path(path_type=Path, file_okay=False),
+         help="Folder for vpm.json, vpm.csv and pictures; with --fly also for the flights, "
+              "which are not flown again  [none; --fly: vpm].")  # fmt: skip
+@_output("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+@_output("--csv", "as_csv", is_flag=True, help="Print the report as CSV, one scheme per row.")
 def vpm(
     vehicles: tuple[str, ...],
     out: Path | None,
@@ -79,10 +87,12 @@ def vpm(
     as_csv: bool,
     **options: Any,
 ) -> None:
-    """Safe velocity, flight time and energy with none, DMR, TMR, and detection and recovery.
+    """Compare no protection, DMR, TMR, and detection and recovery.
 
-    The F-1 visual performance model: a vehicle flies so fast that it stops within what it sees.
-    A copy of the computer adds mass and power; detection and recovery adds compute time.
+    The quantities are safe velocity, flight time and energy.
+
+    In the F-1 visual performance model a vehicle flies as fast as it can stop within its sensing
+    range. A copy of the computer adds mass and power. Detection and recovery adds compute time.
     """
     from mavfi_cli.core.config import require_distinct
     from mavfi_cli.core.files import plain
@@ -120,14 +130,14 @@ def vpm(
 
 
 def overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
-    """Per cent and source of each detector, as given or measured in flights; the last word counts.
+    """Overhead in per cent and its source for each detector; the last option counts.
 
     Args:
-        platform: that is modelled; flights on others do not count. None: all count.
+        platform: the modelled one; flights on others are ignored. None: all are used.
 
     Raises:
-        click.UsageError: neither DETECTOR=PERCENT nor a path.
-        RecordError: a path without flights with a detector on the platform.
+        click.UsageError: the text is neither DETECTOR=PERCENT nor a path.
+        RecordError: the path has no flights with a detector on the platform.
     """
     found: dict[str, tuple[float, str]] = {}
     for text in texts:
@@ -153,7 +163,7 @@ def _measured(path: str, platform: str | None) -> dict[str, tuple[float, str]]:
 
 
 def _refuse_unused() -> None:
-    """An option that would do nothing without --fly is a mistake: exit code 2."""
+    """Reject options that have no effect without --fly or --platform, with exit code 2."""
     context = click.get_current_context()
     for option in context.command.params:
         if option.name in _FLYING and _given(str(option.name)):
@@ -213,7 +223,7 @@ def _choices(options: dict[str, Any]) -> Any:
 
 
 def _save(told: dict[str, Any], out: Path) -> list[str]:
-    """Write everything; the names of the files."""
+    """Write all files; return their names."""
     from mavfi_cli.core.errors import RecordError
     from mavfi_cli.core.files import write_json, write_text
     from mavfi_cli.report.flight_plot import write_flight_plot

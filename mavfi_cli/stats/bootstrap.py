@@ -1,7 +1,7 @@
 """Bootstrap intervals of flight time, distance, energy, replans, and of their paired differences.
 
-BCa: bias-corrected and accelerated (B. Efron, JASA 82, 1987). Seeded, so the same numbers give the
-same interval.
+BCa: bias-corrected and accelerated (B. Efron, JASA 82, 1987). It is seeded, so the same numbers
+give the same interval.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import z_of
 
 RESAMPLES = 9999
-FEW = 10  # of fewer values a 95 % interval holds the true mean in less than nine cases of ten
-LARGE = 500  # from so many values on the mean is normal, and the bootstrap would only be slow
-BLOCKS = 2000  # of more values whole blocks are left out in turn
-_CHUNK = 4_000_000  # numbers that are drawn at once
+FEW = 10  # with fewer values a 95 % interval covers the true mean in less than 90 % of cases
+LARGE = 500  # from here on the mean is normal and the bootstrap would only be slow
+BLOCKS = 2000  # with more values whole blocks are left out in turn
+_CHUNK = 4_000_000  # numbers drawn at once
 IntArray = NDArray[np.int64]
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interval:
-    """A statistic with its interval; not a number where there are too few values."""
+    """A statistic with its interval; NaN if there are too few values."""
 
     value: float
     low: float
@@ -37,12 +37,12 @@ class Interval:
 
 
 def mean(values: FloatArray) -> FloatArray:
-    """Over the last axis."""
+    """Reduce the last axis."""
     return np.asarray(values.mean(axis=-1))
 
 
 def median(values: FloatArray) -> FloatArray:
-    """Over the last axis."""
+    """Reduce the last axis."""
     return np.asarray(np.median(values, axis=-1))
 
 
@@ -54,11 +54,11 @@ def interval(
     resamples: int = RESAMPLES,
     seed: int = 1,
 ) -> Interval:
-    """A statistic of a sample with its BCa interval; of a mean of LARGE samples, the normal one.
+    """A statistic with its BCa interval, or the normal one for the mean of LARGE samples.
 
     Args:
-        values: (n,) one of each mission; for a paired difference, the differences.
-        statistic: of the last axis of an array.
+        values: (n,) one value per mission; the differences for a paired difference.
+        statistic: reduces the last axis of an array.
     """
     sample = np.asarray(values, dtype=np.float64)
     if len(sample) == 0:
@@ -93,7 +93,7 @@ def _levels(
     """The quantiles of the resampled statistic that are the ends of the interval."""
     normal = NormalDist()
     counted = int(np.count_nonzero(drawn < value)) + int(np.count_nonzero(drawn <= value))
-    least = 1.0 / (len(drawn) + 1)  # the quantile of nothing, or of everything, is infinite
+    least = 1.0 / (len(drawn) + 1)  # the quantile of 0 or 1 is infinite
     bias = normal.inv_cdf(min(max(counted / (2 * len(drawn)), least), 1.0 - least))
     left_out = _left_out(sample, statistic)
     centred = left_out.mean() - left_out
@@ -107,7 +107,7 @@ def _levels(
 
 
 def _left_out(sample: FloatArray, statistic: Statistic) -> FloatArray:
-    """The statistic without each of the values in turn; of many, without each of BLOCKS blocks."""
+    """The statistic without each value in turn, or without each of BLOCKS blocks if many."""
     if statistic is mean:
         return np.asarray((sample.sum() - sample) / (len(sample) - 1))
     blocks = np.array_split(np.arange(len(sample)), min(len(sample), BLOCKS))
@@ -124,8 +124,8 @@ def interval_of_rows(
     """A statistic of several columns with its interval, by resampling their rows together.
 
     Args:
-        count: of the rows.
-        statistic: of rows (..., n) of the columns, over the last axis.
+        count: number of rows.
+        statistic: takes row indices (..., n) and reduces the last axis.
     """
     return interval(
         np.arange(count, dtype=np.float64),

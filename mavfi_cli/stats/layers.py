@@ -1,4 +1,4 @@
-"""Across the layers: from a kernel's silent corruption to failed missions, and to flight hours."""
+"""From an SDC of a kernel to failed missions, and to failures per flight hour."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from mavfi_cli.stats.shares import Share, rate
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrossLayer:
-    """What a fault in a kernel does to the kernel, and to the mission.
+    """Effects of a fault in a kernel on the kernel and on the mission.
 
     Attributes:
-        corruption: share of faults that corrupt the kernel's output in silence.
+        corruption: share of faults that cause an SDC of the kernel.
         failure: share of faults that fail the mission.
         failure_given_corruption: failure / corruption, with the ends of the failure's interval over
-            the corruption's point estimate; None where the estimate would be above 1 (crashes and
+            the corruption's point estimate; None if the estimate would be above 1 (crashes and
             hangs fail missions too) or no output was corrupted.
     """
 
@@ -28,13 +28,13 @@ class CrossLayer:
 def cross_layer(
     corrupted: int, kernel_faults: int, failed: int, mission_faults: int, confidence: float = 0.95
 ) -> CrossLayer:
-    """The probability that a mission fails, given that a kernel's output was corrupted in silence.
+    """The probability that a mission fails, given an SDC of a kernel.
 
     Both campaigns must sample the same population: the same kernel, level and sampling rule.
 
     Args:
-        corrupted, kernel_faults: of the isolated kernel (`mavfi kernels`): SDC, injected faults.
-        failed, mission_faults: of whole missions: failures beyond the golden ones, applied faults.
+        corrupted, kernel_faults: SDCs and injected faults of the isolated kernel (`mavfi kernels`).
+        failed, mission_faults: failures beyond the golden ones and applied faults of missions.
     """
     corruption = rate(corrupted, kernel_faults, confidence)
     failure = rate(failed, mission_faults, confidence)
@@ -47,16 +47,16 @@ def cross_layer(
 
 
 def failures_per_hour(upsets_per_hour: float, failure: Share) -> tuple[float, float, float]:
-    """Failed missions a flight hour at a rate of upsets: point, low, high.
+    """Failed missions per flight hour at a rate of upsets: point, low, high.
 
-    Extrapolated: one upset at most a mission, each as likely to fail it as in the campaign.
+    The extrapolation assumes at most one upset per mission, as harmful as in the campaign.
 
     Args:
-        upsets_per_hour: bit flips that reach the attacked kernels in an hour of flight.
-        failure: of missions with one fault each.
+        upsets_per_hour: bit flips that reach the attacked kernels per flight hour.
+        failure: failure rate of missions with one fault each.
 
     Raises:
-        ConfigError: a negative rate.
+        ConfigError: the rate is negative.
     """
     if not upsets_per_hour >= 0.0:
         raise ConfigError(f"must not be negative, got {upsets_per_hour:g}", key="upsets_per_hour")

@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 BoolArray = NDArray[np.bool_]
-_EXACT = 16  # differences up to which all signs are tried
-_FLIPS = 9999  # random ones for more
-_CHUNK = 4_000_000  # numbers that are drawn at once
-_SLACK = 1e-9  # of the largest sum: equal ones differ by rounding
+_EXACT = 16  # all signs are tried up to this many differences
+_FLIPS = 9999  # number of random sign patterns for more
+_CHUNK = 4_000_000  # numbers drawn at once
+_SLACK = 1e-9  # relative to the largest sum; equal sums differ by rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class McNemar:
-    """The pairs of missions whose outcomes differ, and how likely that is by chance.
+    """Counts of pairs by success, and the p-value of the difference.
 
     Attributes:
-        both, neither: pairs in which both, or none, succeeded.
-        only_first, only_second: pairs in which one did.
+        both, neither: pairs in which both or neither succeeded.
+        only_first, only_second: pairs in which only one succeeded.
         p_value: two-sided, exact.
     """
 
@@ -34,12 +34,12 @@ class McNemar:
 
     @property
     def pairs(self) -> int:
-        """How many pairs there are."""
+        """Number of pairs."""
         return self.both + self.only_first + self.only_second + self.neither
 
     @property
     def difference(self) -> float:
-        """Success rate of the second minus that of the first; not a number without pairs."""
+        """Success rate of the second minus that of the first; NaN without pairs."""
         return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
 
 
@@ -47,7 +47,7 @@ def mcnemar(first: Sequence[bool] | BoolArray, second: Sequence[bool] | BoolArra
     """McNemar's test (Psychometrika 12, 1947), exact: the differing pairs as fair coins.
 
     Args:
-        first, second: success of each treatment, (n,) a mission.
+        first, second: success of each mission under each treatment, (n,).
     """
     ends = 2 * np.asarray(first, dtype=np.int64) + np.asarray(second, dtype=np.int64)
     neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
@@ -71,18 +71,18 @@ def _coins(few: int, total: int) -> float:
 
 
 def sign_flips(differences: Sequence[float], *, seed: int = 1) -> float:
-    """Fisher's randomisation test of paired differences: two-sided probability of such a mean.
+    """Two-sided p-value of Fisher's randomisation test of paired differences.
 
-    Without an effect a difference is as likely to have the other sign. It needs no shape of the
-    distribution, so it holds where most differences are zero and a bootstrap interval is too
-    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All signs are tried, of
-    more than _EXACT differences _FLIPS random ones, seeded.
+    Without an effect both signs of a difference are equally likely. The test assumes no
+    distribution, so it is valid if most differences are zero and a bootstrap interval is too
+    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All signs are tried. For
+    more than _EXACT differences, _FLIPS seeded random patterns are tried.
 
     Args:
-        differences: one of each independent pair; zeros have no part in it.
+        differences: one for each independent pair; zeros have no effect.
 
     Returns:
-        1 where nothing differs.
+        1 if nothing differs.
     """
     values = np.array([each for each in differences if each != 0.0])
     count = len(values)
@@ -104,7 +104,7 @@ def sign_flips(differences: Sequence[float], *, seed: int = 1) -> float:
 def holm(p_values: Sequence[float]) -> list[float]:
     """p-values corrected for a family of tests (S. Holm, Scand. J. Statistics 6, 1979).
 
-    In the order in which they came; reject where the corrected one is below the level.
+    The order is kept. Reject if the corrected value is below the level.
     """
     count = len(p_values)
     corrected = [0.0] * count

@@ -1,6 +1,6 @@
 """Receiver operating characteristic, precision and recall, over all thresholds.
 
-A flight's score is the highest that any of its messages had. A threshold t raises an alarm on
+A flight's score is the highest of its messages. A threshold t raises an alarm on
 flights whose score is above t. Areas: under the ROC curve by the Mann-Whitney statistic, ties
 halved, its interval from the variance of Hanley and McNeil (Radiology 143, 1982), taken at the end
 of the interval and not at the estimate, so that an area of 1 has an interval too (method of
@@ -24,10 +24,10 @@ _HALVINGS = 60
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curves:
-    """One detector's curves, from the highest threshold, at which nothing is an alarm, down.
+    """One detector's curves, in descending order of threshold, from one without alarms.
 
     Attributes:
-        positives, negatives: flights with a harmful fault, and without any.
+        positives, negatives: flights with a harmful fault, and error-free flights.
         thresholds: (m,) in units of the detector's own; scores above are alarms.
         false_positive_rate: (m,) share of error-free flights with an alarm.
         recall: (m,) share of harmful faults with an alarm.
@@ -52,7 +52,7 @@ class Curves:
 
 
 def curves(harmful: Sequence[float], error_free: Sequence[float]) -> Curves:
-    """Curves from scores in units of the threshold; without one of both kinds, empty."""
+    """Curves from scores in units of the threshold; empty unless both kinds have flights."""
     positive, negative = np.sort(np.asarray(harmful, np.float64)), np.sort(
         np.asarray(error_free, np.float64)
     )  # fmt: skip
@@ -72,7 +72,7 @@ def curves(harmful: Sequence[float], error_free: Sequence[float]) -> Curves:
     gains = np.diff(np.concatenate([[0.0], recall]))
     area = _area(positive, negative)
     low, high = _area_interval(area, len(positive), len(negative))
-    below = np.concatenate([levels[1:], [-math.inf]])  # a threshold that lets each level through
+    below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
     return Curves(
         positives=len(positive),
         negatives=len(negative),
@@ -96,7 +96,7 @@ def _area(positive: FloatArray, negative: FloatArray) -> float:
 
 
 def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, float]:
-    """Ends of the 95 % interval: areas whose own spread just reaches the one that was found."""
+    """Ends of the 95 % interval: areas whose own spread just reaches the estimate."""
     z = z_of(0.95)
 
     def spread(of: float) -> float:

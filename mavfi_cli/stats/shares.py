@@ -1,4 +1,4 @@
-"""Proportions with their Wilson intervals, and how many missions an interval takes."""
+"""Proportions with their Wilson intervals, and sample sizes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from statistics import NormalDist
 
 from mavfi_cli.core.errors import ConfigError
 
-Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of like runs within it
+Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of similar runs within it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,8 +32,8 @@ def wilson(
 ) -> Share:
     """Wilson score interval (E. B. Wilson, JASA 22, 1927), 95 % by default.
 
-    With no observation the interval is the whole of [0, 1] and the share is not a number. A design
-    effect above 1 counts as that many times fewer observations.
+    Without observations the interval is [0, 1] and the share is NaN. A design effect divides the
+    number of observations.
     """
     if total == 0:
         return Share(count=0, total=0, share=math.nan, low=0.0, high=1.0)
@@ -54,7 +54,7 @@ def z_of(confidence: float) -> float:
     """The two-sided normal quantile of a confidence between 0 and 1.
 
     Raises:
-        ConfigError: it is not between them.
+        ConfigError: the confidence is not between 0 and 1.
     """
     if not 0.0 < confidence < 1.0:
         raise ConfigError(f"must be between 0 and 1, got {confidence:g}", key="confidence")
@@ -72,14 +72,14 @@ def half_width(share: Share) -> float:
 
 
 def design_effect(hits: Sequence[bool], clusters: Sequence[Cluster | None]) -> float:
-    """How many times the variance of a share is that of as many independent runs; at least 1.
+    """Variance of a share over that of as many independent runs; at least 1.
 
     W. G. Cochran, Sampling Techniques, 3rd edition, 1977, sections 9A and 11: squared sums of
     residuals of the clusters against their stratum's share, and the variance of how many runs fall
     into each stratum.
 
     Args:
-        hits: whether each run counts.
+        hits: whether each run is a hit.
         clusters: stratum and cluster of each run; None for a run that stands for itself.
     """
     total = len(hits)
@@ -102,7 +102,7 @@ def design_effect(hits: Sequence[bool], clusters: Sequence[Cluster | None]) -> f
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixture:
-    """A rate of parts that were sampled differently, with its interval."""
+    """A rate over differently sampled parts, with its interval."""
 
     share: float
     low: float
@@ -113,8 +113,8 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> Mixture:
     """The rate of a whole from the rates of its parts, each weighted by its true size.
 
     The interval adds the distances to the ends of the parts' Wilson intervals in squares (MOVER,
-    G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). Not a number where a part that is
-    not empty was never sampled.
+    G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). The result is NaN if a
+    part that is not empty was never sampled.
     """
     whole = sum(size for size, _ in parts)
     if not whole:
@@ -127,17 +127,17 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> Mixture:
 
 
 def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: float = 0.95) -> int:
-    """The fewest missions whose Wilson interval is at most `margin` to either side of its centre.
+    """The fewest missions whose Wilson interval has a half width of at most `margin`.
 
     From (z / (1 + z²/n)) sqrt(p (1 - p)/n + z²/(4 n²)) <= m, which is, with u = z²/n, the quadratic
     u² (1/4 - m²) + u (p (1 - p) - 2 m²) - m² <= 0.
 
     Args:
         margin: half of the interval's width.
-        expected: the rate that is expected; 0.5 is the worst case.
+        expected: expected rate; 0.5 is the worst case.
 
     Raises:
-        ConfigError: a margin not between 0 and 0.5, a rate not within 0 and 1.
+        ConfigError: the margin is not between 0 and 0.5, or the rate not within 0 and 1.
     """
     if not 0.0 < margin < 0.5:
         raise ConfigError(f"must be between 0 and 0.5, got {margin:g}", key="margin")
@@ -152,13 +152,13 @@ def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: flo
 def pairs_for_difference(
     difference: float, discordant: float, *, confidence: float = 0.95, power: float = 0.8
 ) -> int:
-    """Pairs of missions that McNemar's test needs to find a difference of two success rates.
+    """Pairs of missions that McNemar's test needs to detect a difference of success rates.
 
     (z_a sqrt(q) + z_b sqrt(q - d²))² / d², with q the share of pairs whose outcomes differ and d
     the difference (R. J. Connor, Biometrics 43, 1987).
 
     Raises:
-        ConfigError: no difference, or a share of differing pairs that does not allow it.
+        ConfigError: the difference is 0, or the share of differing pairs does not allow it.
     """
     if not 0.0 < abs(difference) <= discordant <= 1.0:
         raise ConfigError(

@@ -1,8 +1,8 @@
-"""The worst case of a setting and what protection recovers of it, as the paper's section VII-A.
+"""The worst case of a setting and its recovery by protection, as in section VII-A of the paper.
 
 The paper gives, for Factory, a worst-case flight time with faults 73.8 % above the golden run's,
 recovered by 64.2 % in section VII-A and by 87.1 % in Fig. 14: 64.2 / 73.8 = 87.0 %. So the first is
-in points of the golden run and the second a share of the increase; both are given here.
+in points of the golden run and the second is a share of the increase. Both are given here.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorstCase:
-    """Worst values of successful flights, against the golden ones.
+    """Worst values of successful flights, compared with the golden ones.
 
     Attributes:
         golden: the reference, the mean of the golden flights.
         golden_worst, faulty_worst, protected_worst: the largest values.
-        increase: of the faulty worst case over the reference, 0.738 in the example.
-        recovered: of it by protection, in the same unit, 0.642.
-        recovered_share: the part of the increase, 0.87; not a number where the faults' worst is
-            not beyond the worst golden one.
+        increase: faulty worst case over the reference, minus 1; 0.738 in the example.
+        recovered: reduction by protection, in the same unit; 0.642.
+        recovered_share: recovered part of the increase, 0.87; NaN unless the faulty worst case
+            exceeds the worst golden one.
     """
 
     golden: float
@@ -41,7 +41,7 @@ def worst_case(
 
     Args:
         golden, faulty, protected: flight times, or energies, of the successful missions of each
-            setting. Without protected ones, what is recovered is not a number.
+            setting. Without protected missions, the recovery is NaN.
     """
     if not golden or not faulty:
         nan = math.nan
@@ -66,7 +66,7 @@ def worst_case(
 
 
 def worst_over_own(faulty: Sequence[float], protected: Sequence[float] = ()) -> WorstCase:
-    """The same of flights over their own golden flights: the missions' lengths have no part in it.
+    """The worst case relative to own golden flights, independent of the missions' lengths.
 
     Args:
         faulty, protected: of each successful flight, its value over that of the successful golden

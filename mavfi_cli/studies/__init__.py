@@ -1,1 +1,1 @@
-"""Studies: which missions are flown for a question, and what is asked of them."""
+"""Studies: the missions that answer a question, and their analysis."""

@@ -1,4 +1,4 @@
-"""Model and flights side by side: each number of the model, what was flown, and the difference."""
+"""Compare model and flights: each number of the model, the measured one, and the difference."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mavfi_cli.stats.shares import rate
 from mavfi_cli.studies.flight_plan import NOT_SCALED, FlightPlan
 from mavfi_cli.vpm.schemes import REFERENCE, SCHEMES, named
 
-BASE = "none"  # ratios of flights are over one board without protection
+BASE = "none"  # reference of ratios: one board without protection
 MODEL = {"velocity": "velocity_mps", "flight_time": "flight_time_s", "energy": "energy_j"}
-PLACE = ("world", "seed")  # what the flights of all schemes share
+PLACE = ("world", "seed")  # columns that identify a mission in all schemes
 _BY_PLACE = [(name, "ascending") for name in PLACE]
 Key = tuple[str, str]  # vehicle and scheme
 
@@ -31,8 +31,8 @@ class Beside:
     """The flights of a scheme.
 
     Attributes:
-        plan: how it is flown; a text where it cannot be, and why.
-        flights: those that ended, as `analysis.flights` has them.
+        plan: plan of its flights, or the reason why it cannot be flown.
+        flights: ended flights, as in `analysis.flights`.
         errors: why missions could not be flown.
     """
 
@@ -41,11 +41,11 @@ class Beside:
     errors: tuple[str, ...] = ()
 
     def measured(self, name: str, flights: pa.Table) -> FloatArray:
-        """A quantity of MODEL of each flight, (n,); not a number where a flight has none.
+        """A quantity of MODEL for each flight, (n,); NaN if a flight has none.
 
         Electrical energy of rotors and boards is shaft energy times the model's hover power over
-        the simulated vehicle's, which is the same for any number of boards; and the boards' power
-        for as long as the flight lasted.
+        the simulated vehicle's, which is the same for any number of boards, plus the boards' power
+        times the flight time.
         """
         if name == "velocity":
             return numbers(flights, "mean_speed_mps")
@@ -62,12 +62,12 @@ def side_by_side(
     flown: Mapping[Key, Beside],
     overheads: Mapping[str, ComputeOverhead],
 ) -> dict[str, Any]:
-    """What is not scaled, overheads, and for each vehicle a flat row a scheme.
+    """Unscaled properties, overheads, and one flat row per vehicle and scheme.
 
     Args:
-        told: the model's report, with the overheads that the plans have.
-        flown: by vehicle and scheme.
-        overheads: measured in these flights, by detector.
+        told: the model's report, with the overheads of the plans.
+        flown: flights by vehicle and scheme.
+        overheads: overheads measured in these flights, by detector.
     """
     return {
         "ratios_over": BASE,
@@ -124,7 +124,7 @@ def _scheme(row: Mapping[str, Any], beside: Beside) -> dict[str, Any]:
 def _over(
     one: Mapping[str, Any], row: Mapping[str, Any], flown: Mapping[Key, Beside]
 ) -> dict[str, float]:
-    """Ratios over one board without protection, and the paper's: over detection and recovery."""
+    """Ratios to one board without protection and, as in the paper, to detection and recovery."""
     rows = {each["scheme"]: each for each in one["schemes"]}
     told: dict[str, float] = {}
     for over, suffix, names in (
@@ -158,10 +158,12 @@ def _success(flights: pa.Table) -> dict[str, Any]:
 
 
 def _numbers(row: Mapping[str, Any], beside: Beside) -> dict[str, Any]:
-    """Absolute numbers of the successful flights; the model's are for the same missions."""
+    """Absolute numbers of the successful flights, and the model's for the same missions."""
     won = chosen(beside.flights, succeeded=True)
     straight_m = numbers(won, "straight_m")
-    model_s = _mean(straight_m / row["velocity_mps"]).value  # the straight way at its velocity
+    model_s = _mean(
+        straight_m / row["velocity_mps"]
+    ).value  # the straight distance at the model's velocity
     energy_j, top = beside.measured("energy", won), _mean(numbers(won, "max_speed_mps"))
     path = _mean(numbers(won, "distance_m") / straight_m)
     return {
@@ -184,7 +186,7 @@ def _mean(values: FloatArray) -> Interval:
 
 
 def _beside(name: str, unit: str, model: float, flight: Interval) -> dict[str, float]:
-    """The model's number, the flights' with its interval, and by how much they differ."""
+    """The model's number, the flights' number with its interval, and the difference."""
     of = "_ratio" if unit == "_ratio" else ""
     return {
         f"model_{name}{unit}": model,

@@ -1,7 +1,7 @@
-"""`mavfi compare`: the same missions on several computers, as the preset fig16 has them.
+"""`mavfi compare`: the same missions on several platforms, as in the preset fig16.
 
-The folder is that of a campaign; `timeline` in it is another, of one golden flight a platform with
-its whole record.
+The folder is a campaign's. Its folder `timeline` is a campaign of one golden flight per platform
+with the whole record.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import installed_versions
 from mavfi_cli.studies.compare_plan import ComparePlan
 
-SCHEMA = 2  # 1 had the costs of faults among the worst cases
+SCHEMA = 2  # version 1 listed the costs of faults with the worst cases
 TIMELINE = "timeline"
 
 
 def compare(
     plan: ComparePlan, folder: Path, options: Options, spectator: Spectator
 ) -> dict[str, Any]:
-    """Fly what the folder has not yet, and say how the platforms compare.
+    """Fly the missing missions of the folder, and compare the platforms.
 
     Returns:
-        Plain values: what `compare.json` holds.
+        Plain values, the contents of `compare.json`.
 
     Raises:
         UnknownName, VehicleProcessError: a platform, world, state or detector that does not exist.
@@ -68,7 +68,7 @@ def _timelines(
     options: Options,
     spectator: Spectator,
 ) -> dict[str, Any]:
-    """What the kernels of a golden flight did, a row a platform; of those that flew."""
+    """Kernel invocations of a golden flight, one row per platform that flew."""
     seed = timeline_seed(flown, plan.platforms) or plan.first_seed
     spectator.on_note(f"the golden flights of seed {seed} again, for the timeline")
     missions = {

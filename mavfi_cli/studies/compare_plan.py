@@ -1,4 +1,4 @@
-"""The missions of a comparison: the same ones on each platform, as a campaign's specification."""
+"""The missions of a comparison of platforms, as a campaign's specification."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.stack import DEFAULT
 
-FAULTY = "FI"  # settings are named as in the presets
-_SHORT = {"gad": "G", "aad": "A"}  # of detectors, in the names of settings
+FAULTY = "FI"  # names of settings, as in the presets
+_SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings
 STAGES = tuple(stage.value for stage in Stage)
 MOST = 100_000  # missions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparePlan:
-    """What is compared. As it stands: the paper's Fig. 16, mission for mission the preset fig16.
+    """Plan of a comparison. The defaults are the preset fig16: the paper's Fig. 16.
 
     Attributes:
-        platforms: names or files; the others are held against the first.
-        inject: stages, states or groups that a fault strikes, one a flight; empty flies golden
+        platforms: names or files; the others are compared with the first.
+        inject: stages, states or groups to corrupt, one per flight; empty flies golden
             missions only.
-        detectors: names; `none` may be among them or not, it is always flown.
-        missions: of each platform and setting, and of each target of `inject`.
-        first_seed: of the missions; seeds count up from here.
+        detectors: names; `none` is always flown, named or not.
+        missions: number per platform, setting and target of `inject`.
+        first_seed: seed of the first mission; each further mission adds 1.
         seed: root of the faults' seeds.
-        field: bit field that is struck; None draws any bit.
-        stack: of all missions; a name, a file or a variant.
+        field: field of the bits; None draws any bit.
+        stack: stack of all missions: a name, a file or a variant.
 
     Raises:
-        ConfigError: nothing to fly, or something is named twice.
+        ConfigError: there is nothing to fly, or a name appears twice.
     """
 
     platforms: tuple[str, ...] = ("x86", "tx2")
@@ -72,17 +72,17 @@ class ComparePlan:
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Golden, `none`, and the detectors: what is flown on each platform."""
+        """The settings of each platform: golden, `none`, and the detectors."""
         protectors = tuple(name for name in self.detectors if name != NONE)
         return (GOLDEN, NONE, *protectors) if self.inject else (GOLDEN,)
 
     def told(self) -> dict[str, Any]:
-        """What is compared, with what the platforms are, as plain values."""
+        """The plan, with descriptions of the platforms, as plain values."""
         platforms = platforms_told(self.platforms)
         return {**asdict(self), "platforms": platforms, "settings": list(self.settings)}
 
     def spec(self) -> Spec:
-        """The campaign."""
+        """The specification of the campaign."""
         axis = "stage" if set(self.inject) <= set(STAGES) else "site"
         faults: dict[str, tuple[Any, ...]] = {axis: self.inject}
         if self.field is not None:

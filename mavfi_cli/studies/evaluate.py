@@ -1,8 +1,8 @@
-"""`mavfi detect evaluate`: what detectors are worth on flights that training never saw.
+"""`mavfi detect evaluate`: evaluate detectors on missions outside the training data.
 
-The folder holds campaigns: `bare` without detectors, whose traces are kept because detectors are
-replayed on them, and in `protected` one for each model of a detector, of which only the records are
-kept. What is flown with detectors depends on which faults turned out to do harm without.
+The folder contains the campaign `bare` without detectors, and in `protected` one campaign for each
+model of a detector. `bare` keeps its traces, because detectors are replayed on them. `protected`
+keeps only records. The missions with detectors depend on the faults that do harm without them.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ BARE, PROTECTED = "bare", "protected"
 def evaluate(
     plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectator
 ) -> tuple[dict[str, Any], tuple[pa.Table, pa.Table]]:
-    """Fly what the folder has not yet, and say what the detectors are worth.
+    """Fly the missing missions of the folder, and evaluate the detectors.
 
-    A larger plan of the same kind goes on from a smaller one.
+    A larger plan of the same kind extends a smaller one.
 
     Returns:
-        What `evaluation.json` holds, and the pairs that it counts: without faults, and with one.
+        The contents of `evaluation.json`, and its pairs: without faults, and with one.
 
     Raises:
         UnknownName, VehicleProcessError: a world or platform that does not exist.
@@ -77,13 +77,13 @@ def evaluate(
 
 
 def _protected_folder(plan: EvaluationPlan, folder: Path, detector: str) -> Path:
-    """Where the flights with a detector lie: a folder a model, whatever its file is called."""
+    """Folder of the flights with a detector: one per model, independent of its file name."""
     digest = model_digest(plan.detector_config(detector), plan.base.stack)
     return folder / PROTECTED / f"{detector}-{digest[:12]}"
 
 
 def _share_profiles(folder: Path, protected: Path) -> None:
-    """Draw instructions from the profiles of the bare flights: the golden flight is the same."""
+    """Share the profiles of the bare flights, which have the same golden flight."""
     try:
         if not (protected / PROFILES).exists():
             (protected / PROFILES).symlink_to(Path("..") / ".." / BARE / PROFILES)
@@ -134,11 +134,11 @@ def _scored(scores: Scores, error_free: pa.Table, faults: pa.Table, view: Specta
 def told(
     plan: EvaluationPlan, pairs: tuple[pa.Table, pa.Table], errors: Sequence[str], scored: Scored
 ) -> dict[str, Any]:
-    """What is known of these pairs, as plain values.
+    """Results of these pairs, as plain values.
 
     Args:
         errors: why missions could not be flown.
-        scored: as `analysis.detectors.found` takes it.
+        scored: see `analysis.detectors.found`.
     """
     return {
         "schema": SCHEMA,

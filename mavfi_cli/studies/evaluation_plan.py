@@ -1,4 +1,4 @@
-"""The missions of an evaluation of detectors, on seeds that no model was made with."""
+"""The missions of an evaluation of detectors, on seeds outside the training data."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ NODES = {
     "control": Stage.CONTROL,
 }
 SOURCE, INSTRUCTION = "source", "instruction"
-_DRAWS = 1000  # fault seeds that are tried until one draws a state of the wanted type
+_DRAWS = 1000  # number of fault seeds to try until one draws a state of the required type
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InjectionSite:
-    """Where faults of one kind strike.
+    """Injection site of one kind of fault.
 
     Attributes:
-        stage: of the corrupted kernel or of its output.
+        stage: stage of the corrupted kernel or of its output.
         target: a stage, or a node.
         field: a bit field, `integer`, or `any`.
     """
@@ -60,20 +60,20 @@ Fault = tuple[str, int, InjectionSite]  # world, seed of the mission, where
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationPlan:
-    """What is flown.
+    """Plan of an evaluation.
 
     Attributes:
-        detectors: names; `none` may be among them or not, it is always flown.
-        flights: missions of each world that get a fault of each place, one a flight.
-        harmless_flights: of them the first so many, all of whose faults are flown with the
-            detectors; of the others only faults that turn out to do harm.
-        golden_flights: error-free missions of each world; the first of them are those with faults.
+        detectors: names; `none` is always flown, named or not.
+        flights: missions per world that are flown with a fault at each site, one per flight.
+        harmless_flights: number of them, from the first on, whose faults are all flown with the
+            detectors; only harmful faults of the others are.
+        golden_flights: error-free missions per world; the first ones also get faults.
         first_seed: seeds of missions count up from here; training flies from 10 000 on.
         models: folder of model files `NAME.json`; None takes those shipped for the stack of `base`.
         level: source or instruction.
-        fields: bit fields that are struck at the source level.
-        seed: of the faults.
-        base: what else is to be flown.
+        fields: fields of the bits at source level.
+        seed: root of the faults' seeds.
+        base: the other parameters of all missions.
     """
 
     worlds: tuple[str, ...] = WORLDS
@@ -112,7 +112,7 @@ class EvaluationPlan:
         return tuple(name for name in self.detectors if name != NONE)
 
     def detector_config(self, detector: str) -> DetectorConfig:
-        """A detector as missions take it.
+        """Configuration of a detector for missions.
 
         Raises:
             ModelError: the folder of models has no such file.
@@ -126,11 +126,11 @@ class EvaluationPlan:
 
     @property
     def seeds(self) -> range:
-        """Of the missions, the same in each world; the first `flights` of them get faults."""
+        """Seeds of the missions, equal in each world; the first `flights` of them get faults."""
         return range(self.first_seed, self.first_seed + self.golden_flights)
 
     def told(self) -> dict[str, Any]:
-        """What is flown, with what the detectors are, as plain values."""
+        """The plan, with descriptions of the detectors, as plain values."""
         stack = self.base.stack
         return {
             "worlds": list(self.worlds),
@@ -149,7 +149,7 @@ class EvaluationPlan:
         }  # fmt: skip
 
     def places(self) -> list[InjectionSite]:
-        """Where faults strike: stage by bit field, or node."""
+        """Injection sites: stages by bit field, or nodes."""
         if self.level == INSTRUCTION:
             return [
                 InjectionSite(stage=stage.value, target=node, field=Field.ANY.value)
@@ -162,14 +162,14 @@ class EvaluationPlan:
         ]
 
     def bare(self) -> list[PlannedMission]:
-        """Golden flights, then those with a fault, none of them with a detector."""
+        """Golden flights, then flights with a fault, all without detector."""
         return [self._mission(key) for key in self._keys()]
 
     def protected(self, detector: str, harmful: Collection[Fault]) -> list[PlannedMission]:
-        """The same once more with a detector.
+        """The same flights with a detector.
 
         Args:
-            harmful: the faults that did harm without one.
+            harmful: faults that do harm without detector.
         """
         return [
             self._mission(key, detector)
@@ -178,7 +178,7 @@ class EvaluationPlan:
         ]
 
     def complete(self, seed: int) -> bool:
-        """Whether the detectors fly all faults of this mission, harmless ones as well."""
+        """Whether the detectors fly all faults of this mission, including harmless ones."""
         return seed in self.seeds[: self.harmless_flights]
 
     def _keys(self) -> Iterator[tuple[str, int, InjectionSite | None]]:
@@ -216,7 +216,7 @@ class EvaluationPlan:
                 field=Field.ANY.value if whole else place.field,
                 seed=derive(*drawn, number),
             )
-            # Drawn again until the state is of the wanted type, so each of them is as likely.
+            # Draw again until the state has the required type: all of them are equally likely.
             if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:
                 return {"fault": fault}
         raise ConfigError(f"no state of {place.target} has a bit field {place.field}")
@@ -232,12 +232,12 @@ def _require_some(what: str, chosen: Sequence[str], known: Sequence[str]) -> Non
 
 
 def require_held_out(plan: EvaluationPlan) -> None:
-    """Refuse detectors that cannot be loaded, and missions that a model was made with.
+    """Reject detectors that cannot be loaded, and missions that trained a model.
 
-    Seeds are compared whatever the world: two worlds may be drawn from the same numbers.
+    Seeds are compared across worlds, because two worlds may use the same random numbers.
 
     Raises:
-        ModelError: a model that cannot be used; names the flight that it was made with.
+        ModelError: a model cannot be used; the message names the training flight.
     """
     for detector in map(plan.detector_config, plan.protectors):
         detector_of(detector, plan.base.stack)

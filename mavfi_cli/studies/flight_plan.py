@@ -1,7 +1,7 @@
-"""What a row of the model becomes in the simulator: vehicle, platform, limits of the mission.
+"""Turn a row of the model into a simulated vehicle, a platform and limits of the mission.
 
-The simulated vehicle and platform are TOML files that a mission names by path. Their names hold a
-digest of their contents, so that equal names mean equal flights.
+The simulated vehicle and platform are TOML files that a mission names by path. Their names contain
+a digest of their contents, so that equal names mean equal flights.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mavfi_cli.vpm.model import safe_velocity_mps
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
 from mavfi_cli.vpm.setting import Setting, outcome
 
-# What of the model the simulation does not take over; printed with every report of flights.
+# Parts of the model that the simulation omits; printed with every report of flights.
 NOT_SCALED = (
     "size, propellers and drag are those of the simulated vehicle; boards weigh, but have no "
     "size: inertia and drag do not grow with them",
@@ -38,16 +38,16 @@ NOT_SCALED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
-    """How a vehicle is flown with a scheme.
+    """Plan of the flights of a vehicle with a scheme.
 
     Attributes:
-        mission: without world and seed.
-        files: TOML files that the mission names, by path.
-        model_velocity_mps: the safe velocity that it flies with, where the mission can take it.
-        braking_velocity_mps: the safe velocity with the deceleration that the companion counts on.
-        rotors_w: electrical power of hovering with all boards, by the model.
-        boards_w: of all boards.
-        cut: what of the model the mission cannot take, in words.
+        mission: configuration without world and seed.
+        files: TOML files of the mission, by path.
+        model_velocity_mps: safe velocity of the flights, if the mission allows it.
+        braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
+        rotors_w: electrical hover power with all boards, by the model.
+        boards_w: power of all boards.
+        cut: values of the model that exceed the mission's limits, in words.
     """
 
     scheme: Scheme
@@ -72,15 +72,15 @@ def flight_plan(
     """The mission that flies a scheme at the model's safe velocity.
 
     Args:
-        platform: whose latencies are scaled to the model's response time.
-        chain_s: what the model takes for that platform's response time.
-        folder: absolute; for the files.
-        models: of model files NAME.json; None takes those that come with the detectors.
-        stack: that the mission flies.
+        platform: platform whose latencies are scaled to the model's response time.
+        chain_s: response time of that platform in the model.
+        folder: absolute path of the folder for the files.
+        models: folder of model files NAME.json; None takes the shipped ones.
+        stack: stack of the mission.
 
     Raises:
-        CannotLift: the rotors do not lift so many boards.
-        ConfigError: the model's numbers make no mission.
+        CannotLift: the rotors cannot lift this many boards.
+        ConfigError: the model's numbers are not valid for a mission.
     """
     flown = outcome(setting, scheme)
     boards_w = scheme.copies * setting.board.power_w
@@ -120,7 +120,7 @@ def flight_plan(
 
 
 def write_files(plan: FlightPlan) -> None:
-    """Write the TOML files that the plan's missions name.
+    """Write the TOML files of the plan's missions.
 
     Raises:
         RecordError: a file cannot be written.
@@ -134,7 +134,7 @@ def write_files(plan: FlightPlan) -> None:
 
 
 def vehicle_text(setting: Setting, scheme: Scheme, acceleration_mps2: float) -> str:
-    """TOML of the simulated vehicle that stands in for the model's, with a scheme's boards."""
+    """TOML of the simulated equivalent of the model's vehicle, with a scheme's boards."""
     vehicle, boards = setting.vehicle, scheme.copies
     told = f"{vehicle.name} of the performance model with {boards} x {setting.board.name}"
     return "\n".join(
@@ -155,7 +155,7 @@ def vehicle_text(setting: Setting, scheme: Scheme, acceleration_mps2: float) -> 
 
 
 def platform_text(platform: PlatformProfile, factor: float) -> str:
-    """TOML of a platform with all latencies of another times a factor."""
+    """TOML of a platform whose latencies are those of another times a factor."""
     lines = [
         f"name = {_quoted(f'{platform.name}{TIMES}{factor:.6g}')}",
         f"cores = {platform.cores}",
@@ -172,7 +172,7 @@ def platform_text(platform: PlatformProfile, factor: float) -> str:
 
 
 def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:
-    """The nearest that a mission can take, and what is to be told where that is not the same."""
+    """The nearest value that a mission allows, and a message if it differs."""
     low, high = LIMITS[key]
     taken = min(max(wanted, low), high)
     told = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"

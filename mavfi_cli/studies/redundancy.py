@@ -1,4 +1,4 @@
-"""`mavfi vpm --fly`: every row of the model flown, and put beside it."""
+"""`mavfi vpm --fly`: fly every row of the model and compare."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def fly_and_report(
     options: Options,
     spectator: Spectator,
 ) -> dict[str, Any]:
-    """The model's report with the flights of all its rows in `flights`.
+    """The model's report, with the flights of all rows in `flights`.
 
-    The flights, and the model beside them, have the overheads that are given, or else the paper's;
-    the model's own rows have those that were measured in the flights, where none is given.
+    The flights and the model beside them use the given overheads, or else the paper's. The model's
+    own rows use the given overheads, or else those measured in the flights.
 
     Args:
-        overheads: of a detector's name to per cent and source.
+        overheads: per cent and source, by the detector's name.
 
     Raises:
         MavfiError: as `run_campaign`; a world or vehicle that does not exist.

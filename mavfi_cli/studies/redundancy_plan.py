@@ -1,4 +1,4 @@
-"""Which flights stand beside the rows of the performance model: a plan a vehicle and scheme."""
+"""The flights for the rows of the performance model: one plan per vehicle and scheme."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from mavfi_cli.vpm.vehicle import Vehicle
 
 WORLDS = ("sparse", "dense")
 FLOWN, TRAINING = "flown", "training"
-PLATFORM = "x86"  # whose latencies are scaled where no platform is named
+PLATFORM = "x86"  # platform whose latencies are scaled by default
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RedundancyPlan:
-    """What is to be flown.
+    """Plan of the flights of all vehicles and schemes.
 
     Attributes:
-        missions: of each scheme in each world.
-        folder: of flights and pictures; what it has is not flown again.
-        models: of the detectors; None takes those that come with them.
+        missions: number per scheme and world.
+        folder: folder of flights and pictures; recorded missions are not flown again.
+        models: folder of the detectors' models; None takes the shipped ones.
         train: flights of each training world to which detectors are fitted for each vehicle; 0
             fits none.
-        stack: of all flights.
+        stack: stack of all flights.
     """
 
     vehicles: Sequence[Vehicle]
@@ -56,7 +56,7 @@ class RedundancyPlan:
 
     @property
     def models_told(self) -> str:
-        """Where the detectors' models are from."""
+        """Origin of the detectors' models."""
         if self.train:
             worlds = ", ".join(TRAINING_WORLDS)
             flown = f"{self.train} error-free flights in each of {worlds} at its safe velocity"
@@ -66,7 +66,7 @@ class RedundancyPlan:
         return "the shipped ones, fitted to flights of the Solo at 3 m/s"
 
     def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
-        """Mission by mission, so that pairs are complete wherever the list is cut off."""
+        """The list mission by mission, so that pairs are complete if it is cut off."""
         seeds = range(self.first_seed, self.first_seed + self.missions)
         return [
             PlannedMission(
@@ -83,16 +83,16 @@ class RedundancyPlan:
 def make_plans(
     plan: RedundancyPlan, schemes: Sequence[Scheme], options: Options, spectator: Spectator
 ) -> dict[Key, FlightPlan | str]:
-    """A plan, or why there is none, for each vehicle and scheme; their files are written.
+    """Make a plan, or a reason for its absence, for each vehicle and scheme; write the files.
 
     Args:
-        options, spectator: of the flights to which detectors are fitted, where that is asked for.
+        options, spectator: for the flights to which detectors are fitted, if requested.
 
     Raises:
         UnknownName, VehicleProcessError: a world, a stack or a simulated vehicle that does not
             exist.
-        CannotLift: a vehicle that does not lift one board.
-        ModelError: a detector's model that cannot be used.
+        CannotLift: a vehicle cannot lift one board.
+        ModelError: a detector's model cannot be used.
     """
     require_distinct(plan.worlds, "world")
     if plan.train:
@@ -119,7 +119,7 @@ def _plans_of(
     chain_s = chain([kernel.latency_s for kernel in platform.kernels.values()])
     setting, models = setting_of(vehicle, plan.choices), plan.models
     folder = plan.folder.absolute() / FLOWN
-    refused: dict[int, str | None] = {}  # by number of boards: what the simulator says
+    refused: dict[int, str | None] = {}  # number of boards -> the simulator's answer
     for scheme in schemes:
         try:
             each = flight_plan(setting, scheme, platform, chain_s, folder, models, plan.stack)
@@ -139,7 +139,7 @@ def _plans_of(
 
 
 def _refusal(plan: RedundancyPlan, flown: FlightPlan, *, bare: bool) -> str | None:
-    """Why the simulator does not fly so many boards; an error where it is one board."""
+    """Why the simulator cannot fly this many boards; an error for one board."""
     try:
         ask_vehicle(replace(flown.mission, world=plan.worlds[0], seed=plan.first_seed))
     except VehicleProcessError as error:
@@ -152,10 +152,10 @@ def _refusal(plan: RedundancyPlan, flown: FlightPlan, *, bare: bool) -> str | No
 def fitted(
     plan: RedundancyPlan, vehicle: str, flown: FlightPlan, options: Options, spectator: Spectator
 ) -> Path:
-    """The folder of detectors that are fitted to error-free flights of a plan.
+    """The folder of detectors fitted to error-free flights of a plan.
 
-    What is there is taken: the folder's name holds a digest of the mission and of the number of
-    flights.
+    Existing models are reused, because the folder's name contains a digest of the mission and of
+    the number of flights.
 
     Raises:
         ModelError: too few flights reached their goals, or torch is missing.
@@ -171,7 +171,7 @@ def fitted(
 
 
 def _require_held_out(plan: RedundancyPlan) -> None:
-    """Refuse missions with the seeds of training flights, whatever their worlds."""
+    """Reject missions with the seeds of training flights, in any world."""
     first = TrainingPlan().first_seed
     last = first + plan.train * len(TRAINING_WORLDS) - 1
     if plan.first_seed <= last and first <= plan.first_seed + plan.missions - 1:

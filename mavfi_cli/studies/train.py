@@ -1,7 +1,7 @@
 """Training of detectors: error-free flights, the data set of their samples, the fitted models.
 
 The paper's training set (section VI): two obstacle densities times two obstacle sizes, 25 flights
-each, the world of every flight from a seed of its own.
+each. Every flight has its own world seed.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.stack import load_stack
 
 WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
-FLIGHTS = 25  # of each world
-FIRST_SEED = 10_000  # far from the seeds that people fly and evaluate with
+FLIGHTS = 25  # flights per world
+FIRST_SEED = 10_000  # far from the usual seeds of flights and evaluations
 FLIGHTS_FOLDER, DATASET = "flights", "dataset.parquet"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingPlan:
-    """What is flown and fitted.
+    """Plan of the flights and of the fit.
 
     Attributes:
-        flights: of each world.
-        first_seed: seeds count up from here, over all worlds.
-        seed: of the split and of the first weights.
-        n_sigma: threshold of the Gaussian model; None takes its default.
+        flights: number per world.
+        first_seed: seed of the first flight; each further flight of any world adds 1.
+        seed: seed of the split and of the initial weights.
+        n_sigma: threshold of the Gaussian model; None takes the default.
     """
 
     worlds: tuple[str, ...] = WORLDS
@@ -68,11 +68,11 @@ class TrainingPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainedDetectors:
-    """What came of it.
+    """The result of a training.
 
     Attributes:
-        models: by detector, with the files that they were written to.
-        failed: flights that did not reach the goal, and so are no part of the data set.
+        models: model and file of each detector.
+        failed: number of flights outside the data set, because they did not reach the goal.
     """
 
     dataset: Dataset
@@ -83,15 +83,15 @@ class TrainedDetectors:
 def fly_training(
     plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
 ) -> tuple[Dataset, int]:
-    """Fly what is missing, and gather the samples of all flights that reached the goal.
+    """Fly the missing flights, and collect the samples of those that reached the goal.
 
     Returns:
-        The data set, written to the folder as well, and how many flights are not in it.
+        The data set, also written to the folder, and the number of flights outside it.
 
     Raises:
         ModelError: no flight can be used.
-        UnknownName: there is no such stack.
-        ConfigError: the folder holds the flights of another plan; the stack makes no sense.
+        UnknownName: the stack does not exist.
+        ConfigError: the folder has the flights of another plan, or the stack is not valid.
         RecordError: a file cannot be written.
     """
     missions, stack = plan.missions(), load_stack(plan.base.stack).mark
@@ -122,12 +122,12 @@ def train(
     options: Options,
     spectator: Spectator,
 ) -> TrainedDetectors:
-    """Fly, gather, fit, and write the models with their provenance.
+    """Fly, fit the detectors, and write the models with their provenance.
 
     Raises:
         ModelError: too few flights, an unknown kind, or torch is missing; before anything is
             flown, unless too many flights fail.
-        ConfigError: n sigma out of range; the folder holds the flights of another plan.
+        ConfigError: n sigma is out of range, or the folder has the flights of another plan.
         RecordError: a file cannot be written.
     """
     check(plan.kinds, len(plan.missions()), plan.n_sigma)

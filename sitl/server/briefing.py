@@ -1,4 +1,4 @@
-"""What a companion that was started together with the vehicle is told: its mission."""
+"""The briefing of a companion that starts together with the vehicle."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ FILE = "briefing.json"
 
 
 def write_briefing(simulation: Simulation, folder: Path) -> None:
-    """Leave goal, bounds and camera mount in `folder`, before the first message is sent.
+    """Write goal, bounds and camera mounting to `folder`, before the first message is sent.
 
     Raises:
-        RecordError: it cannot be written.
+        RecordError: the file cannot be written.
     """
     world = simulation.referee.world
     briefing = {

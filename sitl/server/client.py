@@ -1,4 +1,4 @@
-"""One client: its connection, its codecs, and its place at the autopilot and the camera."""
+"""One client: its connection, codecs, and sessions with autopilot and camera."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _FRAMES = (
 )
 
 
-_OVERHEARD = 100  # texts kept at most, the newest
+_OVERHEARD = 100  # number of newest texts to keep
 
 
 class Client:
-    """Turns bytes of one connection into calls of the simulation, and its messages into bytes.
+    """Turns bytes of one connection into calls of the simulation, and messages into bytes.
 
-    Depth frames go to the clients that started the capture; everybody gets the camera's
+    Depth frames go to the clients that started the capture. All clients get the camera's
     heartbeat.
 
     Attributes:
-        overheard: frames of STATUSTEXTs that came, for the other clients: as an autopilot
-            forwards what its companion says to the ground station, unchanged.
+        overheard: frames of received STATUSTEXTs for the other clients, unchanged, as an
+            autopilot forwards its companion's texts to the ground station.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Client:
         self.transport.close()
 
     def receive(self, timeout_s: float) -> list[Any]:
-        """Handle what arrives next, waiting at most `timeout_s`; the messages handled.
+        """Handle the next bytes, waiting at most `timeout_s`; return the handled messages.
 
         Raises:
             LinkLost: the peer is gone.
@@ -70,7 +70,7 @@ class Client:
         return self._take(data) if data else []
 
     def receive_some(self) -> bool:
-        """Handle one portion of what waits; False when nothing does.
+        """Handle one portion of the waiting bytes; False if there are none.
 
         Raises:
             LinkLost: the peer is gone.
@@ -115,7 +115,7 @@ class Client:
         self._send(frames + [self._codec.encode(message) for message in answers])
 
     def forward(self, frames: Iterable[bytes]) -> None:
-        """Send frames of other clients as they are."""
+        """Send frames of other clients unchanged."""
         self._send(list(frames))
 
     def _send(self, frames: list[bytes]) -> None:

@@ -1,4 +1,4 @@
-"""Lockstep: one companion, and no simulated time passes while it thinks.
+"""Lockstep: one companion, and simulated time stands still while it computes.
 
 Each control tick everything due goes out in one send that ends with LOCAL_POSITION_NED. The
 next tick begins when the companion has sent SET_POSITION_TARGET_LOCAL_NED with the same
@@ -21,7 +21,7 @@ from sitl.server.pace import Pace
 from sitl.server.simulation import Simulation
 
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
-_LOOK_UP_S = 0.2  # how often a silent wait looks whether it should stop
+_LOOK_UP_S = 0.2  # interval at which a silent wait checks for a stop
 
 
 def run_lockstep(
@@ -37,9 +37,9 @@ def run_lockstep(
     Args:
         simulation: the vehicle.
         client: the companion.
-        speed: at most so many times real time; None for as fast as the machine goes.
-        limit_s: how long the companion may think about one tick, wall clock.
-        stopped: whether the user asked to end.
+        speed: limit in multiples of real time; None for no limit.
+        limit_s: wall time limit of the companion for one tick.
+        stopped: whether the user requested the end.
 
     Raises:
         VehicleProcessError: no answer within the limit.
@@ -61,7 +61,7 @@ def run_lockstep(
 def _await_answer(
     stamp_ms: int, client: Client, limit_s: float, stopped: Callable[[], bool]
 ) -> bool:
-    """Handle what the companion sends until it has answered; False when stopped before."""
+    """Handle messages of the companion until it answers; False if stopped before."""
     deadline_s = 0.0
     while True:
         messages = client.receive(_LOOK_UP_S)
@@ -90,16 +90,16 @@ def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
 
 
 class EmbeddedVehicle:
-    """The vehicle inside its companion's process, which stands still while the vehicle flies.
+    """The vehicle in the process of its companion, which waits while the vehicle flies.
 
     Args:
         simulation: the vehicle.
-        truth_folder: where the truth is saved at the end.
+        truth_folder: folder in which the truth is saved at the end.
 
     Attributes:
         link: the companion's end of the link. When the companion has answered a tick and waits for
             more, the vehicle flies the next one.
-        error: what ended the vehicle before its companion did.
+        error: error that ended the vehicle before its companion.
     """
 
     def __init__(self, simulation: Simulation, truth_folder: Path) -> None:
@@ -112,7 +112,7 @@ class EmbeddedVehicle:
         self.link.on_wait = self._fly_on
 
     def _fly_on(self) -> None:
-        """Fly a tick if the companion has answered the last, and tell of it."""
+        """Fly a tick if the companion has answered the last one, and send its messages."""
         try:
             if not self._begun or self._fly_tick():
                 self._begun = True
@@ -122,14 +122,14 @@ class EmbeddedVehicle:
             self.end()
 
     def _fly_tick(self) -> bool:
-        """Fly on if the companion has answered; whether it has."""
+        """Fly a tick if the companion has answered; return whether it has."""
         answered = _answers(self._client.receive(0.0), self._simulation.stamp_us // 1000)
         if answered:
             self._simulation.advance()
         return answered
 
     def end(self) -> None:
-        """Fly as the companion's last answer wants it, and save the truth; harmless when repeated.
+        """Fly the companion's last answer and save the truth; may be called repeatedly.
 
         Raises:
             RecordError: the truth cannot be saved.

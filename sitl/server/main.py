@@ -1,4 +1,4 @@
-"""Puts a server together from its options, runs it, and ends it well."""
+"""Assembles a server from its options, runs it, and shuts it down."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _WARM_TICKS = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m sitl`; the exit code. A known error is one line on stderr and 1."""
+    """Run `python -m sitl`; return the exit code. A known error is one line on stderr and 1."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
     try:
         serve(options)
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def serve(options: Options) -> None:
-    """Run until the peer closes, or SIGINT or SIGTERM; save the truth whatever ends it."""
+    """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
     stopped = _stop_on_signals()
     simulation = _simulation(options)
     if options.truth is not None:
@@ -53,8 +53,8 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> EmbeddedVehicle:
     """The vehicle of `python -m sitl --lockstep` in this process, ready to fly.
 
     Args:
-        arguments: of the command line, without the companion's descriptor.
-        truth_folder: for the briefing, and at the end the truth.
+        arguments: command line without the companion's descriptor.
+        truth_folder: folder for the briefing and, at the end, the truth.
 
     Raises:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
@@ -65,7 +65,7 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> EmbeddedVehicle:
 
 
 def warm_up() -> None:
-    """Load and compile all that a flight needs; the code is the same for every world."""
+    """Load and compile the code of a flight, which is the same for every world."""
     simulation = Simulation(load_world("dense", seed=1), load_profile("solo"))
     for _ in range(_WARM_TICKS):
         simulation.advance()
@@ -162,7 +162,7 @@ def _announce(options: Options, simulation: Simulation) -> None:
 
 
 def _how(url: str) -> list[str]:
-    """How clients get to an endpoint, a line each."""
+    """How clients reach an endpoint, one line each."""
     scheme, _, place = url.partition(":")
     port = place.rpartition(":")[2]
     mavsdk, mavproxy = {

@@ -22,7 +22,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """What the user asked for."""
+    """The parsed options of the user."""
 
     world: str
     seed: int
@@ -31,7 +31,7 @@ class Options:
     goal_enu_m: Triple | None
     links: tuple[tuple[Preset, str], ...]
     lockstep_fd: int | None
-    speed: float | None  # None: as fast as it goes, in lockstep only
+    speed: float | None  # None: no limit, in lockstep only
     answer_limit_s: float
     truth: Path | None
     camera_columns: int
@@ -43,7 +43,7 @@ class Options:
 
 
 def parse(arguments: Sequence[str]) -> Options:
-    """Options of a command line; exits with 2 where it cannot be understood."""
+    """Parse a command line; exit with code 2 if it is not valid."""
     parser = _parser()
     given = parser.parse_args(arguments)
     if given.lockstep and given.fd is None:
@@ -149,7 +149,7 @@ def _system_id(text: str) -> int:
 
 
 def _link(text: str) -> tuple[Preset, str]:
-    """A preset, named or guessed by port as PX4 has it, and a URL."""
+    """A preset, named or derived from PX4's port numbers, and a URL."""
     name, equals, url = text.partition("=")
     if equals:
         names = [preset.value for preset in Preset]

@@ -8,10 +8,10 @@ _PATIENCE_S = 0.5
 
 
 class Pace:
-    """Says how long to wait before the next tick.
+    """Computes the wait before the next tick.
 
-    A machine that cannot keep up gets no bill for the past: beyond half a second of delay the
-    lost time is forgiven.
+    A slow machine does not accumulate delay: time lost beyond half a second of delay is
+    dropped.
 
     Args:
         speed: simulated seconds for each second of the wall clock.
@@ -22,9 +22,9 @@ class Pace:
         self._due_s = time.monotonic()
 
     def next_tick(self, tick_s: float) -> None:
-        """One more tick has been simulated."""
+        """Count one more simulated tick."""
         self._due_s = max(self._due_s + tick_s / self._speed, time.monotonic() - _PATIENCE_S)
 
     def remaining_s(self) -> float:
-        """Until the tick is due; zero or less when it is."""
+        """Time until the tick is due; zero or less if it is."""
         return self._due_s - time.monotonic()

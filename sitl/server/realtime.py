@@ -14,21 +14,21 @@ from sitl.server.client import Client
 from sitl.server.pace import Pace
 from sitl.server.simulation import Simulation
 
-_RECEIVES_A_TICK = 1000  # of one client, so that a flood cannot stop the clock
+_RECEIVES_A_TICK = 1000  # limit per client, so that a flood cannot stop the clock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Door:
-    """Where clients come in, and what they get."""
+    """An endpoint for clients, and their preset."""
 
     listener: Listener
     preset: Preset
-    signing: Callable[[], Signing | None]  # a fresh one for each client
-    ends_with_peer: bool = False  # an inherited connection: when it closes, so does the server
+    signing: Callable[[], Signing | None]  # a new one for each client
+    ends_with_peer: bool = False  # an inherited connection; the server ends with it
 
 
 class Realtime:
-    """The clients of a simulation that runs by the wall clock."""
+    """The clients of a simulation that is paced by the wall clock."""
 
     def __init__(self, simulation: Simulation, doors: list[Door], *, speed: float) -> None:
         self._simulation = simulation
@@ -65,14 +65,14 @@ class Realtime:
                 return
 
     def _forward(self) -> None:
-        """What one client tells people goes to all others."""
+        """Forward the status texts of each client to all others."""
         for speaker, _ in list(self._clients):
             while speaker.overheard:
                 self._tell_others(speaker, speaker.overheard.popleft())
 
     def _tell_others(self, speaker: Client, frame: bytes) -> None:
         def forward(client: Client) -> None:
-            """To all but the one who spoke."""
+            """Send to all except the sender."""
             if client is not speaker:
                 client.forward([frame])
 
@@ -95,7 +95,7 @@ class Realtime:
                 self._clients.append((client, door))
 
     def _each(self, action: Callable[[Client], None]) -> None:
-        """Do something with every client, and part with those that are gone."""
+        """Call a function with every client, and remove disconnected ones."""
         for client, door in list(self._clients):
             try:
                 action(client)

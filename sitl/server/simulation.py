@@ -34,17 +34,17 @@ class Simulation:
     """One vehicle in one world; deterministic in its arguments and the messages handled.
 
     Args:
-        world: where it flies; it starts at the world's start, facing the goal.
-        profile: what flies.
+        world: world of the flight, which begins at the world's start, facing the goal.
+        profile: profile of the vehicle.
         system_id: MAVLink system id.
         camera_columns: depth image width, pixels.
         camera_rows: depth image height, pixels.
-        camera_rate_hz: frames a second where a client names no interval.
+        camera_rate_hz: frames per second for clients that request no interval.
 
     Attributes:
         stamp_us: boot clock at the newest tick.
         camera_due: messages of the camera at the newest tick.
-        wall: where this machine's time goes.
+        wall: wall times of this machine by part.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Simulation:
         self._look()
 
     def advance(self) -> None:
-        """Fly one control tick as the autopilot now wants it, then look at what came of it."""
+        """Fly one control tick with the autopilot's command, then judge the result."""
         autopilot, vehicle = self.autopilot, self.vehicle
         autopilot.fly()
         setpoint, motors_on = autopilot.setpoint, autopilot.motors_on
@@ -95,7 +95,11 @@ class Simulation:
         self._look()
 
     def save_truth(self, folder: Path) -> None:
-        """Write the referee's log and verdict; RecordError where that fails."""
+        """Write the referee's log and verdict.
+
+        Raises:
+            RecordError: a file cannot be written.
+        """
         truth = self.vehicle.truth
         energies = {
             "regression": truth.energy_regression_j,
@@ -120,7 +124,7 @@ class Simulation:
     def _judge(
         self, truth: StateEstimate, position_enu_m: Vector, quaternion_flu_enu: Vector
     ) -> None:
-        """Let the referee see this tick; a collision ends the flight where it falls to."""
+        """Let the referee judge this tick; after a collision the vehicle falls and stays there."""
         commander, powers = self.autopilot.commander, self.vehicle.truth
         moves = self._wreck is None
         collision = self.referee.observe(

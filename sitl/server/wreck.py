@@ -1,4 +1,4 @@
-"""What is left of a vehicle that crashed and came down: it lies where it fell."""
+"""State of a vehicle that has crashed and come to rest."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from sitl.autopilot.truth import StateEstimate, Vector
 
-_GROUND_M = 0.3  # the centre of what has fallen lies no higher than this
+_GROUND_M = 0.3  # highest centre of a fallen vehicle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wreck:
-    """A vehicle's state, at rest for good; see `sitl.autopilot.truth.StateEstimate`."""
+    """State of a vehicle at permanent rest; see `sitl.autopilot.truth.StateEstimate`."""
 
     position_ned_m: Vector  # (3,)
     quaternion_frd_ned: Vector  # (4,)
@@ -33,7 +33,7 @@ def has_come_down(truth: StateEstimate) -> bool:
 
 
 def wreck_of(truth: StateEstimate) -> Wreck:
-    """The state of a vehicle that stays where it is from now on."""
+    """The state of a vehicle that stays at its position."""
     return Wreck(
         position_ned_m=np.array(truth.position_ned_m),
         quaternion_frd_ned=np.array(truth.quaternion_frd_ned),

@@ -1,1 +1,1 @@
-"""What commands print: tables of text in at most 100 columns, and rows of CSV."""
+"""Output of commands: text tables of at most 100 columns, and CSV."""

@@ -73,7 +73,7 @@ def _mean_cells(cell: Row) -> list[str]:
 
 
 def _comparison_table(settings: SettingColumns, found: Sequence[Row]) -> list[str]:
-    """A line a comparison; without the columns in which none has a value."""
+    """One line per comparison, without empty columns."""
     head = ["pairs", "success, points", "p", "time, s", "worst over own golden",
             "worst over mean golden"]  # fmt: skip
     cells = [_comparison_cells(each) for each in found]
@@ -86,7 +86,7 @@ def _comparison_table(settings: SettingColumns, found: Sequence[Row]) -> list[st
 
 
 def _comparison_cells(each: Row) -> list[str]:
-    """Success, time, and worst cases; that over the mean golden flight beside protection only."""
+    """Success, time, and worst cases; the one over the mean golden flight for protection only."""
     test, time, mean = McNemar(**each["success"]), each["differences"]["flight_time_s"], "over_mean"
     return [
         f"{test.pairs}",
@@ -112,7 +112,7 @@ def _worst(worst: Row) -> str:
 
 
 def quality_lines(found: Sequence[Row], confidence: float = 0.95) -> list[str]:
-    """A table for each metric."""
+    """One table per metric."""
     if not found:
         return []
     settings = SettingColumns.of([each["labels"] for each in found if each["metric"] == METRICS[0]])
@@ -142,7 +142,7 @@ def _quality_cells(each: Row, scale: float) -> list[str]:
 
 
 def overhead_lines(found: Sequence[Row], confidence: float = 0.95) -> list[str]:
-    """A table of detection, measured on the host, and one of recovery, simulated."""
+    """A table of detection, measured on the host, and a table of recovery, simulated."""
     if not found:
         return ["", "overhead: no flight with a detector"]
     settings = SettingColumns.of([each["labels"] for each in found])
@@ -182,7 +182,7 @@ def _recovery_cells(each: Row) -> list[str]:
 
 
 def _percent(share: Row, *, ends: bool = True) -> str:
-    """Per cent with four digits, as in the paper's table; what is less but not nothing as "<"."""
+    """Per cent with four decimals, as in the paper's table; smaller positive values as "<"."""
     value, *between = spread(share, 4, 100.0).split(" ", 1)
     told = "<0.0001" if 0.0 < share["value"] < 0.5e-6 else value
     return " ".join([told, *between]) if ends else told
@@ -192,7 +192,7 @@ def _percent(share: Row, *, ends: bool = True) -> str:
 
 
 def failure_lines(rows: Sequence[Row]) -> list[str]:
-    """A setting, and a line for each number of it."""
+    """One setting, with a line for each number."""
     return [
         line for each in rows for line in (f"  {each['name']}", *(f"    {p}" for p in _parts(each)))
     ]

@@ -1,4 +1,4 @@
-"""Numbers as cells of a table; what is no number is a dash."""
+"""Numbers as cells of a table; NaN is a dash."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Row = Mapping[str, Any]
 
 
 def number(value: float, shape: str = "", scale: float = 1.0, unit: str = "") -> str:
-    """A value by a format specification, and its unit."""
+    """A value in a format specification, with its unit."""
     return "-" if not math.isfinite(value) else f"{scale * value:{shape}}{unit}"
 
 
@@ -20,7 +20,7 @@ def percent(share: float, shape: str = ".1f") -> str:
 
 
 def fraction(share: Row) -> str:
-    """How many of how many."""
+    """A count and its total."""
     return f"{share['count']}/{share['total']}" if share["total"] else "-"
 
 
@@ -35,10 +35,10 @@ def rate(share: Row, digits: int = 1) -> str:
 def spread(
     each: Row, digits: int, scale: float = 1.0, sign: str = "", chance: float | None = None
 ) -> str:
-    """A value with its interval, where it has one, and the p-value, where one is given."""
+    """A value, with its interval and p-value if there are any."""
     if math.isnan(each["value"]):
         return "-"
-    shape = f"{sign or 'z'}.{digits}f"  # with a sign, -0.00 tells on which side of zero it is
+    shape = f"{sign or 'z'}.{digits}f"  # the sign of -0.00 shows its side of zero
     value, low, high = (f"{scale * each[end]:{shape}}" for end in ("value", "low", "high"))
     told = [] if math.isnan(each["low"]) else [f"{low} to {high}"]
     told += [] if chance is None else [p_value(chance)]
@@ -46,5 +46,5 @@ def spread(
 
 
 def p_value(chance: float) -> str:
-    """A p-value in little room."""
+    """A p-value in short form."""
     return "p<.001" if chance < 0.001 else f"p {chance:.1g}".replace("p 0.", "p .")

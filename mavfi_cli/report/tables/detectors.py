@@ -1,4 +1,4 @@
-"""An evaluation of detectors: as text, and its pairs as CSV."""
+"""An evaluation of detectors as text, and its pairs as CSV."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 
 
 def _group_rows(by: str, rows: Sequence[Row]) -> Iterator[list[str]]:
-    """How many of the harmful faults each detector detects, and whose harm it undoes."""
+    """Number of harmful faults that each detector detects, and whose harm it undoes."""
     detectors = [row["detector"] for row in rows if row["value"] == rows[0]["value"]]
     told = [name for name in detectors if name != NONE]
     yield [f"by {by}", "active", "harmful", "seen:", *told, "undone:", *told]
@@ -139,7 +139,7 @@ def _group_rows(by: str, rows: Sequence[Row]) -> Iterator[list[str]]:
 
 
 def _worst_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    """The worst flight time of each world over the golden flight's, and how much is recovered."""
+    """Worst flight time of each world over the golden flight's, and its recovery."""
     yield ["worst time", *dict.fromkeys(row["detector"] for row in rows)]
     for value in dict.fromkeys(row["value"] for row in rows):
         group = [row for row in rows if row["value"] == value]
@@ -175,5 +175,5 @@ def _share(share: Row) -> str:
 
 
 def detector_csv(*pairs: pa.Table) -> str:
-    """A row a pair: those without faults first, then those with one."""
+    """One row per pair: first the pairs without faults, then those with one."""
     return csv_text((row for table in pairs for row in rows_of(table, [*CSV])), [*CSV])

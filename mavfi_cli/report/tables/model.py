@@ -26,7 +26,7 @@ def model_lines(told: Mapping[str, Any]) -> list[str]:
 
 
 def model_csv(told: Mapping[str, Any]) -> str:
-    """CSV text: a row a vehicle and scheme; the header names the units."""
+    """CSV text, one row per vehicle and scheme; the header names the units."""
     return csv_text(schemes_of(dict(told)))
 
 
@@ -121,5 +121,5 @@ def _sources(one: Mapping[str, Any]) -> Iterator[str]:
 
 
 def columns(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """Left-aligned columns under a head, where there is one."""
+    """Left-aligned columns, with an optional head."""
     yield from aligned([head, *rows] if head else rows)

@@ -1,4 +1,4 @@
-"""Platforms beside each other: as text, and as CSV with a row a number."""
+"""A comparison of platforms as text, and as CSV with one row per number."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PAPER = "paper, Fig. 16: worst case x 2.8 on the TX2, of which GAD recovers 79.3
 
 
 def setting_title(setting: str) -> str:
-    """What a setting is called."""
+    """The name of a setting."""
     return {GOLDEN: "golden", NONE: "faults"}.get(setting, f"faults, {setting}")
 
 
 def titles_of(told: Row) -> dict[str, str]:
-    """What the platforms are called."""
+    """The names of the platforms."""
     return {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
 
 
@@ -63,7 +63,7 @@ def platform_lines(told: Row) -> list[str]:
 
 
 def _few(told: Row) -> list[str]:
-    """A word where intervals are of too few flights to be believed."""
+    """A warning if intervals rest on too few flights."""
     counts = [row["quantities"]["flight_time_s"]["mean"]["count"] for row in told["settings"]]
     if not any(1 < count < FEW for count in counts):
         return []
@@ -94,7 +94,7 @@ def _head(told: Row) -> list[str]:
 
 
 def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -> list[str]:
-    """A table of all platforms and settings; the label that comes first is told once."""
+    """A table of all platforms and settings; the first label is printed once."""
     titles, last, rows = titles_of(told), "", []
     for row in told[name]:
         labels = [titles[row["platform"]], setting_title(row["setting"])]
@@ -105,7 +105,7 @@ def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -
 
 
 def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: Any) -> list[str]:
-    """A title, and a table of a platform against the first one."""
+    """A title, and a table of a platform compared with the first one."""
     rows = [row for row in told[name] if row["platform"] == platform["platform"]]
     title, *names = head
     told_rows = [[setting_title(row["setting"]), *cells(row)] for row in rows]
@@ -180,7 +180,7 @@ def _worst_cells(row: Row) -> list[str]:
 
 
 def _again(told: Row) -> list[str]:
-    """How to fly again what cost most."""
+    """How to repeat the most expensive flights."""
     titles, lines = titles_of(told), []
     for row in told["costs"]:
         if row["setting"] != NONE or row["worst_flight"] is None:
@@ -194,7 +194,7 @@ def _again(told: Row) -> list[str]:
 
 
 def _command_of(plan: Row, row: Row) -> str:
-    """The command that flies the worst flight of a setting without detector again."""
+    """The command that repeats the worst flight of a setting without detector."""
     flight = row["worst_flight"]
     parts = [
         f"mavfi fly --world {plan['world']} --seed {flight['seed']} --platform {row['platform']}"
@@ -212,7 +212,7 @@ def _command_of(plan: Row, row: Row) -> str:
 
 _NAMES = ("table", "platform", "reference", "setting", "quantity", "statistic", "unit", "value",
           "low", "high", "count")  # fmt: skip
-# Quantity, statistic and unit of a number, and where it stands in its row.
+# Quantity, statistic and unit of a number, and its path in the row.
 _OF_COSTS = (
     ("lost by faults", "flights", "count", ("lost",)),
     ("cost of a fault", "mean", "s", ("cost_s", "mean")),
@@ -239,7 +239,7 @@ _OF_WORST = (
 
 
 def platform_csv(told: Row) -> str:
-    """A row a number: what it is, of which platform and setting, its unit and its interval."""
+    """One row per number: quantity, platform, setting, unit, value and interval."""
     rows = [*_setting_numbers(told["settings"]), *_ratio_numbers(told["ratios"])]
     for row in told["costs"]:
         counts = {"lost": row["pairs"] + row["lost"]}
@@ -292,8 +292,8 @@ def _numbers(
     """The listed numbers of a row.
 
     Args:
-        counts: of how many some of them are, by the first word of their place.
-        count: of how many the others are that do not say it.
+        counts: sample sizes, by the first word of a number's path.
+        count: sample size of numbers without their own.
     """
     for quantity, statistic, unit, place in listed:
         found: Any = row

@@ -1,4 +1,4 @@
-"""Model and flights side by side as text and as CSV; every number with its unit."""
+"""Comparison of model and flights as text and as CSV; every number with its unit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
 from mavfi_cli.report.tables.model import columns
 from mavfi_cli.report.tables.rows import csv_text
 
-MANY_ALARMS = 10.0  # of an error-free flight: more is not the detector's usual rate
+MANY_ALARMS = 10.0  # alarms of an error-free flight; more is not the detector's usual rate
 _NUMBERS = (
     # name, unit in the key, unit as printed, factor, digits, heading
     ("velocity", "_mps", "m/s", 1.0, 2, "Mean velocity against the model's safe velocity"),
@@ -39,7 +39,7 @@ def redundancy_lines(flights: Mapping[str, Any]) -> list[str]:
 
 
 def redundancy_csv(flights: Mapping[str, Any]) -> str:
-    """CSV text: a row a vehicle and scheme; the header names the units."""
+    """CSV text, one row per vehicle and scheme; the header names the units."""
     rows = [
         {
             "vehicle": one["vehicle"],
@@ -145,7 +145,7 @@ def _ratio(row: Mapping[str, Any], name: str, suffix: str) -> list[str]:
 
 
 def _known(text: str, value: float, otherwise: str = "-") -> str:
-    """The text of a value, where there is one: no flight succeeds, or one has no interval."""
+    """The text of a value, if it has one: without successful flights there is none."""
     return otherwise if math.isnan(value) else text
 
 

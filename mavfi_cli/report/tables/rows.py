@@ -9,10 +9,10 @@ from typing import Any
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]], names: Sequence[str] = ()) -> str:
-    """A line a row below the names of the columns.
+    """One line per row, below the names of the columns.
 
     Args:
-        names: of the columns; none takes the keys of all rows, in order.
+        names: names of the columns; None takes the keys of all rows, in order.
     """
     told = list(rows)
     keys = names or list(dict.fromkeys(key for row in told for key in row))

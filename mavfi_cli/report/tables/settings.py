@@ -1,4 +1,4 @@
-"""Settings as rows of a table: a column a label that tells them apart, the others told once."""
+"""Settings as rows of a table: a column per distinguishing label; common labels printed once."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from mavfi_cli.core.columns import blocks
 
 @dataclass(frozen=True, slots=True)
 class SettingColumns:
-    """How the labels of some settings are told.
+    """Columns and common labels of some settings.
 
     Attributes:
         keys: the labels that have a column, in order.
-        common: the other labels: each has one value, in all settings that have it.
+        common: other labels, which have one value in all settings that have them.
     """
 
     keys: tuple[str, ...]
@@ -24,9 +24,9 @@ class SettingColumns:
 
     @classmethod
     def of(cls, settings: Sequence[Mapping[str, Any]]) -> SettingColumns:
-        """The columns of settings, from their labels; without the common ones they still differ.
+        """The columns of settings, from their labels. They differ without the common ones.
 
-        A single setting has none: its name tells all.
+        A single setting has no columns, because its name is enough.
         """
         if len(settings) == 1:
             return cls((), {})
@@ -41,17 +41,17 @@ class SettingColumns:
         return cls(tuple(key for key in keys if key not in common), common)
 
     def told(self) -> list[str]:
-        """The line above a table that tells the common labels; none where there are none."""
+        """The line of common labels above a table; no line if there are none."""
         return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
 
     def table(
         self, head: Sequence[str], rows: Sequence[tuple[Mapping[str, Any], str, Sequence[str]]]
     ) -> list[str]:
-        """A line a setting, in as many tables below each other as the screen is too narrow.
+        """One line per setting, in several tables if the screen is too narrow.
 
         Args:
-            head: of the cells.
-            rows: of each setting its labels, its name in one phrase, and its cells.
+            head: head of the cells.
+            rows: labels, name and cells of each setting.
         """
         labels = [self._labels(labels, name) for labels, name, _ in rows]
         heads = list(self.keys) or ["setting"]
@@ -59,7 +59,7 @@ class SettingColumns:
         return blocks([[*heads, *head], *told], len(heads))
 
     def _labels(self, labels: Mapping[str, Any], name: str) -> list[str]:
-        """The cells of a setting's labels; the first empty one has what its name says beyond."""
+        """The cells of a setting's labels; the first empty one has the rest of its name."""
         if not self.keys:
             return [name]
         cells = _cells(labels, self.keys)
