@@ -7,7 +7,7 @@ run = mavfi.fly(
     seed=5,
     start=(2, 2, 0),
     goal=(10, 6, 5),
-    fault={"target": "waypoint_y", "field": "exponent", "seed": 4},
+    fault={"target": "waypoint_y", "field": "exponent", "seed": 1},
     detector={"name": "gad"},
 )
-print(run.result["outcome"], "with", run.result["detection"]["alarms"], "alarms")
+print(run.result["outcome"], "with", len(run.result["detection"]["alarms"]), "alarm")

@@ -2,7 +2,7 @@
 
 import mavfi_cli as mavfi
 
-fault = mavfi.FaultConfig(target="waypoint_y", field="exponent", seed=4)
+fault = mavfi.FaultConfig(target="waypoint_y", field="exponent")
 run = mavfi.fly(world="farm", seed=5, start=(2, 2, 0), goal=(10, 6, 5), fault=fault)
 golden = mavfi.paired_golden(run)
 for name, flight in (("golden", golden), ("faulty", run)):

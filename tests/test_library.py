@@ -4,12 +4,19 @@ import subprocess
 import sys
 
 import pytest
+from pyarrow import parquet
 
 import mavfi_cli as mavfi
 from mavfi_cli import library
 from mavfi_cli.core.errors import ConfigError, MissingLibrary, UnknownKey
 
 HEAVY = ("numba", "numpy", "torch", "pyarrow", "ompl", "fcl", "pymavlink", "click")
+
+
+@pytest.fixture(name="mavfi_command")
+def mavfi_command_fixture(request):
+    """The command line; its fixture has the name of the library."""
+    return request.getfixturevalue("mavfi")
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +84,7 @@ def test_a_configuration_and_settings_go_together(short_config, monkeypatch, tmp
 
 
 def test_a_wrong_setting_is_named():
-    with pytest.raises(UnknownKey, match="planer.*planner"):
+    with pytest.raises(UnknownKey, match=r"planer.*planner"):
         mavfi.fly(planer="rrt")
     with pytest.raises(UnknownKey, match=r"fault\.bit.*bits"):
         mavfi.fly(fault={"target": "planning", "bit": 3})
@@ -85,16 +92,14 @@ def test_a_wrong_setting_is_named():
         mavfi.fly(seed="3")
 
 
-def test_a_campaign_is_the_table_that_is_exported(flown_campaign, command_line, tmp_path):
+def test_a_campaign_is_the_table_that_is_exported(flown_campaign, mavfi_command, tmp_path):
     read = mavfi.campaign(flown_campaign)
     assert isinstance(read, library.Campaign)
     assert read.folder == flown_campaign
     assert read.table["outcome"].to_pylist() == ["success"]
-    code, _, err = command_line("campaign", "export", str(flown_campaign), "t.parquet")
-    assert code == 0, err
-    from pyarrow import parquet
-
-    assert parquet.read_table("t.parquet").equals(read.table)
+    done = mavfi_command("campaign", "export", flown_campaign, tmp_path / "t.parquet")
+    assert done.returncode == 0, done.stderr
+    assert parquet.read_table(tmp_path / "t.parquet").equals(read.table)
 
 
 def test_a_campaign_becomes_a_data_frame(flown_campaign):

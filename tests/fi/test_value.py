@@ -8,7 +8,7 @@ from mavfi_cli.fi.bits import NUMPY_TYPES, Field
 from mavfi_cli.fi.value import inject
 
 
-@pytest.mark.parametrize("value", [5.0, 7, True, np.float32(2.5), np.int16(3), np.bool_(False)])
+@pytest.mark.parametrize("value", [5.0, 7, True, np.float32(2.5), np.int16(3), np.bool_(0)])
 def test_a_scalar_keeps_its_type_and_twice_restores_it(value):
     struck = inject(value, seed=3)
     assert type(struck) is type(value)
