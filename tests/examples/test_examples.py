@@ -39,7 +39,7 @@ def test_an_example_runs(name, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", EXAMPLES.glob("*.ipynb"), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", list(EXAMPLES.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_the_code_of_a_notebook_runs(path, tmp_path):
     cells = json.loads(path.read_text())["cells"]
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
