@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-SOURCES := mavfi_cli sitl tests benchmarks
+SOURCES := mavfi_cli sitl tests benchmarks examples
 
 .PHONY: fly test install install-dev lint clean
 

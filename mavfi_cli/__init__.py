@@ -1,10 +1,73 @@
-"""mavfi: what a bit flip does to a flying robot, and what it costs to survive it."""
+"""mavfi: what a bit flip does to a flying robot, and what it costs to survive it.
 
+`import mavfi_cli as mavfi` is the library. Its names are imported when they are first used, so that
+the import itself and `mavfi --help` stay fast. docs/library.md shows how to use them.
+"""
+
+import importlib
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mavfi_cli.campaign.missions import PlannedMission
+    from mavfi_cli.campaign.run import run_campaign
+    from mavfi_cli.core.errors import MavfiError
+    from mavfi_cli.fi.value import inject
+    from mavfi_cli.library import campaign, fly
+    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.mission.detector_config import DetectorConfig
+    from mavfi_cli.mission.fault_config import FaultConfig
+    from mavfi_cli.mission.golden import paired_golden
+    from mavfi_cli.mission.instruction_config import InstructionConfig
+    from mavfi_cli.mission.record.run_folder import load_run
 
 try:
     __version__ = version("mavfi")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
-__all__ = ["__version__"]
+__all__ = [
+    "DetectorConfig",
+    "FaultConfig",
+    "InstructionConfig",
+    "MavfiError",
+    "MissionConfig",
+    "PlannedMission",
+    "__version__",
+    "campaign",
+    "fly",
+    "inject",
+    "load_run",
+    "paired_golden",
+    "run_campaign",
+]
+
+_MODULES = {  # name -> module that defines it; `campaign` is the package, which can be called
+    "DetectorConfig": "mavfi_cli.mission.detector_config",
+    "FaultConfig": "mavfi_cli.mission.fault_config",
+    "InstructionConfig": "mavfi_cli.mission.instruction_config",
+    "MavfiError": "mavfi_cli.core.errors",
+    "MissionConfig": "mavfi_cli.mission.config",
+    "PlannedMission": "mavfi_cli.campaign.missions",
+    "fly": "mavfi_cli.library",
+    "inject": "mavfi_cli.fi.value",
+    "load_run": "mavfi_cli.mission.record.run_folder",
+    "paired_golden": "mavfi_cli.mission.golden",
+    "run_campaign": "mavfi_cli.campaign.run",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of the library when it is first used."""
+    if name == "campaign":
+        return importlib.import_module("mavfi_cli.campaign")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the names of the library with those of the module."""
+    return sorted({*globals(), *__all__})

@@ -138,8 +138,8 @@ def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
 # The table as a file --------------------------------------------------------------------------
 
 
-def export(ledger: Ledger, path: Path) -> int:
-    """Write the table of a campaign to a .parquet or .csv file; return the number of rows.
+def export(table: pa.Table, path: Path) -> int:
+    """Write an exported table to a .parquet or .csv file; return the number of rows.
 
     Raises:
         ConfigError: the file has another suffix.
@@ -150,32 +150,31 @@ def export(ledger: Ledger, path: Path) -> int:
             f"expected a name that ends in {' or '.join(FORMATS)}, or - for CSV on stdout",
             path=path,
         )
-    found = _exported(ledger)
 
     def write(file: Any) -> None:
         """Write the table in the format of the name."""
         from pyarrow import csv, parquet
 
         if path.suffix == ".csv":
-            csv.write_csv(found, file)
+            csv.write_csv(table, file)
         else:
-            parquet.write_table(found, file, compression="zstd")
+            parquet.write_table(table, file, compression="zstd")
 
     write_atomically(path, write)
-    return int(found.num_rows)
+    return int(table.num_rows)
 
 
-def export_csv(ledger: Ledger) -> bytes:
-    """The table of a campaign as CSV."""
+def export_csv(table: pa.Table) -> bytes:
+    """Return an exported table as CSV."""
     from pyarrow import csv
 
     text = io.BytesIO()
-    csv.write_csv(_exported(ledger), text)
+    csv.write_csv(table, text)
     return text.getvalue()
 
 
-def _exported(ledger: Ledger) -> pa.Table:
-    """One row per finished mission, in the order of the list, with the labels as columns."""
+def exported(ledger: Ledger) -> pa.Table:
+    """Return one row per finished mission, in the order of the list, with the labels as columns."""
     whole = flights(ledger)
     return whole.select(
         [

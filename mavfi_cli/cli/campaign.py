@@ -127,16 +127,15 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 @click.argument("path", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
 def export(what: str, path: Path) -> None:
     """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
+    from mavfi_cli import library
     from mavfi_cli.analysis.flights import export as write
     from mavfi_cli.analysis.flights import export_csv
-    from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.ledger import Ledger
 
-    with Ledger(folder_of(what)) as ledger:
-        if path == Path("-"):
-            click.echo(export_csv(ledger), nl=False)
-        else:
-            click.echo(f"{write(ledger, path)} missions in {path}")
+    table = library.campaign(what).table
+    if path == Path("-"):
+        click.echo(export_csv(table), nl=False)
+    else:
+        click.echo(f"{write(table, path)} missions in {path}")
 
 
 @campaign.command()

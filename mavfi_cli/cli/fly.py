@@ -160,16 +160,15 @@ def fly(
 
     A mission that fails still exits with code 0, unless --expect names another outcome.
     """
+    from mavfi_cli import library
     from mavfi_cli.cli.progress import progress_view
-    from mavfi_cli.mission.record.run_folder import load_run
-    from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.report.summary import outcome_line, summary_lines
     from mavfi_cli.report.top_view import write_top_view
 
     mission = _mission_of(config)
     with progress_view(mission, quiet=quiet) as view:
-        folder = fly_mission(mission, out, view)
-    run = load_run(folder.path)
+        run = library.fly(mission, out=out, watcher=view)
+    folder = run.folder
     if picture:
         write_top_view(run, folder.picture)
     if as_json:

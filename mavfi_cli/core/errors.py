@@ -22,6 +22,7 @@ MavfiError                      a known error; printed in one line, exit code 1
 │   ├── TracingForbidden        ptrace is not permitted; says how to allow it
 │   ├── TargetError             a program that cannot be started, or ends before the trigger
 │   └── BuildMismatch           a fault record made with another build; says what differs
+├── MissingLibrary              an optional library that is not installed; says how to install it
 └── Interrupted                 the user asked to stop
 """
 
@@ -212,6 +213,13 @@ class BuildMismatch(FaultError):
 
     def __init__(self, differences: Iterable[str]) -> None:
         super().__init__(f"the record is of another build: {'; '.join(differences)}")
+
+
+class MissingLibrary(MavfiError):
+    """An optional library that is not installed. Says how to install it."""
+
+    def __init__(self, what: str, library: str, *, extra: str) -> None:
+        super().__init__(f"{what} needs {library}; install it with: pip install 'mavfi[{extra}]'")
 
 
 class Interrupted(MavfiError):

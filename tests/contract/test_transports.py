@@ -12,12 +12,11 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
-from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.codec import Codec
 from mavfi_cli.link.memory import memory_pair
 from mavfi_cli.link.transport import Transport, open_listener, open_transport
-
-Pair = tuple[Transport, Transport]
-WAIT_S = 5.0
+from mavfi_cli.testing import StreamTransportContract, TransportContract
+from mavfi_cli.testing.transports import WAIT_S, Pair, introduce, message, receive, send
 
 
 def _socket_pair() -> Iterator[Pair]:
@@ -54,7 +53,7 @@ def _tcp() -> Iterator[Pair]:
 def _listened(scheme: str, caller: str) -> Iterator[Pair]:
     listener = open_listener(f"{scheme}:127.0.0.1:0")
     far = open_transport(f"{caller}:127.0.0.1:{listener.port}")  # type: ignore[attr-defined]
-    far.send(Codec(9, 9).encode(_message(0)))
+    far.send(Codec(9, 9).encode(message(0)))
     peers: list[Transport] = []
     while not peers:
         assert _wait_readable(listener.fileno())
@@ -136,88 +135,33 @@ def pair(kind: str) -> Iterator[Pair]:
         os.close(_OPEN_TERMINALS.pop())
 
 
-def _message(number: int) -> object:
-    return dialect.MAVLink_local_position_ned_message(number, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
+@pytest.mark.parametrize("kind", STREAMS, indirect=True)
+class TestStreams(StreamTransportContract):
+    pass
 
 
-def _send(transport: Transport, codec: Codec, numbers: range) -> None:
-    transport.send(b"".join(codec.encode(_message(number)) for number in numbers))
-
-
-def _receive(transport: Transport, count: int) -> list[int]:
-    codec, numbers = Codec(7, 7), []
-    while len(numbers) < count:
-        data = transport.receive(WAIT_S)
-        assert data, f"only {numbers} came"
-        numbers += [m.time_boot_ms for m in codec.decode(data, datagram=transport.datagram)]
-    assert codec.bad_bytes == 0
-    return numbers
-
-
-def _introduce(near: Transport, far: Transport) -> None:
-    """The caller speaks first, so that a listening end knows it."""
-    _send(far, Codec(2, 2), range(1))
-    assert _receive(near, 1) == [0]
-
-
-def test_messages_arrive_in_both_directions_whole_and_in_order(pair: Pair) -> None:
-    near, far = pair
-    _introduce(near, far)
-    _send(near, Codec(1, 1), range(5))
-    assert _receive(far, 5) == list(range(5))
-    _send(far, Codec(2, 2), range(5, 10))
-    assert _receive(near, 5) == list(range(5, 10))
-
-
-def test_a_batch_larger_than_a_packet_arrives_whole(pair: Pair) -> None:
-    near, far = pair
-    _introduce(near, far)
-    _send(near, Codec(1, 1), range(80))  # 3200 bytes, more than two Ethernet packets
-    assert _receive(far, 80) == list(range(80))
-
-
-def test_nothing_to_receive_gives_no_bytes(pair: Pair) -> None:
-    near, far = pair
-    _introduce(near, far)
-    for timeout_s in (0.0, 0.01):
-        assert near.receive(timeout_s) == b""
-        assert far.receive(timeout_s) == b""
+@pytest.mark.parametrize("kind", [kind for kind in MAKERS if kind not in STREAMS], indirect=True)
+class TestOtherTransports(TransportContract):
+    pass
 
 
 @pytest.mark.parametrize("kind", WITH_DESCRIPTOR, indirect=True)
 def test_the_descriptor_becomes_readable(pair: Pair) -> None:
     near, far = pair
-    _introduce(near, far)
-    _send(near, Codec(1, 1), range(1))
+    introduce(near, far)
+    send(near, Codec(1, 1), range(1))
     assert _wait_readable(far.fileno())
-    assert _receive(far, 1) == [0]
-
-
-def test_closing_twice_is_harmless(pair: Pair) -> None:
-    for transport in pair:
-        transport.close()
-        transport.close()
+    assert receive(far, 1) == [0]
 
 
 @pytest.mark.parametrize("kind", WITH_DESCRIPTOR, indirect=True)
 def test_a_wait_without_end_is_ended_by_data(pair: Pair) -> None:
     near, far = pair
-    _introduce(near, far)
-    sender = threading.Timer(0.01, _send, (near, Codec(1, 1), range(1)))
+    introduce(near, far)
+    sender = threading.Timer(0.01, send, (near, Codec(1, 1), range(1)))
     sender.start()
     assert far.receive(float("inf"))
     sender.join()
-
-
-@pytest.mark.parametrize("kind", STREAMS, indirect=True)
-def test_a_closed_stream_is_a_lost_link_at_the_other_end(pair: Pair) -> None:
-    near, far = pair
-    _introduce(near, far)
-    _send(far, Codec(2, 2), range(3))
-    far.close()
-    assert _receive(near, 3) == [0, 1, 2]  # what was sent before still arrives
-    with pytest.raises(LinkLost):
-        near.receive(WAIT_S)
 
 
 def test_in_memory_the_other_end_acts_while_one_waits() -> None:
@@ -247,7 +191,7 @@ def test_a_udp_peer_that_is_not_there_is_no_error(pair: Pair) -> None:
     near, far = pair
     near.close()
     for _ in range(3):
-        far.send(Codec(1, 1).encode(_message(0)))
+        far.send(Codec(1, 1).encode(message(0)))
         assert far.receive(0.0) == b""
 
 
@@ -296,14 +240,14 @@ def test_several_clients_of_one_listener_are_kept_apart() -> None:
         callers = [open_transport(url) for _ in range(3)]
         peers: list[Transport] = []
         for number, client in enumerate(callers):
-            _send(client, Codec(2, 2), range(number, number + 1))
+            send(client, Codec(2, 2), range(number, number + 1))
             while len(peers) <= number:
                 assert _wait_readable(listener.fileno())
                 peers += listener.accept_ready()
         for number, (peer, client) in enumerate(zip(peers, callers, strict=True)):
-            assert _receive(peer, 1) == [number]
-            _send(peer, Codec(1, 1), range(10 + number, 11 + number))
-            assert _receive(client, 1) == [10 + number]
+            assert receive(peer, 1) == [number]
+            send(peer, Codec(1, 1), range(10 + number, 11 + number))
+            assert receive(client, 1) == [10 + number]
         for opened in (*callers, *peers, listener):
             opened.close()
 
@@ -316,7 +260,7 @@ def test_a_flood_of_udp_callers_pushes_out_the_silent_ones_only() -> None:
     callers = [open_transport(url) for _ in range(MAX_PEERS + 2)]
     peers: list[Transport] = []
     for client in callers:
-        _send(client, Codec(2, 2), range(1))
+        send(client, Codec(2, 2), range(1))
         assert _wait_readable(listener.fileno())
         peers += listener.accept_ready()
     assert [_is_lost(peer) for peer in peers] == [True, True, *[False] * MAX_PEERS]
@@ -352,7 +296,7 @@ def test_a_slow_reader_of_a_listener_loses_whole_batches_and_blocks_nobody() -> 
     (peer,) = listener.accept_ready()
     codec, sent = Codec(1, 1), 0
     for _ in range(400):
-        batch = b"".join(codec.encode(_message(number)) for number in range(1000))
+        batch = b"".join(codec.encode(message(number)) for number in range(1000))
         peer.send(batch)
         sent += 1000
     decoder, got = Codec(2, 2), 0
@@ -371,8 +315,8 @@ def test_one_peer_endpoints_serve_as_listeners_too() -> None:
     listener = open_listener(f"fd:{ends[0].detach()}")
     (peer,) = listener.accept_ready()
     assert listener.accept_ready() == []
-    _send(far, Codec(2, 2), range(1))
+    send(far, Codec(2, 2), range(1))
     assert _wait_readable(listener.fileno())
-    assert _receive(peer, 1) == [0]
+    assert receive(peer, 1) == [0]
     far.close()
     listener.close()

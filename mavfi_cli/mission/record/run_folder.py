@@ -113,12 +113,13 @@ class Run:
     trace: pa.Table | None
 
 
-def load_run(path: Path) -> Run:
+def load_run(path: str | Path) -> Run:
     """Read a run from its folder or from the path of its result.json.
 
     Raises:
         RecordError: There is no run, or it was cut off before its end or is damaged.
     """
+    path = Path(path)
     folder = RunFolder(path.parent if path.name == RESULT else path)
     if not folder.path.is_dir():
         raise RecordError(f"{path}: no such run folder")

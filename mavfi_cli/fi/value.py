@@ -1,0 +1,67 @@
+"""A bit flip in one value or in one element of an array, without a mission."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import FaultSpecError, UnknownName
+from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.fi.bits import NUMPY_TYPES, Field, Scalar, draw_bits, flip
+
+Value = TypeVar("Value", bound=Scalar | np.generic | NDArray[Any])
+
+
+def inject(
+    value: Value,
+    *,
+    bits: int = 1,
+    field: str | Field = Field.ANY,
+    seed: int = 1,
+    exact_bits: Sequence[int] | None = None,
+) -> Value:
+    """Return the value with flipped bits, or a copy of the array with one corrupted element.
+
+    The same arguments give the same flip. An injection into the result with the same seed and the
+    same bits restores the value.
+
+    Args:
+        value: Python float (binary64), int (int64) or bool, a numpy scalar, or an array of any
+            shape with dtype float64, float32, int64, int32, int16 or bool. It is not changed.
+        bits: Number of distinct bits to flip.
+        field: Field of the bits: sign, exponent, mantissa or any.
+        seed: Seed from which the element and the bits are drawn, 0 or more.
+        exact_bits: Bits to flip instead of drawn ones; bit 0 is the least significant.
+
+    Raises:
+        FaultSpecError: The type of the value is not supported, or the array is empty.
+        UnknownName: No field has this name.
+        FieldUnavailable: The type lacks the field, or the field has too few bits.
+        BitOutsideWidth: The type lacks a bit of `exact_bits`.
+    """
+    corrupted: NDArray[Any] = np.array(value)
+    kind = NUMPY_TYPES.get(corrupted.dtype.name)
+    if kind is None:
+        known = ", ".join(NUMPY_TYPES)
+        raise FaultSpecError(f"cannot flip bits of {corrupted.dtype.name}; types are {known}")
+    if corrupted.size == 0:
+        raise FaultSpecError("cannot flip bits of an array without elements")
+    rng = generator(seed, Stream.FAULT, "value")
+    element = int(rng.integers(corrupted.size))
+    chosen = exact_bits
+    if chosen is None:
+        chosen = draw_bits(rng, kind, field=_field(field), count=bits)
+    corrupted.flat[element] = flip(corrupted.flat[element].item(), chosen, kind)
+    if isinstance(value, np.ndarray):
+        return cast(Value, corrupted)
+    return cast(Value, corrupted[()] if isinstance(value, np.generic) else corrupted.item())
+
+
+def _field(name: str | Field) -> Field:
+    try:
+        return Field(name)
+    except ValueError:
+        raise UnknownName("field", str(name), [field.value for field in Field]) from None

@@ -1,0 +1,107 @@
+"""The functions behind `import mavfi_cli as mavfi` and behind the commands of the same names."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.core.errors import MissingLibrary
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.record.run_folder import Run
+
+
+def fly(
+    config: MissionConfig | None = None,
+    *,
+    out: str | Path = "runs",
+    watcher: Watcher | None = None,
+    **settings: Any,
+) -> Run:
+    """Fly one mission and return its loaded run. A mission that fails is a result, not an error.
+
+    Args:
+        config: Mission; None selects the defaults of `MissionConfig`.
+        out: Folder in which the run folder is made.
+        watcher: Receives progress and events.
+        settings: Fields of `MissionConfig` that replace those of `config`. `fault`, `instruction`
+            and `detector` are their dataclasses or mappings with the same keys.
+
+    Raises:
+        UnknownKey: `MissionConfig` does not have this setting. Names the nearest.
+        ConfigError: A setting has the wrong type or is out of range.
+        MavfiError: The mission could not begin, or its record could not be written.
+    """
+    from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.mission.run import fly_mission
+
+    folder = fly_mission(_mission(config, settings), Path(out), watcher or Watcher())
+    return load_run(folder.path)
+
+
+def _mission(config: MissionConfig | None, settings: dict[str, Any]) -> MissionConfig:
+    """Return the mission with the settings in place."""
+    from mavfi_cli.core.config import structure
+    from mavfi_cli.mission.config import MissionConfig
+
+    base = config or MissionConfig()
+    if not settings:
+        return base
+    given = {name: _plain(value) for name, value in settings.items()}
+    return structure({**asdict(base), **given}, MissionConfig)
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Campaign:
+    """A campaign read from its folder.
+
+    Attributes:
+        folder: Folder of the campaign.
+        table: One row per mission that is over, in the order of the campaign's list, with the
+            columns that `mavfi campaign export` writes.
+    """
+
+    folder: Path
+    table: pa.Table
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the table as a pandas data frame.
+
+        Raises:
+            MissingLibrary: pandas is not installed. Says how to install it.
+        """
+        try:
+            import pandas  # noqa: F401  pyarrow's own error does not say what to install
+        except ImportError:
+            raise MissingLibrary("to_pandas", "pandas", extra="pandas") from None
+        return self.table.to_pandas()
+
+
+def campaign(what: str | Path) -> Campaign:
+    """Read a campaign, also while it runs.
+
+    Args:
+        what: Folder of a campaign, or the preset or TOML file whose folder is campaigns/NAME.
+
+    Raises:
+        UnknownName: There is no such folder or preset.
+        MavfiError: The folder holds no campaign, or its records cannot be read.
+    """
+    from mavfi_cli.analysis.flights import exported
+    from mavfi_cli.campaign.begin import folder_of
+    from mavfi_cli.campaign.ledger import Ledger
+
+    folder = folder_of(str(what))
+    with Ledger(folder) as ledger:
+        return Campaign(folder=folder, table=exported(ledger))

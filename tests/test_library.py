@@ -1,0 +1,114 @@
+"""`import mavfi_cli as mavfi`: what a library's user gets."""
+
+import subprocess
+import sys
+
+import pytest
+from pyarrow import parquet
+
+import mavfi_cli as mavfi
+from mavfi_cli import library
+from mavfi_cli.core.errors import ConfigError, MissingLibrary, UnknownKey
+
+HEAVY = ("numba", "numpy", "torch", "pyarrow", "ompl", "fcl", "pymavlink", "click")
+
+
+@pytest.fixture(name="mavfi_command")
+def mavfi_command_fixture(request):
+    """The command line; its fixture has the name of the library."""
+    return request.getfixturevalue("mavfi")
+
+
+@pytest.fixture(scope="module")
+def flown_campaign(tmp_path_factory, short_config):
+    folder = tmp_path_factory.mktemp("campaign")
+    missions = [mavfi.PlannedMission(config=short_config, labels={"kind": "golden"})]
+    mavfi.run_campaign(missions, folder).close()
+    return folder
+
+
+def test_the_import_loads_nothing_heavy():
+    program = f"import sys, mavfi_cli; print([m for m in {HEAVY} if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"
+
+
+def test_every_name_is_there_and_others_are_not():
+    for name in mavfi.__all__:
+        assert getattr(mavfi, name) is not None
+        assert name in dir(mavfi)
+    with pytest.raises(AttributeError, match="no attribute 'flyy'"):
+        mavfi.flyy  # noqa: B018
+
+
+@pytest.mark.parametrize("first", ["pass", "import mavfi_cli.campaign.ledger", "mavfi.fly"])
+def test_campaign_can_be_called_whatever_was_imported_before(first, tmp_path):
+    program = (
+        f"import mavfi_cli as mavfi\n{first}\n"
+        "try: mavfi.campaign('nothing/here')\nexcept mavfi.MavfiError as error: print(error)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert "nothing/here" in done.stdout
+
+
+def test_settings_fly_what_the_configuration_flies(short_config, short_flight, tmp_path):
+    flown = mavfi.fly(
+        world="farm", seed=5, stack="hardened", start=(2, 2, 0), goal=(10, 6, 5), out=tmp_path
+    )
+    assert flown.trace.equals(mavfi.load_run(str(short_flight.path)).trace)
+    assert flown.folder.path.parent == tmp_path
+
+
+def test_a_configuration_and_settings_go_together(short_config, monkeypatch, tmp_path):
+    flown = []
+
+    class Flown(Exception):
+        pass
+
+    def fly_mission(config, out, watcher):
+        flown.append((config, out))
+        raise Flown
+
+    monkeypatch.setattr("mavfi_cli.mission.run.fly_mission", fly_mission)
+    fault = mavfi.FaultConfig(target="planning", exact_bits=(3,))
+    for given in (fault, {"target": "planning", "exact_bits": [3]}):
+        with pytest.raises(Flown):
+            mavfi.fly(short_config, v_max_mps=2, fault=given, out=tmp_path)
+    assert flown[0] == flown[1]
+    config, out = flown[0]
+    assert (config.world, config.v_max_mps, config.fault, out) == ("farm", 2.0, fault, tmp_path)
+
+
+def test_a_wrong_setting_is_named():
+    with pytest.raises(UnknownKey, match=r"planer.*planner"):
+        mavfi.fly(planer="rrt")
+    with pytest.raises(UnknownKey, match=r"fault\.bit.*bits"):
+        mavfi.fly(fault={"target": "planning", "bit": 3})
+    with pytest.raises(ConfigError, match="expected int"):
+        mavfi.fly(seed="3")
+
+
+def test_a_campaign_is_the_table_that_is_exported(flown_campaign, mavfi_command, tmp_path):
+    read = mavfi.campaign(flown_campaign)
+    assert isinstance(read, library.Campaign)
+    assert read.folder == flown_campaign
+    assert read.table["outcome"].to_pylist() == ["success"]
+    done = mavfi_command("campaign", "export", flown_campaign, tmp_path / "t.parquet")
+    assert done.returncode == 0, done.stderr
+    assert parquet.read_table(tmp_path / "t.parquet").equals(read.table)
+
+
+def test_a_campaign_becomes_a_data_frame(flown_campaign):
+    frame = mavfi.campaign(flown_campaign).to_pandas()
+    assert frame["outcome"].tolist() == ["success"]
+    assert frame["label_kind"].tolist() == ["golden"]
+
+
+def test_without_pandas_one_line_says_what_to_install(flown_campaign, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingLibrary, match=r"pip install 'mavfi\[pandas\]'"):
+        mavfi.campaign(flown_campaign).to_pandas()
