@@ -1,4 +1,4 @@
-"""The whole report as plain data: what is printed, drawn and written as JSON or CSV."""
+"""The whole report as plain data, to be printed, drawn, or written as JSON or CSV."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from mavfi_cli.vpm.sensitivity import sensitivity
 from mavfi_cli.vpm.setting import Outcome, Setting, outcome
 from mavfi_cli.vpm.vehicle import SMALLEST, Vehicle
 
-# How the latencies of a platform's kernels make one response time, and how that is told.
+# How the latencies of a platform's kernels add up to one response time, and the words for it.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
     "serial": (sum, "sum"),
     "pipelined": (max, "slowest"),
 }
-OTHER_BOARD = "tx2"  # calibrations are repeated with it: what a heavier copy would mean
+OTHER_BOARD = "tx2"  # calibrations are repeated with this heavier board
 RATIOS = ("velocity", "flight_time", "energy", "missions")
 _CURVE_HZ = np.logspace(-1.0, 3.0, 161)
 _COMMAND = "command line"
-_FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # of what a calibration sets
+_FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # units of what a calibration sets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """What the user chose; None: the vehicle's own."""
+    """The user's choices; None means the vehicle's own value."""
 
     platform: PlatformProfile | None = None
     chain: str = "serial"  # one of CHAINS
@@ -45,11 +45,11 @@ class Choices:
 def report(
     vehicles: Sequence[Vehicle], choices: Choices, schemes: tuple[Scheme, ...]
 ) -> dict[str, Any]:
-    """The model's answer for each vehicle; every key of a number names its unit or is a ratio.
+    """Compute the model's answer for each vehicle; keys of numbers but ratios name the unit.
 
     Raises:
         CannotLift: a vehicle does not lift even one board.
-        ConfigError: a vehicle lacks what the choices do not give either.
+        ConfigError: neither the vehicle nor the choices give a needed value.
     """
     return {
         "model": "F-1, IEEE CAL 19(1), equations 1 to 3",
@@ -79,10 +79,10 @@ def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dic
 
 
 def setting_of(vehicle: Vehicle, choices: Choices) -> Setting:
-    """What the model works with for a vehicle, its free number calibrated.
+    """Make the model's inputs for a vehicle with its free number calibrated.
 
     Raises:
-        ConfigError: the vehicle lacks what the choices do not give either.
+        ConfigError: neither the vehicle nor the choices give a needed value.
     """
     found = calibrated(vehicle) if vehicle.calibration else None
     return _setting(vehicle, choices, found)[0]
@@ -91,7 +91,7 @@ def setting_of(vehicle: Vehicle, choices: Choices) -> Setting:
 def _setting(
     vehicle: Vehicle, choices: Choices, found: Calibrated | None
 ) -> tuple[Setting, list[dict[str, Any]]]:
-    """The numbers that the model works with, and the list of them with their sources."""
+    """Collect the model's inputs, and list them with their sources."""
     full = found.vehicle if found else vehicle
     sources, free = dict(vehicle.sources), ""
     if found is not None and vehicle.calibration is not None:
@@ -138,7 +138,7 @@ def _setting(
 def _notes(
     vehicle: Vehicle, choices: Choices, setting: Setting, found: Calibrated | None
 ) -> list[str]:
-    """What a user who changed the computer might take for changed with it."""
+    """Name what did not change with the computer, although a user may think so."""
     notes, board = [], setting.board.name
     own_time = choices.platform is None and choices.response_s is None
     if own_time and board != vehicle.board:
@@ -201,7 +201,7 @@ def _parameters(setting: Setting, sources: dict[str, str], free: str) -> list[di
 
 
 def _row(setting: Setting, scheme: Scheme, reference: Outcome) -> dict[str, Any]:
-    """A scheme's numbers and its ratios over the reference, or why it cannot fly."""
+    """A scheme's numbers and its ratios to the reference, or why it cannot fly."""
     told = {
         "scheme": scheme.name, "title": scheme.title, "boards": scheme.copies,
         "overhead_percent": 100.0 * scheme.overhead, "source": scheme.source,
@@ -226,7 +226,7 @@ def _row(setting: Setting, scheme: Scheme, reference: Outcome) -> dict[str, Any]
 
 
 def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, Any]]:
-    """The paper's figure: with the calibration's board, and once more with a heavier one."""
+    """The paper's figure, with the calibration's board and with a heavier one."""
     if found is None:
         return []
     both = [found]
@@ -248,7 +248,7 @@ def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, 
 
 
 def _curves(setting: Setting, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
-    """Safe velocity against action throughput for one, two, three boards, where they fly."""
+    """Safe velocity against action throughput for the numbers of boards that can fly."""
     copies = sorted({scheme.copies for scheme in schemes})
     flying = [(n, setting.acceleration_mps2(n)) for n in copies]
     return {
@@ -262,7 +262,7 @@ def _curves(setting: Setting, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
 
 
 def schemes_of(told: dict[str, Any]) -> list[dict[str, Any]]:
-    """One flat row a vehicle and scheme, for CSV."""
+    """One flat row for each vehicle and scheme, for CSV."""
     return [
         {"vehicle": one["vehicle"], "board": one["board"], "distance_m": told["distance_m"], **row}
         for one in told["vehicles"]

@@ -1,4 +1,4 @@
-"""How much the answer hangs on each assumption: range, response time, board mass, board power."""
+"""Sensitivity of the answer to range, response time, board mass and board power."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mavfi_cli.vpm.schemes import REFERENCE, Scheme, named
 from mavfi_cli.vpm.setting import Setting
 
 FACTORS = (0.5, 0.8, 1.25, 2.0)
-_STEP = 1.001  # of the derivative
+_STEP = 1.001  # factor of the numerical derivative
 
 
 def _with_range(setting: Setting, factor: float) -> Setting:
@@ -39,12 +39,12 @@ _PARAMETERS: dict[str, tuple[str, Callable[[Setting], float], Callable[..., Sett
 
 
 def sensitivity(setting: Setting, schemes: tuple[Scheme, ...]) -> list[dict[str, Any]]:
-    """One row a parameter: the answer at each factor, and its elasticity at the middle.
+    """One row for each parameter: the answer at each factor, and its elasticity at factor 1.
 
-    An elasticity is d ln(answer) / d ln(parameter): by how many per cent the answer changes for
-    one per cent of the parameter. Answers are the safe velocity with the reference scheme and
-    the flight time with TMR over that with the reference; None where the vehicle cannot fly.
-    Power changes the mass of the heat sink with it.
+    An elasticity is d ln(answer) / d ln(parameter): the change of the answer in per cent for one
+    per cent of the parameter. The answers are the safe velocity with the reference scheme, and
+    the flight time with TMR over that with the reference. They are None if the vehicle cannot
+    fly. Power also changes the mass of the heat sink.
     """
     rows = []
     for name, (unit, value, scaled) in _PARAMETERS.items():

@@ -1,7 +1,7 @@
 """The compiled single-step loop: a step costs little more than its system calls.
 
 The loop returns to Python for code out of scope, a system call, a push of the flags or a signal.
-`ptrace` and `wait4` are resolved by name in the running process, so the compiled loop can be cached.
+`ptrace` and `wait4` are resolved by name at run time, so the compiled loop can be cached.
 """
 
 from __future__ import annotations
