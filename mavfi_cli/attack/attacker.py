@@ -17,7 +17,7 @@ from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.alarm import Alarm
+from mavfi_cli.fi.tracer.alarm import ProcessTimer
 from mavfi_cli.fi.tracer.fault import InstructionFault, Stage
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import (
@@ -82,7 +82,7 @@ class Attacker:
         try:
             hits = sum(stage.count for stage in fault.trigger)
             wall_s = self._wall_limit_s + hits * _HIT_LIMIT_S
-            with Alarm(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
+            with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
                 reason = reach(tracee, self.place.image(tracee), fault)
             if reason:
                 return self._result(start, tracee.ended, fault, None, NOTHING, reason)
@@ -111,10 +111,10 @@ class Attacker:
         limits = self.place.limits
         return limits.factor * self.golden.wall_s + limits.wall_grace_s
 
-    def _deadline(self, tracee: Tracee) -> AbstractContextManager[Alarm]:
+    def _deadline(self, tracee: Tracee) -> AbstractContextManager[ProcessTimer]:
         limits = self.place.limits
         cpu_s = limits.factor * self.golden.cpu_s + limits.cpu_grace_s
-        return Alarm(tracee.pid, signal.SIGKILL, cpu_s=cpu_s, wall_s=self._wall_limit_s)
+        return ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=cpu_s, wall_s=self._wall_limit_s)
 
     def _fault_at_moment(
         self, tracee: Tracee, plan: Strategy, rng: np.random.Generator, moment_s: float
@@ -122,7 +122,7 @@ class Attacker:
         image, cpu = self.place.image(tracee), plan.rule is Rule.CPU_TIME
         scope, reason = self.place.scope(image), ""
         for _ in range(plan.attempts):
-            alarm = Alarm(
+            alarm = ProcessTimer(
                 tracee.pid,
                 signal.SIGTRAP,
                 cpu_s=moment_s if cpu else None,

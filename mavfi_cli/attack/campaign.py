@@ -18,7 +18,7 @@ from mavfi_cli.attack.journal import Journal
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.profile import TargetProfile, steps_told
 from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace
-from mavfi_cli.attack.workers import Bench, Workers, one_processor
+from mavfi_cli.attack.workers import AttackWorkers, Bench, one_processor
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.sampling import Rule
 
@@ -70,14 +70,14 @@ def run_campaign(
     if folder is not None:
         names = [target.stream[0] for target in targets if target.stream]
         journal = Journal(folder, plan.to_json(targets[0]), runs=plan.runs, kernels=names or None)
-    with Workers(jobs) as workers:
+    with AttackWorkers(jobs) as workers:
         return [_attack(plan, each, workers, journal, progress, stage) for each in targets]
 
 
 def _attack(
     plan: Plan,
     target: AttackTarget,
-    workers: Workers,
+    workers: AttackWorkers,
     journal: Journal | None,
     progress: Progress,
     stage: Stage,

@@ -93,14 +93,14 @@ def _settle(queue: Any) -> None:
     os.sched_setaffinity(0, [queue.get()])
 
 
-class Workers:
+class AttackWorkers:
     """The workers of one campaign, or this process if one is enough; a context manager."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
         self._pool: ProcessPoolExecutor | None = None
 
-    def __enter__(self) -> Workers:
+    def __enter__(self) -> AttackWorkers:
         if self._jobs > 1:
             context = multiprocessing.get_context("spawn")
             processors, queue = sorted(os.sched_getaffinity(0)), context.Queue()

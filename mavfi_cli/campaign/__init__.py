@@ -1,1 +1,1 @@
-"""Many runs instead of one: isolated kernels, and missions by the thousand."""
+"""Campaigns: planned lists of missions with a ledger of their results."""

@@ -10,8 +10,8 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.vpm.board import Board, load_board
 from mavfi_cli.vpm.model import GRAVITY_MPS2
 from mavfi_cli.vpm.schemes import REFERENCE, SCHEMES, named
-from mavfi_cli.vpm.setting import Setting
-from mavfi_cli.vpm.vehicle import Vehicle
+from mavfi_cli.vpm.setting import ModelInputs
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 _SPAN = 1.0e4  # ratio of the largest to the smallest tried value
 _STEPS = 200  # halvings of the interval; far below a float's resolution
@@ -21,7 +21,7 @@ _STEPS = 200  # halvings of the interval; far below a float's resolution
 class Calibrated:
     """A vehicle with its calibrated number, and the resulting ratios of flight times."""
 
-    vehicle: Vehicle
+    vehicle: ModelVehicle
     board: Board
     parameter: str
     value: float  # in the unit of the parameter
@@ -30,7 +30,7 @@ class Calibrated:
     dmr_ratio: float  # a prediction, not fitted
 
 
-def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
+def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated:
     """Find the vehicle's free number that gives its published ratio.
 
     The ratio falls as the free number grows, so bisection finds it.
@@ -48,7 +48,7 @@ def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
     board = board or load_board(plan.board)
     known = {scheme.name: scheme for scheme in SCHEMES}
 
-    def setting(value: float) -> Setting:
+    def setting(value: float) -> ModelInputs:
         """The vehicle with a trial value of the parameter."""
         pull_n, compute_s = vehicle.rotor_pull_n, vehicle.response_s
         if plan.parameter == "rotor_pull_n":
@@ -58,7 +58,7 @@ def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
         full = replace(vehicle, calibration=None, rotor_pull_n=pull_n, response_s=compute_s)
         assert pull_n is not None  # the vehicle has the number that is not calibrated
         assert compute_s is not None
-        return Setting(
+        return ModelInputs(
             vehicle=full, board=board, pull_n=pull_n, range_m=full.range_m,
             compute_s=compute_s, distance_m=1.0,
         )  # fmt: skip

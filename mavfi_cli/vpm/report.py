@@ -15,8 +15,8 @@ from mavfi_cli.vpm.calibrate import Calibrated, calibrated
 from mavfi_cli.vpm.model import KNEE_SHARE, safe_velocity_mps
 from mavfi_cli.vpm.schemes import REFERENCE, Scheme, named, unlike_sources
 from mavfi_cli.vpm.sensitivity import sensitivity
-from mavfi_cli.vpm.setting import Outcome, Setting, outcome
-from mavfi_cli.vpm.vehicle import SMALLEST, Vehicle
+from mavfi_cli.vpm.setting import ModelInputs, SchemePerformance, outcome
+from mavfi_cli.vpm.vehicle import SMALLEST, ModelVehicle
 
 # How the latencies of a platform's kernels add up to one response time, and the words for it.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
@@ -43,7 +43,7 @@ class Choices:
 
 
 def report(
-    vehicles: Sequence[Vehicle], choices: Choices, schemes: tuple[Scheme, ...]
+    vehicles: Sequence[ModelVehicle], choices: Choices, schemes: tuple[Scheme, ...]
 ) -> dict[str, Any]:
     """Compute the model's answer for each vehicle; keys of numbers but ratios name the unit.
 
@@ -61,7 +61,7 @@ def report(
     }
 
 
-def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
+def _one(vehicle: ModelVehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
     found = calibrated(vehicle) if vehicle.calibration else None
     setting, parameters = _setting(vehicle, choices, found)
     reference = outcome(setting, named(schemes, REFERENCE))
@@ -78,7 +78,7 @@ def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dic
     }
 
 
-def setting_of(vehicle: Vehicle, choices: Choices) -> Setting:
+def setting_of(vehicle: ModelVehicle, choices: Choices) -> ModelInputs:
     """Make the model's inputs for a vehicle with its free number calibrated.
 
     Raises:
@@ -89,8 +89,8 @@ def setting_of(vehicle: Vehicle, choices: Choices) -> Setting:
 
 
 def _setting(
-    vehicle: Vehicle, choices: Choices, found: Calibrated | None
-) -> tuple[Setting, list[dict[str, Any]]]:
+    vehicle: ModelVehicle, choices: Choices, found: Calibrated | None
+) -> tuple[ModelInputs, list[dict[str, Any]]]:
     """Collect the model's inputs, and list them with their sources."""
     full = found.vehicle if found else vehicle
     sources, free = dict(vehicle.sources), ""
@@ -124,7 +124,7 @@ def _setting(
     if choices.range_m is not None:
         sources["range_m"] = _COMMAND
     assert full.rotor_pull_n is not None
-    setting = Setting(
+    setting = ModelInputs(
         vehicle=replace(full, response_s=compute_s, range_m=choices.range_m or full.range_m),
         board=board,
         pull_n=full.rotor_pull_n,
@@ -136,7 +136,7 @@ def _setting(
 
 
 def _notes(
-    vehicle: Vehicle, choices: Choices, setting: Setting, found: Calibrated | None
+    vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: Calibrated | None
 ) -> list[str]:
     """Name what did not change with the computer, although a user may think so."""
     notes, board = [], setting.board.name
@@ -155,7 +155,7 @@ def _notes(
     return notes
 
 
-def _other_calibration(vehicle: Vehicle, board: Board, found: Calibrated) -> str:
+def _other_calibration(vehicle: ModelVehicle, board: Board, found: Calibrated) -> str:
     unit = _FREE_UNITS[found.parameter]
     told = (
         f"{found.parameter} = {found.value:.4g} {unit} is calibrated with board {found.board.name}"
@@ -169,7 +169,7 @@ def _other_calibration(vehicle: Vehicle, board: Board, found: Calibrated) -> str
     return f"{told}; with board {board.name} it would be {other.value:.4g} {unit}"
 
 
-def _board(vehicle: Vehicle, choices: Choices) -> Board:
+def _board(vehicle: ModelVehicle, choices: Choices) -> Board:
     if choices.board is not None:
         return choices.board
     if choices.platform is not None:
@@ -180,7 +180,7 @@ def _board(vehicle: Vehicle, choices: Choices) -> Board:
     return load_board(vehicle.board)
 
 
-def _parameters(setting: Setting, sources: dict[str, str], free: str) -> list[dict[str, Any]]:
+def _parameters(setting: ModelInputs, sources: dict[str, str], free: str) -> list[dict[str, Any]]:
     units = {
         "mass_kg": "kg", "rotor_pull_n": "N", "tilt_deg": "deg", "range_m": "m",
         "sensor_hz": "Hz", "response_s": "s", "hover_power_w": "W", "battery_wh": "Wh",
@@ -200,13 +200,13 @@ def _parameters(setting: Setting, sources: dict[str, str], free: str) -> list[di
     return rows
 
 
-def _row(setting: Setting, scheme: Scheme, reference: Outcome) -> dict[str, Any]:
+def _row(setting: ModelInputs, scheme: Scheme, reference: SchemePerformance) -> dict[str, Any]:
     """A scheme's numbers and its ratios to the reference, or why it cannot fly."""
     told = {
         "scheme": scheme.name, "title": scheme.title, "boards": scheme.copies,
         "overhead_percent": 100.0 * scheme.overhead, "source": scheme.source,
     }  # fmt: skip
-    numbers = [key.name for key in fields(Outcome) if key.name not in ("scheme", "bound")]
+    numbers = [key.name for key in fields(SchemePerformance) if key.name not in ("scheme", "bound")]
     if setting.velocity_mps(scheme) is None:
         nothing = dict.fromkeys([*numbers, *(f"{name}_ratio" for name in RATIOS), "bound"])
         weights = {"mass_kg": setting.mass_kg(scheme.copies),
@@ -225,7 +225,7 @@ def _row(setting: Setting, scheme: Scheme, reference: Outcome) -> dict[str, Any]
     }
 
 
-def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, Any]]:
+def _calibrations(vehicle: ModelVehicle, found: Calibrated | None) -> list[dict[str, Any]]:
     """The paper's figure, with the calibration's board and with a heavier one."""
     if found is None:
         return []
@@ -247,7 +247,7 @@ def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, 
     ]
 
 
-def _curves(setting: Setting, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
+def _curves(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
     """Safe velocity against action throughput for the numbers of boards that can fly."""
     copies = sorted({scheme.copies for scheme in schemes})
     flying = [(n, setting.acceleration_mps2(n)) for n in copies]

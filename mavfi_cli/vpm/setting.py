@@ -16,7 +16,7 @@ from mavfi_cli.vpm.model import (
     safe_velocity_mps,
 )
 from mavfi_cli.vpm.schemes import Scheme
-from mavfi_cli.vpm.vehicle import Vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 _J_PER_WH = 3600.0
 
@@ -30,10 +30,10 @@ class Bound(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setting:
+class ModelInputs:
     """The model's inputs for one vehicle with its computer."""
 
-    vehicle: Vehicle
+    vehicle: ModelVehicle
     board: Board
     pull_n: float
     range_m: float
@@ -75,7 +75,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class SchemePerformance:
     """Performance with a scheme, for hovering power and a straight path."""
 
     scheme: Scheme
@@ -97,7 +97,7 @@ class Outcome:
     missions: float  # missions for each battery charge, not rounded
 
 
-def outcome(setting: Setting, scheme: Scheme) -> Outcome:
+def outcome(setting: ModelInputs, scheme: Scheme) -> SchemePerformance:
     """Compute the performance of a vehicle with a scheme.
 
     Raises:
@@ -113,7 +113,7 @@ def outcome(setting: Setting, scheme: Scheme) -> Outcome:
     power_w = rotors_w + copies * setting.board.power_w
     time_s = setting.distance_m / velocity
     slower = Bound.SENSOR if 1.0 / vehicle.sensor_hz > compute_s else Bound.COMPUTE
-    return Outcome(
+    return SchemePerformance(
         scheme=scheme,
         mass_kg=mass_kg,
         compute_kg=setting.carried_kg(copies),

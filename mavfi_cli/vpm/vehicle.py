@@ -32,7 +32,7 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Vehicle:
+class ModelVehicle:
     """A quadrotor of the model; a number is None until it has been calibrated."""
 
     name: str
@@ -90,11 +90,11 @@ def vehicle_names() -> list[str]:
     return shipped_names(_FOLDER)
 
 
-def load_vehicle(name_or_path: str) -> Vehicle:
+def load_vehicle(name_or_path: str) -> ModelVehicle:
     """A shipped vehicle of the model by name, or a user's own by the path of its TOML file.
 
     Raises:
         UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
         ConfigError: the file cannot be used.
     """
-    return load_shipped("vehicle", name_or_path, _FOLDER, Vehicle)
+    return load_shipped("vehicle", name_or_path, _FOLDER, ModelVehicle)

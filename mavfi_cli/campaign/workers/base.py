@@ -9,7 +9,7 @@ from typing import Any, Self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ended:
+class AttemptEnd:
     """How one attempt at a mission ended.
 
     Attributes:
@@ -64,7 +64,7 @@ class Workers(ABC):
         """Start a mission that has `limit_s` of wall time."""
 
     @abstractmethod
-    def wait(self, timeout_s: float) -> list[Ended]:
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
         """The missions that ended, waiting for news or the time-out."""
 
     @abstractmethod

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.workers.base import Assignment, Ended, Workers
+from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd, Workers
 from mavfi_cli.campaign.workers.local import TASK
 from mavfi_cli.campaign.workers.remote import Answer, Order, fly, unpack, worker_versions
 from mavfi_cli.core.errors import MavfiError
@@ -84,7 +84,7 @@ class Cluster(Workers):
         self._futures[number] = (future, Path(mission.out))
         future.add_done_callback(lambda _future: self._done.put(number))
 
-    def wait(self, timeout_s: float) -> list[Ended]:
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
         """The missions that came back."""
         numbers = []
         with contextlib.suppress(queue.Empty):
@@ -93,15 +93,15 @@ class Cluster(Workers):
                 numbers.append(self._done.get_nowait())
         return [self._taken(number) for number in numbers]
 
-    def _taken(self, number: int) -> Ended:
+    def _taken(self, number: int) -> AttemptEnd:
         future, out = self._futures.pop(number)
         if future.status != "finished":
-            return Ended(number=number, lost=f"lost by the cluster: {future.exception()}")
+            return AttemptEnd(number=number, lost=f"lost by the cluster: {future.exception()}")
         answer: Answer = future.result()
         if answer.ended is None:
             raise ClusterError(f"a worker has other versions: {answer.refused}")
         unpack(answer.files, out)
-        return Ended(**answer.ended)
+        return AttemptEnd(**answer.ended)
 
     def close(self) -> None:
         """Take back what was not begun; what flies on a worker ends there, and nobody hears it."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.workers.base import Assignment, Ended, Workers
+from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd, Workers
 from mavfi_cli.core.fork_server import PACKET, ForkServer
 
 TASK = "mavfi_cli.campaign.workers.task"
@@ -51,7 +51,7 @@ class LocalWorkers(Workers):
         self._number[channel] = mission.number
         self.running[mission.number] = 0
 
-    def wait(self, timeout_s: float) -> list[Ended]:
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
         """The missions that ended, waiting for at least one word of a guard or the time-out."""
         ended = []
         for key, _ in self._selector.select(timeout_s):
@@ -62,7 +62,7 @@ class LocalWorkers(Workers):
             if said is not None and "pid" in said:
                 self.running[number] = said["pid"]
                 continue
-            ended.append(Ended(number=number, **(said or {})))
+            ended.append(AttemptEnd(number=number, **(said or {})))
             self._release(channel)
         return ended
 

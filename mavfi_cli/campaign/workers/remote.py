@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.workers.base import Assignment, Ended
+from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd
 from mavfi_cli.campaign.workers.local import LocalWorkers
 from mavfi_cli.core.fork_server import SCRATCH
 from mavfi_cli.mission.record.run_folder import FAULT, RESULT
@@ -75,7 +75,7 @@ def fly(order: Order) -> Answer:
         workers = _workers(order.task)
         mission = Assignment(number=order.number, changes=order.changes, out=str(place))
         workers.start(mission, order.limit_s)
-        ended: list[Ended] = []
+        ended: list[AttemptEnd] = []
         while not ended:
             ended = workers.wait(60.0)
         return Answer(ended=asdict(ended[0]), files=_packed(place, order))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.outcome import State
-from mavfi_cli.campaign.workers.base import Ended
+from mavfi_cli.campaign.outcome import ResultState
+from mavfi_cli.campaign.workers.base import AttemptEnd
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.fork_server import ERRORS, SCRATCH
 from mavfi_cli.core.types import Outcome
@@ -43,14 +43,14 @@ class Verdict:
         doubtful: there is a record, but something outside had a hand in it.
     """
 
-    state: State | None
+    state: ResultState | None
     result: Mapping[str, Any]
     reason: str
     run: Path | None = None
     doubtful: bool = False
 
 
-def judge(ended: Ended, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
+def judge(ended: AttemptEnd, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
     """What the end of an attempt means.
 
     Args:
@@ -79,7 +79,7 @@ def judge(ended: Ended, out: Path, config: Mapping[str, Any], limit_s: float) ->
             return Verdict(state=None, result={}, reason=f"killed by {name}")
         return _cut_off(Outcome.CRASH, f"the companion was killed by {name}", out, config)
     if "traceback" in report:  # a defect of ours; who reads the ledger sees where
-        return Verdict(state=State.ERROR, result={}, reason=report["traceback"].rstrip())
+        return Verdict(state=ResultState.ERROR, result={}, reason=report["traceback"].rstrip())
     return _cut_off(Outcome.CRASH, f"the companion ended with code {ended.exit}", out, config)
 
 
@@ -107,7 +107,9 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
             reason = "the vehicle died before it had saved the truth"
             return Verdict(state=None, result={}, reason=reason)
     doubts = [how for how in crashes if how.endswith(_OUTSIDE_WORDS)]
-    return Verdict(state=State.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts))
+    return Verdict(
+        state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts)
+    )
 
 
 def _refused(kind: str, text: str) -> Verdict:
@@ -118,7 +120,7 @@ def _refused(kind: str, text: str) -> Verdict:
         return Verdict(state=None, result={}, reason="interrupted")
     if kind in _BY_CHANCE and text.endswith(_OUTSIDE_WORDS):
         return Verdict(state=None, result={}, reason=text)
-    return Verdict(state=State.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
+    return Verdict(state=ResultState.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
 
 
 def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]) -> Verdict:
@@ -140,4 +142,4 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]
         "quality_of_flight": {},
         "fault": fault,
     }
-    return Verdict(state=State.FLOWN, result=result, reason=reason, run=run)
+    return Verdict(state=ResultState.FLOWN, result=result, reason=reason, run=run)

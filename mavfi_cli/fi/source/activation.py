@@ -1,7 +1,7 @@
 """Activation of a source-level fault: whether a corrupted value was read before it was replaced.
 
 A flip in a value that nobody reads is not a fault that the system survived. The two are told apart
-with the words of the instruction level (`fi.tracer.inject.Activation`).
+with the words of the instruction level (`fi.tracer.inject.BitActivation`).
 """
 
 from __future__ import annotations

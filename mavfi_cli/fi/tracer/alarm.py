@@ -15,7 +15,7 @@ from types import TracebackType
 from mavfi_cli.fi.tracer import linux
 
 
-class Alarm:
+class ProcessTimer:
     """A timer on one process; leaving its context cancels it.
 
     It fires when the process has used `cpu_s` of CPU time since the timer was set, or when
@@ -34,7 +34,7 @@ class Alarm:
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
-    def __enter__(self) -> Alarm:
+    def __enter__(self) -> ProcessTimer:
         self._thread.start()
         return self
 

@@ -50,7 +50,7 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Corruption:
+class InstructionCorruption:
     """The inverted bits, relative to one execution of one instruction."""
 
     site: Site
@@ -69,7 +69,7 @@ class InstructionFault:
     execution: int  # k: number of the execution in the profiled scope, from 1
     instruction: str
     instruction_bytes: bytes
-    corruption: Corruption | None  # None: null injection, everything but the flip
+    corruption: InstructionCorruption | None  # None: null injection, everything but the flip
 
     @property
     def target(self) -> Location:
@@ -133,7 +133,7 @@ class _Candidate:
 
 def draw_corruption(
     instruction: Instruction, model: FaultModel, rng: np.random.Generator
-) -> Corruption | None:
+) -> InstructionCorruption | None:
     """Draw an operand of the instruction uniformly, then distinct bits of it uniformly.
 
     Returns:
@@ -149,7 +149,7 @@ def draw_corruption(
     chosen = candidates[int(rng.integers(len(candidates)))]
     available = bits.bits_of(chosen.mask)
     picked = rng.choice(len(available), size=model.count, replace=False)
-    return Corruption(
+    return InstructionCorruption(
         site=chosen.site,
         role=chosen.role,
         register=chosen.register,
@@ -164,7 +164,7 @@ def site_of(register: str) -> Site:
     return Site(register_kind(register))
 
 
-def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> Corruption:
+def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> InstructionCorruption:
     """Make the corruption that the user names.
 
     Raises:
@@ -177,7 +177,7 @@ def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> Co
         raise FaultError(f"no register {register!r} on this processor") from None
     if not 0 <= bit < width:
         raise BitOutsideWidth(bit, register, width)
-    return Corruption(
+    return InstructionCorruption(
         site=site_of(register), role=role, register=register, operand=register, bits=(bit,)
     )
 

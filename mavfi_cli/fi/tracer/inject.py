@@ -16,12 +16,12 @@ from mavfi_cli.fi.tracer.arch import (
     erase_trap,
     width_of,
 )
-from mavfi_cli.fi.tracer.fault import Corruption, InstructionFault, Role, Site
+from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee, Trap
 
 
-class Activation(Enum):
+class BitActivation(Enum):
     """What happened to the corrupted bits within the followed window."""
 
     READ = "read"
@@ -48,12 +48,12 @@ class Injection:
 class Followed:
     """The activation, and the instruction that decided it."""
 
-    activation: Activation
+    activation: BitActivation
     after_instructions: int  # 0: the attacked instruction itself
     instruction: str = ""
 
 
-NOTHING = Followed(activation=Activation.NOT_INJECTED, after_instructions=0)
+NOTHING = Followed(activation=BitActivation.NOT_INJECTED, after_instructions=0)
 
 
 def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
@@ -89,7 +89,7 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
     return result
 
 
-def apply(tracee: Tracee, instruction: Instruction, corruption: Corruption) -> Injection:
+def apply(tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption) -> Injection:
     """Invert the bits at the stop in front of `instruction`.
 
     A destination is corrupted after the instruction has executed. The result is read back: a
@@ -126,7 +126,7 @@ def _not_applied(reason: str, place: int, value: int, start: int) -> Injection:
 
 
 def _invert(
-    tracee: Tracee, instruction: Instruction, corruption: Corruption, place: int
+    tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption, place: int
 ) -> tuple[int, int]:
     if corruption.site is Site.OPCODE:
         return _execute_corrupted(tracee, instruction, corruption)
@@ -143,7 +143,7 @@ def _invert(
 
 
 def _execute_corrupted(
-    tracee: Tracee, instruction: Instruction, corruption: Corruption
+    tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption
 ) -> tuple[int, int]:
     """Execute the corrupted bytes once, then restore the code: a transient fetch error."""
     corrupted = bits.flip_bytes(instruction.raw, corruption.bits)
@@ -162,7 +162,7 @@ def _number(data: bytes) -> int:
 def follow(
     tracee: Tracee,
     instruction: Instruction,
-    corruption: Corruption,
+    corruption: InstructionCorruption,
     injection: Injection,
     *,
     window: int,
@@ -172,7 +172,7 @@ def follow(
         return NOTHING
     if corruption.role is Role.SOURCE or corruption.site is Site.INSTRUCTION_POINTER:
         return Followed(
-            activation=Activation.READ, after_instructions=0, instruction=instruction.text
+            activation=BitActivation.READ, after_instructions=0, instruction=instruction.text
         )
     remaining = bits.mask_of(corruption.bits, bits.raw(TRAITS.vector_bits))
     for distance in range(1, window + 1):
@@ -181,11 +181,11 @@ def follow(
             break
         read, remaining = _touch(tracee, current, corruption, injection.address, remaining)
         if read or not remaining:
-            what = Activation.READ if read else Activation.OVERWRITTEN
+            what = BitActivation.READ if read else BitActivation.OVERWRITTEN
             return Followed(activation=what, after_instructions=distance, instruction=current.text)
         if isinstance(clean_step(tracee, current), Ended):
-            return Followed(activation=Activation.ENDED_BEFORE_READ, after_instructions=distance)
-    what = Activation.NOT_READ_IN_WINDOW if window else Activation.NOT_FOLLOWED
+            return Followed(activation=BitActivation.ENDED_BEFORE_READ, after_instructions=distance)
+    what = BitActivation.NOT_READ_IN_WINDOW if window else BitActivation.NOT_FOLLOWED
     return Followed(activation=what, after_instructions=window)
 
 
@@ -214,7 +214,11 @@ def strike(
 
 
 def _touch(
-    tracee: Tracee, current: Instruction, corruption: Corruption, place: int, remaining: int
+    tracee: Tracee,
+    current: Instruction,
+    corruption: InstructionCorruption,
+    place: int,
+    remaining: int,
 ) -> tuple[bool, int]:
     """Tell whether an instruction reads the remaining bits, and which it leaves."""
     if corruption.site is Site.MEMORY:

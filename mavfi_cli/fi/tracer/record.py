@@ -14,7 +14,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import write_text
-from mavfi_cli.fi.tracer.fault import Corruption, InstructionFault, Role, Site, Stage
+from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site, Stage
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
 
@@ -53,7 +53,7 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
     }
 
 
-def corruption_to_json(corruption: Corruption | None) -> dict[str, Any] | None:
+def corruption_to_json(corruption: InstructionCorruption | None) -> dict[str, Any] | None:
     """The corruption part of a record; null for a null injection."""
     if corruption is None:
         return None
@@ -113,9 +113,9 @@ def fault_of(record: Mapping[str, Any]) -> InstructionFault:
         raise RecordError(f"the fault record is damaged: {error!r}") from None
 
 
-def corruption_of(data: Mapping[str, Any]) -> Corruption:
+def corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
     """The corruption part of a record, read back."""
-    return Corruption(
+    return InstructionCorruption(
         site=Site(data["site"]),
         role=Role(data["role"]),
         register=data["register"],

@@ -11,8 +11,8 @@ import numpy as np
 from mavfi_cli.core.errors import FaultError, UnknownName
 from mavfi_cli.fi.tracer.arch import Instruction, decode
 from mavfi_cli.fi.tracer.fault import (
-    Corruption,
     FaultModel,
+    InstructionCorruption,
     InstructionFault,
     Site,
     draw_corruption,
@@ -41,11 +41,13 @@ class Strategy:
     retry_s: float = 0.0  # time rules: how much later
     whole_process: bool = False  # hits code out of scope as well
     in_system_calls: bool = False  # hits a thread that waits in the operating system as well
-    bit_of: Callable[[Corruption, np.random.Generator], Corruption] = field(
+    bit_of: Callable[[InstructionCorruption, np.random.Generator], InstructionCorruption] = field(
         default=lambda corruption, _rng: corruption
     )
 
-    def draw_at(self, instruction: Instruction, rng: np.random.Generator) -> Corruption | None:
+    def draw_at(
+        self, instruction: Instruction, rng: np.random.Generator
+    ) -> InstructionCorruption | None:
         """Draw a corruption at a stop; None gives up this moment."""
         drawn = draw_corruption(instruction, self.model, rng)
         if drawn is None or drawn.operand in self.refused:
@@ -60,7 +62,9 @@ _ROSFI_REFUSED = frozenset(
 )
 
 
-def _rosfi_bit(corruption: Corruption, rng: np.random.Generator) -> Corruption:
+def _rosfi_bit(
+    corruption: InstructionCorruption, rng: np.random.Generator
+) -> InstructionCorruption:
     """Move bits 52 to 62 (110 to 126 of XMM) to byte 0, where ROSFI writes them."""
     wide = corruption.site is Site.VECTOR
     bit = int(rng.integers(110, 127) if wide else rng.integers(52, 63))

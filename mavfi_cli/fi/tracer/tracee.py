@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.alarm import Alarm
+from mavfi_cli.fi.tracer.alarm import ProcessTimer
 from mavfi_cli.fi.tracer.arch import DebugBreakpoint, Registers
 from mavfi_cli.fi.tracer.breakpoints import (
     SI_KERNEL,
@@ -112,7 +112,7 @@ class Tracee:
         """Run until our own trap stops the target thread, or to the end."""
         return self._go(linux.CONT)
 
-    def resume_until_alarm(self, alarm: Alarm) -> Trap | Ended:
+    def resume_until_alarm(self, alarm: ProcessTimer) -> Trap | Ended:
         """Run until `alarm` sends its SIGTRAP, which is not delivered to the program."""
         self._expecting_alarm = True
         try:

@@ -121,7 +121,7 @@ def plan_fault(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Invocation:
+class KernelInvocation:
     """One invocation of a kernel, and the entry with which it begins."""
 
     number: int  # number of the kernel's invocation, from 1
@@ -131,7 +131,7 @@ class Invocation:
     earlier: int  # entries in the earlier orders
 
 
-def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> Invocation:
+def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> KernelInvocation:
     """Draw one invocation of a kernel uniformly from the entries up to each order.
 
     Each entry is an invocation, except for a planner node. It is entered each time it builds an
@@ -151,7 +151,7 @@ def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) 
         which, of = int(rng.integers(len(orders))), len(orders)
         order, number = int(orders[which]), which + 1
         entry = int(before[order]) + 1
-    return Invocation(
+    return KernelInvocation(
         number=number, of=of, order=order + 1, entry=entry, earlier=int(before[order])
     )
 
