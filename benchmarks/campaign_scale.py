@@ -99,7 +99,8 @@ def fill(folder: Path, rows: int) -> None:
             database.execute(
                 "INSERT INTO results VALUES (?, ?, ?, '', ?, ?, ?, ?, ?, ?, ?, ?, ?, 1, NULL)",
                 (
-                    number, ResultState.FLOWN.value, "success" if rng.random() < 0.9 else "collision",
+                    number, ResultState.FLOWN.value,
+                    "success" if rng.random() < 0.9 else "collision",
                     (Injected.GOLDEN if golden else Injected.ACTIVE).value,
                     time_s, 2.5 * time_s, 540.0 * time_s, 100.0 * time_s, 1.0,
                     int(rng.integers(5)), time_s + 10.0, 3.0,
