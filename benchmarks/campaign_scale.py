@@ -23,7 +23,7 @@ from mavfi_cli.analysis.summary import summarise
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.run import Options, run_campaign, store_plan
 from mavfi_cli.mission.config import MissionConfig
@@ -99,7 +99,8 @@ def fill(folder: Path, rows: int) -> None:
             database.execute(
                 "INSERT INTO results VALUES (?, ?, ?, '', ?, ?, ?, ?, ?, ?, ?, ?, ?, 1, NULL)",
                 (
-                    number, State.FLOWN.value, "success" if rng.random() < 0.9 else "collision",
+                    number, ResultState.FLOWN.value,
+                    "success" if rng.random() < 0.9 else "collision",
                     (Injected.GOLDEN if golden else Injected.ACTIVE).value,
                     time_s, 2.5 * time_s, 540.0 * time_s, 100.0 * time_s, 1.0,
                     int(rng.integers(5)), time_s + 10.0, 3.0,

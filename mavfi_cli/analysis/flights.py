@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
-from mavfi_cli.campaign.outcome import COUNTED, MissionResult, State
+from mavfi_cli.campaign.outcome import COUNTED, MissionResult, ResultState
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import FloatArray, Outcome
@@ -110,7 +110,7 @@ def chosen(table: pa.Table, **values: Any) -> pa.Table:
 
 def flown(table: pa.Table) -> pa.Table:
     """The rows of missions that ended with any outcome, without those that could not begin."""
-    return table.filter(pc.equal(table["state"], State.FLOWN.value))
+    return table.filter(pc.equal(table["state"], ResultState.FLOWN.value))
 
 
 def numbers(table: pa.Table, name: str) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Any
 from mavfi_cli.analysis.groups import TREATMENT, untreated
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import label_text
-from mavfi_cli.campaign.outcome import COUNTED, Injected, MissionResult, State
+from mavfi_cli.campaign.outcome import COUNTED, Injected, MissionResult, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.record.measures import fields_of
 from mavfi_cli.mission.record.run_folder import RESULT
@@ -43,7 +43,7 @@ def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
     pairs = [(each, name) for each, _, name, _ in ledger.rows()]
     mine = [each for each, name in pairs if name == pairs[number][1]]
     over = list(ledger.results(mine))
-    flown = [each for each in over if each.state is State.FLOWN]
+    flown = [each for each in over if each.state is ResultState.FLOWN]
     if not flown:
         raise RecordError(f"{ledger.folder}: nothing of mission {number}'s pair is flown")
     lost = [each.number for each in flown if each.path is None]
@@ -53,7 +53,7 @@ def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
     if not whole:
         raise RecordError(f"{ledger.folder}: {_told(mine)} left no record to draw")
     missing = sorted(set(mine) - {each.number for each in over})
-    errors = [each for each in over if each.state is State.ERROR]
+    errors = [each for each in over if each.state is ResultState.ERROR]
     return {
         "panels": _panels(whole),
         "absent": [

@@ -1,1 +1,1 @@
-"""Attacks on native code, one fault a run: one driver for kernels, nodes, programs, your own."""
+"""Attacks on native code, one fault a run: one driver for kernels, nodes, programs and plug-ins."""

@@ -1,4 +1,4 @@
-"""One fault in one run: reach the place, flip, follow, run to the end, judge."""
+"""Runs one fault: reach the location, flip, follow, run to the end, judge."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.alarm import Alarm
+from mavfi_cli.fi.tracer.alarm import ProcessTimer
 from mavfi_cli.fi.tracer.fault import InstructionFault, Stage
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import (
@@ -42,18 +42,18 @@ class RunResult:
     outcome: Outcome
     signal: int | None
     verdict: RunVerdict
-    fault: InstructionFault | None  # None where a time trigger found nothing to hit
+    fault: InstructionFault | None  # None if a time trigger found nothing to hit
     injection: Injection | None
     followed: Followed
-    reason: str  # why not injected
+    reason: str  # why the fault was not injected
     run_s: float  # wall time of the whole run
 
 
 def golden_run(place: JudgedPlace) -> Golden:
-    """Run without a fault several times; the target must repeat itself.
+    """Run without a fault several times; the target must be repeatable.
 
     Raises:
-        TargetError: it fails, or its outputs differ.
+        TargetError: the target fails, or its outputs differ.
     """
     runs = [place.fault_free() for _ in range(GOLDEN_RUNS)]
     for again in runs[1:]:
@@ -75,14 +75,14 @@ class Attacker:
         """One run with a fault at an exact execution of an instruction.
 
         Raises:
-            FaultError: the instruction at the place is not the one that was drawn.
+            FaultError: the instruction at the location is not the drawn one.
         """
         start = time.perf_counter()
         tracee = self.place.start()
         try:
             hits = sum(stage.count for stage in fault.trigger)
             wall_s = self._wall_limit_s + hits * _HIT_LIMIT_S
-            with Alarm(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
+            with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
                 reason = reach(tracee, self.place.image(tracee), fault)
             if reason:
                 return self._result(start, tracee.ended, fault, None, NOTHING, reason)
@@ -111,10 +111,10 @@ class Attacker:
         limits = self.place.limits
         return limits.factor * self.golden.wall_s + limits.wall_grace_s
 
-    def _deadline(self, tracee: Tracee) -> AbstractContextManager[Alarm]:
+    def _deadline(self, tracee: Tracee) -> AbstractContextManager[ProcessTimer]:
         limits = self.place.limits
         cpu_s = limits.factor * self.golden.cpu_s + limits.cpu_grace_s
-        return Alarm(tracee.pid, signal.SIGKILL, cpu_s=cpu_s, wall_s=self._wall_limit_s)
+        return ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=cpu_s, wall_s=self._wall_limit_s)
 
     def _fault_at_moment(
         self, tracee: Tracee, plan: Strategy, rng: np.random.Generator, moment_s: float
@@ -122,7 +122,7 @@ class Attacker:
         image, cpu = self.place.image(tracee), plan.rule is Rule.CPU_TIME
         scope, reason = self.place.scope(image), ""
         for _ in range(plan.attempts):
-            alarm = Alarm(
+            alarm = ProcessTimer(
                 tracee.pid,
                 signal.SIGTRAP,
                 cpu_s=moment_s if cpu else None,
@@ -137,7 +137,7 @@ class Attacker:
         return None, reason
 
     def _corrupt(self, start: float, tracee: Tracee, fault: InstructionFault) -> RunResult:
-        """Stopped in front of the attacked instruction: flip, follow, run to the end."""
+        """Flip at the stop in front of the attacked instruction, follow, and run to the end."""
         with self._deadline(tracee) as alarm:
             window = self.place.limits.follow_window
             injection, followed = strike(tracee, fault, window=window)
@@ -193,20 +193,20 @@ def _fault_here(
 
 
 def run_out(tracee: Tracee) -> Ended:
-    """Let a run go on to its end."""
+    """Let a run continue to its end."""
     while tracee.ended is None:
         tracee.resume()
     return tracee.ended
 
 
-# -- a process that goes on
+# -- a process that keeps running
 
 Notice = Callable[[], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveAttack:
-    """What came of a fault in a process that somebody else runs."""
+    """The result of a fault in a process that other code runs."""
 
     injection: Injection | None  # None: the trigger was not reached, or null injection
     followed: Followed
@@ -226,25 +226,25 @@ def attack_live(
     leave_stopped: bool = False,
     **context: Any,
 ) -> LiveAttack:
-    """Apply one fault in a running process, a node of a mission say, and let it go on.
+    """Apply one fault in a running process, such as a node of a mission, and let it continue.
 
     The record is on the disk before the process runs to the trigger. The process must be a child of
-    the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached, the tracer
-    hears of it first: take its end from the result, not from `Popen.wait`.
+    the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached, the kernel
+    tells the tracer first: take its end from the result, not from `Popen.wait`.
 
     Args:
-        pid: the process.
-        fault: its trigger counts from now on.
-        path: of the record.
-        regions: as `Image` takes them.
-        window: how many instructions a destination fault is followed.
+        pid: id of the process.
+        fault: the fault; its trigger counts from now on.
+        path: path of the record.
+        regions: the regions, as `Image` takes them.
+        window: number of instructions for which a destination fault is followed.
         armed: called once the process runs towards the trigger.
-        leave_stopped: let the process go stopped (SIGSTOP) after the flip, for a debugger.
-        context: what else belongs in the record: kernel, stage, sampling rule, seed, scope.
+        leave_stopped: detach with the process stopped (SIGSTOP) after the flip, for a debugger.
+        context: further entries of the record: kernel, stage, sampling rule, seed, scope.
 
     Raises:
         TracingForbidden: the operating system refuses.
-        FaultError: another instruction is at the place.
+        FaultError: another instruction is at the location.
     """
     tracee = Tracee.attach(pid)
     try:

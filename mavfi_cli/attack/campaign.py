@@ -1,7 +1,7 @@
-"""Many faults on each of some targets: golden run, profile, fault list, runs.
+"""Runs many faults on each of several targets: golden run, profile, fault list, runs.
 
-Fault number i of a target depends on the seed, the target's own stream and i only, so the results
-depend neither on the number of workers nor on which targets are attacked beside it.
+Fault number i of a target depends on the seed, the target's own stream and i only. So the results
+depend neither on the number of workers nor on the other targets.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mavfi_cli.attack.journal import Journal
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.profile import TargetProfile, steps_told
 from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace
-from mavfi_cli.attack.workers import Bench, Workers, one_processor
+from mavfi_cli.attack.workers import AttackWorkers, Bench, one_processor
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.sampling import Rule
 
@@ -29,10 +29,10 @@ Stage = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetRuns:
-    """All runs of one target, in order of their numbers, and what they were drawn from."""
+    """All runs of one target, in order of their numbers, with the profile they were drawn from."""
 
     target: AttackTarget
-    context: Mapping[str, Any]  # what every record says of the target
+    context: Mapping[str, Any]  # entries of every record about the target
     golden: Golden
     profile: TargetProfile | None  # None for time rules
     records: tuple[Record, ...] = ()
@@ -49,35 +49,35 @@ def run_campaign(
     progress: Progress = lambda _name, _done: None,
     stage: Stage = lambda _: None,
 ) -> list[TargetRuns]:
-    """Golden run, profile, fault list and runs of every target.
+    """Make golden run, profile, fault list and runs of every target.
 
     Args:
-        plan: what to do.
-        targets: some; more than one have streams of their own.
+        plan: which faults are drawn, and how.
+        targets: one or more; if there are several, each has its own stream.
         jobs: worker processes.
-        folder: where the faults are flushed before the first one runs, and every run after it; the
-            runs that it has already are not repeated.
-        progress: called with the target and the number of its runs that are there; with 0 before
-            its golden run and profile.
-        stage: called with what goes on before a target's first run.
+        folder: the faults are flushed there before the first run, and each run when it is over.
+            Runs that are already there are not repeated.
+        progress: called with the target and the number of its completed runs; with 0 before its
+            golden run and profile.
+        stage: called with the present step before a target's first run.
 
     Raises:
         TracingForbidden: the operating system refuses.
         TargetError: a target cannot be attacked; says why.
-        ConfigError: the folder holds another campaign, or runs that this one leaves out.
+        ConfigError: the folder holds another campaign, or runs beyond this one.
     """
     journal = None
     if folder is not None:
         names = [target.stream[0] for target in targets if target.stream]
         journal = Journal(folder, plan.to_json(targets[0]), runs=plan.runs, kernels=names or None)
-    with Workers(jobs) as workers:
+    with AttackWorkers(jobs) as workers:
         return [_attack(plan, each, workers, journal, progress, stage) for each in targets]
 
 
 def _attack(
     plan: Plan,
     target: AttackTarget,
-    workers: Workers,
+    workers: AttackWorkers,
     journal: Journal | None,
     progress: Progress,
     stage: Stage,
@@ -104,7 +104,7 @@ def _attack(
 
 
 def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns, JudgedPlace]:
-    """Golden run and profile, and the place where they were made."""
+    """Make golden run and profile; return them with the place where they were made."""
     begun = time.perf_counter()
     stage("loading")
     with contextlib.ExitStack() as undo:
@@ -129,7 +129,7 @@ def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns
 
 
 def _draw(plan: Plan, bench: Bench, prepared: TargetRuns) -> list[Record]:
-    """The records of all faults before they run; time rules draw at the stop."""
+    """Make the records of all faults before they run; time rules draw at the stop."""
     chosen, profile, records = plan.strategy(), prepared.profile, []
     for index in range(plan.runs):
         what = {"run": index, "seed": plan.seed, "sampling": chosen.name, **prepared.context}
@@ -151,7 +151,7 @@ def _tasks(planned: Sequence[Record], done: Mapping[int, Record]) -> list[Any]:
 
 
 def completed(planned: Mapping[str, Any], result: RunResult) -> Record:
-    """The record of a run that is over."""
+    """Make the record of a run that is over."""
     fault = result.fault
     if fault is not None and not planned["trigger"]:  # a time trigger: it cannot be repeated
         planned = {

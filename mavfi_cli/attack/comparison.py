@@ -1,4 +1,4 @@
-"""What of a program is compared with the golden run: standard output, files that it writes."""
+"""Compares a program's standard output and files with those of the golden run."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputComparison:
-    """Which outputs are compared, and what of them.
+    """The compared outputs, and how they are compared.
 
     Attributes:
-        files: that the program writes, relative to the folder in which it runs.
-        stdout: standard output is compared, too.
+        files: compared files, relative to the folder in which the program runs.
+        stdout: whether standard output is compared too.
         tolerance: largest relative difference of a number that still counts as equal.
-        ignored: patterns (bytes); a line in which one is found is left out.
+        ignored: patterns (bytes); a line that contains one is left out.
     """
 
     files: tuple[str, ...] = ()
@@ -36,17 +36,17 @@ class OutputComparison:
     def of(
         cls, outputs: Iterable[str], *, tolerance: float = 0.0, ignored: Iterable[str] = ()
     ) -> OutputComparison:
-        """From the command line.
+        """Make a comparison from options of the command line.
 
         Args:
-            outputs: each `stdout`, or `file:PATH` relative to where the program runs; none for
-                standard output.
-            tolerance: as above.
+            outputs: each `stdout`, or `file:PATH` relative to the program's folder; an empty list
+                means standard output.
+            tolerance: as in the class.
             ignored: regular expressions.
 
         Raises:
-            ConfigError: neither of the two, a path that leads out of the program's folder, or no
-                regular expression.
+            ConfigError: an output is neither of the two, a path leads out of the program's
+                folder, or a pattern is not a regular expression.
         """
         chosen = tuple(dict.fromkeys(outputs)) or (STDOUT,)
         return cls(
@@ -57,7 +57,7 @@ class OutputComparison:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """What results depend on."""
+        """The entries that results depend on."""
         names: list[str | None] = [None] if self.stdout else []
         names += self.files
         told: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
@@ -66,10 +66,10 @@ class OutputComparison:
         return told | {"tolerance": self.tolerance}
 
     def parts(self, folder: Path, stdout: Path) -> dict[str, bytes | None]:
-        """What a run left, by name of the output; None for a file that it did not write.
+        """Read a run's outputs, by name; None for a file that it did not write.
 
         Args:
-            folder: in which it ran.
+            folder: folder in which it ran.
             stdout: file of its standard output.
         """
         found: dict[str, bytes | None] = {}
@@ -89,7 +89,7 @@ class OutputComparison:
         )
 
     def same(self, golden: bytes, output: bytes) -> bool:
-        """Whether two outputs are equal, or differ in numbers within the tolerance only."""
+        """True if two outputs are equal, or differ only in numbers within the tolerance."""
         if golden == output:
             return True
         size = magnitude(golden, output) if self.tolerance > 0.0 else None
@@ -97,7 +97,7 @@ class OutputComparison:
 
 
 def joined(parts: dict[str, bytes | None]) -> bytes:
-    """All outputs as one: the one that there is, or each with its name in front of it."""
+    """Join all outputs: a single one as it is, several each after its name."""
     pieces = [b"\0missing" if data is None else data for data in parts.values()]
     if len(pieces) == 1:
         return pieces[0]
@@ -130,7 +130,7 @@ def _pattern(text: str) -> bytes:
 
 
 def _read_inside(folder: Path, name: str) -> bytes | None:
-    """A regular file below the folder; a link that leads out of it is none."""
+    """Read a regular file below the folder; None if a link leads out of it."""
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()) or not path.is_file():
         return None
@@ -138,7 +138,7 @@ def _read_inside(folder: Path, name: str) -> bytes | None:
 
 
 def compared(golden: bytes, output: bytes) -> Difference | None:
-    """The difference between the numbers of two texts; None where other things differ."""
+    """The difference between the numbers of two texts; None if anything else differs."""
     size = magnitude(golden, output)
     return None if size is None else Difference(relative=size, absolute=size)
 
@@ -146,8 +146,8 @@ def compared(golden: bytes, output: bytes) -> Difference | None:
 def magnitude(golden: bytes, output: bytes) -> float | None:
     """Largest relative difference between the numbers of two texts.
 
-    Relative to the golden number's size, absolute where that is 0; infinite where one of the two
-    is not finite and they differ. None where the texts differ in more than their numbers.
+    It is relative to the golden number's size, absolute if that is 0, and infinite if one of the
+    two is not finite and they differ. None if the texts differ in more than their numbers.
     """
     ours, theirs = _SEPARATORS.split(golden), _SEPARATORS.split(output)
     if len(ours) != len(theirs):
@@ -174,12 +174,12 @@ def _size(golden: bytes, other: bytes) -> float | None:
 def absolute_arguments(
     argv: Iterable[str], directory: Path, written: Iterable[str]
 ) -> Iterator[str]:
-    """Arguments that name existing files, made absolute: the program runs in a scratch folder.
+    """Make arguments that name existing files absolute: the program runs in a scratch folder.
 
     Args:
         argv: the arguments.
-        directory: that they are relative to.
-        written: files that the program writes: of these it writes its own, not the user's.
+        directory: the folder that they are relative to.
+        written: files that the program writes; their names stay, so the user's are not overwritten.
     """
     own = {str(PurePosixPath(name)) for name in written}
     for argument in argv:

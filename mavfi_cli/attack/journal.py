@@ -1,8 +1,8 @@
-"""The folder of a campaign: its plan, the faults as drawn, and every run as soon as it is over.
+"""The folder of a campaign: its plan, the drawn faults, and every run as soon as it is over.
 
-`plan.json` says what the folder holds, `faults.jsonl` (`faults-KERNEL.jsonl`) is on the disk before
-the first fault runs, and `runs.jsonl` grows by one line a run, so a campaign that was cut off goes
-on where it stopped.
+`plan.json` says what the folder holds. `faults.jsonl` (`faults-KERNEL.jsonl`) is on the disk before
+the first fault runs. `runs.jsonl` grows by one line a run, so an interrupted campaign continues
+where it stopped.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _DRAWN = ("object", "offset", "trigger", "k", "instruction_bytes", "corruption",
 
 
 class Journal:
-    """Reads and grows the folder of one campaign."""
+    """Reads and extends the folder of one campaign."""
 
     def __init__(
         self,
@@ -31,16 +31,16 @@ class Journal:
         runs: int,
         kernels: Sequence[str] | None = None,
     ) -> None:
-        """Open the folder, or begin it.
+        """Open the folder, or create it.
 
         Args:
-            folder: of the campaign.
-            known: what its results depend on, as plain values.
-            runs: how many of each kernel there shall be in the end.
-            kernels: which ones; None of a program.
+            folder: folder of the campaign.
+            known: everything that its results depend on, as plain values.
+            runs: number of runs of each kernel when the campaign is complete.
+            kernels: names of the kernels; None for a program.
 
         Raises:
-            ConfigError: it holds another campaign, or runs that this one would leave out.
+            ConfigError: it holds another campaign, or runs beyond this one.
             RecordError: it cannot be written.
         """
         self._folder = folder
@@ -58,7 +58,7 @@ class Journal:
         write_json(path, known)
 
     def _require_all(self, runs: int, kernels: Sequence[str] | None) -> None:
-        """Refuse to leave out runs that are there: the summary is of the whole folder."""
+        """Refuse to leave out existing runs, because the summary covers the whole folder."""
         counts: dict[str, int] = {}
         for entry in read_runs(self._folder):
             kernel = entry.get("kernel", "")
@@ -79,7 +79,7 @@ class Journal:
             )
 
     def runs_of(self, planned: Sequence[Mapping[str, Any]]) -> dict[int, dict[str, Any]]:
-        """The runs that are there, by number, of the faults that are planned now."""
+        """Existing runs of the planned faults, by number."""
         found = {}
         for entry in read_runs(self._folder):
             index = entry["run"]
@@ -88,12 +88,12 @@ class Journal:
         return found
 
     def flush_plan(self, name: str, planned: Iterable[Mapping[str, Any]]) -> None:
-        """Have the faults on the disk, in a file of that name, before the first one runs."""
+        """Flush the faults to a file of that name before the first one runs."""
         text = "".join(json.dumps(entry) + "\n" for entry in planned).encode()
         write_atomically(self._folder / name, lambda file: file.write(text))
 
     def append(self, entry: Mapping[str, Any]) -> None:
-        """Add a run that is over."""
+        """Append a run that is over."""
         path = self._folder / RUNS
         line = (json.dumps(entry) + "\n").encode()
         try:
@@ -107,7 +107,7 @@ class Journal:
 
 
 def read_plan(folder: Path) -> dict[str, Any]:
-    """What the runs of a folder depend on.
+    """Read everything that the runs of a folder depend on.
 
     Raises:
         RecordError: the folder holds no campaign.
@@ -121,7 +121,7 @@ def read_plan(folder: Path) -> dict[str, Any]:
 
 
 def read_runs(folder: Path) -> Iterator[dict[str, Any]]:
-    """The completed records of a folder; a last line that was cut off is left out.
+    """Read the completed records of a folder; an incomplete last line is left out.
 
     Raises:
         RecordError: the file cannot be read.

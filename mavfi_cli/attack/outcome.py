@@ -1,4 +1,4 @@
-"""Outcomes of isolated runs, and how often each of them occurs."""
+"""Outcomes of isolated runs, and their shares."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavfi_cli.stats.shares import Share, design_effect, wilson
 
 
 class Outcome(Enum):
-    """What one fault did to an isolated program or kernel."""
+    """The outcome of one run of an isolated program or kernel."""
 
     BENIGN = "benign"
     CRASH = "crash"
@@ -23,7 +23,7 @@ class Outcome(Enum):
 
     @property
     def title(self) -> str:
-        """What people call it."""
+        """The name in tables."""
         return "SDC" if self is Outcome.SDC else self.value.replace("_", " ")
 
 
@@ -33,12 +33,12 @@ Window = tuple[Hashable, int]  # stratum and number of the sampled window that a
 def shares(
     outcomes: Iterable[Outcome], windows: Iterable[Window | None] = ()
 ) -> dict[Outcome, Share]:
-    """Each outcome's share of the *injected* runs; not injected ones are a share of all runs.
+    """Share of each outcome in the *injected* runs; not injected ones are a share of all runs.
 
     Args:
-        outcomes: of the runs.
-        windows: of each run, where its instruction is from a sample of windows; None for a run
-            that stands for itself. Intervals are widened by the likeness of runs in a window.
+        outcomes: the outcome of each run.
+        windows: the window of each run if its instruction is from a sample of windows, else None.
+            The similarity of runs in a window widens the intervals.
     """
     ended = list(outcomes)
     hit = list(windows) or [None] * len(ended)
@@ -53,7 +53,7 @@ def shares(
 
 
 def shares_to_json(found: Mapping[Outcome, Share]) -> dict[str, dict[str, Any]]:
-    """What `shares` says, as plain values; a share of nothing is null."""
+    """The result of `shares` as plain values; a share of nothing is null."""
     return {
         outcome.value: {
             "count": share.count,
@@ -66,12 +66,12 @@ def shares_to_json(found: Mapping[Outcome, Share]) -> dict[str, dict[str, Any]]:
 
 
 def signal_name(number: int) -> str:
-    """What a signal is called."""
+    """The name of a signal."""
     known = {each.value for each in signal.Signals}
     return signal.Signals(number).name if number in known else f"signal {number}"
 
 
 def counted(names: Iterable[str]) -> dict[str, int]:
-    """How often each name occurs, the most frequent first."""
+    """Count each name, the most frequent first."""
     counts = Counter(names)
     return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}

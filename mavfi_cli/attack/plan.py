@@ -1,4 +1,4 @@
-"""What a campaign on native code draws."""
+"""The plan of a campaign on native code."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mavfi_cli.fi.tracer.sampling import Rule, Strategy, strategy
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """Which faults are drawn; `runs` is of each target."""
+    """Which faults are drawn; `runs` is the number of runs of each target."""
 
     runs: int
     seed: int
     rule: str = Rule.INSTRUCTION.value
     compat: str | None = None
     model: FaultModel | None = None
-    windows: int = 16  # stepped, where not all that executes is
+    windows: int = 16  # number of stepped windows, if not the whole run is stepped
     null: bool = False  # everything but the flip
 
     def strategy(self) -> Strategy:
@@ -27,7 +27,7 @@ class Plan:
         return strategy(self.rule, self.model, compat=self.compat)
 
     def to_json(self, target: AttackTarget) -> dict[str, Any]:
-        """What results depend on; neither how many runs nor which targets there are does."""
+        """The entries that results depend on, without number of runs and choice of targets."""
         return {
             "seed": self.seed,
             "rule": self.rule,

@@ -1,13 +1,13 @@
-"""Which instructions a target executes in one run: all of them, or a stated sample.
+"""Profiles the instructions that a target executes in one run: all of them, or a stated sample.
 
-A run that is not too long is stepped completely. Another is cut into windows that together are the
-whole run: each execution of a *marker* (a function's first instruction, say) begins one, which ends
-in front of the next execution of any marker, or with the run; what comes before the first marker is
-a window of its own. The windows of one marker are a stratum. Of each stratum some windows are drawn
-uniformly and stepped, so every executed instruction of the scope has the same chance as all others
-of its stratum to be in the sample; where windows are short, more are drawn, as many as the first
-ones say fit into `ENOUGH` instructions. A stratum is then drawn in proportion to its windows times
-their mean length, and an instruction uniformly out of its stepped windows.
+A run that is not too long is stepped completely. A longer one is cut into windows that together are
+the whole run. Each execution of a *marker*, such as a function's entry, begins a window.
+It ends in front of the next execution of any marker, or with the run. The code before the first
+marker is a window too. The windows of one marker are a stratum. Some windows of each stratum are
+drawn uniformly and stepped, so every executed instruction in scope is as likely to be in the sample
+as all others of its stratum. If windows are short, more are drawn: as many as fit into `ENOUGH`
+instructions by the length of the first ones. A stratum is then drawn in proportion to its windows
+times their mean length, and an instruction uniformly from its stepped windows.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from mavfi_cli.fi.tracer.symbols import short_name
 from mavfi_cli.fi.tracer.windows import Segment, Stratum, record_window
 
 STEPS = 2_000_000  # of one window
-ENOUGH = 200_000  # stepped instructions of one marker's windows
+ENOUGH = 200_000  # stepped instructions of all windows of one marker
 _FIRST = np.array([1])
-Watch = Callable[[int], None]  # called with instructions stepped since it was called last
+Watch = Callable[[int], None]  # called with the instructions stepped since the last call
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetProfile:
-    """What can be hit in one run, with what is needed to draw from it after the run is gone."""
+    """The instructions that can be hit in one run, with what is needed to draw from them."""
 
     strata: tuple[Stratum, ...]
     image: Image
@@ -46,23 +46,23 @@ class TargetProfile:
 
     @property
     def complete(self) -> bool:
-        """Every window of the run was stepped."""
+        """True if every window of the run was stepped."""
         return all(stratum.complete for stratum in self.strata)
 
     @property
     def windows(self) -> str:
-        """How many windows of how many were stepped."""
+        """Stepped windows and all windows, in words."""
         stepped = sum(len(stratum.segments) for stratum in self.strata)
         return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
 
     @property
     def executed(self) -> int:
-        """Executed instructions in scope, over the stepped windows."""
+        """Number of executed instructions in scope, over the stepped windows."""
         return sum(stratum.executed for stratum in self.strata)
 
     @property
     def instructions(self) -> float:
-        """Executed in scope; estimated where the profile is not complete."""
+        """Number of executed instructions in scope; estimated if the profile is not complete."""
         return sum(stratum.instructions for stratum in self.strata)
 
     def code_at(self, address: int) -> bytes:
@@ -73,7 +73,7 @@ class TargetProfile:
         return b""
 
     def window_of(self, record: Mapping[str, Any]) -> Window | None:
-        """The sampled window that a fault is from; None where no sample of windows was taken."""
+        """The sampled window of a fault; None if no sample of windows was taken."""
         first = record["trigger"][0]
         for number, stratum in enumerate(self.strata):
             at = stratum.marker
@@ -82,24 +82,24 @@ class TargetProfile:
         return None
 
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
-        """One fault, uniform over the executed instructions."""
+        """Draw one fault, uniformly over the executed instructions."""
         shares = np.array([stratum.instructions for stratum in self.strata])
         which = int(rng.choice(len(shares), p=shares / shares.sum())) if len(shares) > 1 else 0
         stratum, locate = self.strata[which], self.image.locate
         return draw_fault(stratum, plan, rng, code_at=self.code_at, locate=locate)
 
     def after(self, begin: Stage) -> TargetProfile:
-        """The same windows in a run that has to reach `begin` first."""
+        """Make the same profile for a run that has to reach `begin` first."""
 
         def later(stratum: Stratum) -> Stratum:
-            """All its segments after the new stage."""
+            """The stratum with the new stage before each segment's start."""
             segments = (replace(each, start=(begin, *each.start)) for each in stratum.segments)
             return replace(stratum, segments=tuple(segments))
 
         return replace(self, strata=tuple(map(later, self.strata)))
 
     def in_words(self) -> str:
-        """How the population of faults was found."""
+        """How the population of faults was found, in words."""
         if self.complete:
             return f"all {self.instructions:.0f} executed instructions in scope"
         parts = []
@@ -117,7 +117,7 @@ class TargetProfile:
 
 
 def steps_told(stage: Callable[[str], None]) -> Watch:
-    """A watch that has `stage` told how many instructions were stepped so far."""
+    """Make a watch that tells `stage` the number of instructions stepped so far."""
     total = 0
 
     def watch(steps: int) -> None:
@@ -138,16 +138,16 @@ def profile_run(
     limit: int = STEPS,
     watch: Watch | None = None,
 ) -> TargetProfile:
-    """Step a fault-free run, or a sample of the windows that markers cut it into.
+    """Step a golden run, or a sample of the windows that markers cut it into.
 
     Args:
-        place: where it runs.
+        place: the place where it runs.
         rng: draws the windows.
         markers: instructions in scope; none for the whole run.
-        windows: how many of each marker are stepped at least.
-        enough: more of them where together they have no more instructions.
+        windows: the least number of windows of each marker to step.
+        enough: more windows are stepped while they have at most this many instructions together.
         limit: refuse longer windows, instructions.
-        watch: is told how far it is.
+        watch: called with the progress.
 
     Raises:
         TargetError: no instruction in scope executes, or the run does not repeat itself.
@@ -172,7 +172,7 @@ def profile_run(
 
 
 def profile_call(place: AttackPlace, *, limit: int = STEPS) -> TargetProfile:
-    """Step one call of a function: the runs of the place start at its entry.
+    """Step one call of a function, at whose entry the runs of the place start.
 
     Raises:
         WindowTooLong: too many instructions.
@@ -190,19 +190,19 @@ def profile_calls(
     limit: int = STEPS,
     watch: Watch | None = None,
 ) -> TargetProfile:
-    """Step invocations of one function, which is drawn by how often it is called.
+    """Step calls of one function, which is drawn in proportion to its calls.
 
     Args:
-        place: where the target runs.
-        rng: draws the function and its invocations.
-        functions: the entries of those that it is drawn from.
-        windows: how many invocations are stepped at most.
-        limit: refuse longer ones, instructions.
-        watch: is told how far it is.
+        place: the place where the target runs.
+        rng: draws the function and its calls.
+        functions: entries of the functions to draw from.
+        windows: the most calls to step.
+        limit: refuse longer calls, instructions.
+        watch: called with the progress.
 
     Raises:
         WindowTooLong: too many instructions.
-        TargetError: none of them is ever called.
+        TargetError: none of the functions is ever called.
     """
     begun = time.perf_counter()
     steppers = [_Stepper(place, entry, None, limit, watch) for entry in functions]
@@ -221,10 +221,10 @@ def profile_calls(
 
 
 def function_of(place: AttackPlace, name: str) -> Location:
-    """The entry of a function in scope.
+    """Find the entry of a function in scope.
 
     Raises:
-        UnknownName: there is none of that name; names the nearest.
+        UnknownName: there is no function of that name; names the nearest.
     """
     tracee = place.start()
     try:
@@ -266,7 +266,7 @@ class _Stepper:
     watch: Watch | None = None
 
     def count(self) -> int:
-        """How many windows a run has."""
+        """Count the windows of a run."""
         assert self.marker is not None
         tracee = self.place.start()
         try:
@@ -275,17 +275,17 @@ class _Stepper:
             tracee.kill()
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
-        """The windows of these numbers, from 1, of `count`."""
+        """Step the windows of these numbers, from 1, out of `count`."""
         left = sorted(numbers.tolist())
         segments: list[Segment] = []
-        while left:  # once, unless a function calls itself
+        while left:  # one pass, unless a function calls itself
             found = list(self._pass(left))
             segments += found
             left = left[len(found) :]
         return Stratum(marker=self.marker, segments=tuple(segments), windows_in_run=count)
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:
-        """Windows of one run, until one lies inside the window before."""
+        """Step windows of one run, until one lies inside the window before it."""
         tracee = self.place.start()
         try:
             image = self.place.image(tracee)

@@ -1,4 +1,4 @@
-"""A user's program as a target: how it starts, its golden run, and how its runs are judged."""
+"""A user's program as a target: its start, its golden run, and the judgement of its runs."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramTarget:
-    """A program, what of it may be hit, and what is compared."""
+    """A program, its code in scope, and its compared outputs."""
 
     command: Command
     comparison: OutputComparison
-    objects: tuple[str, ...] = ()  # file names in scope; default the program itself
-    function: str | None = None  # only within invocations of this function
+    objects: tuple[str, ...] = ()  # file names in scope; by default the program itself
+    function: str | None = None  # hit only calls of this function
     limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
 
@@ -44,7 +44,7 @@ class ProgramTarget:
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """A campaign has one program."""
+        """No stream, because a campaign has one program."""
         return ()
 
     @property
@@ -53,7 +53,7 @@ class ProgramTarget:
         return self.objects or (self.name,)
 
     def context(self) -> dict[str, Any]:
-        """What every record says of it."""
+        """Entries of every record about the program."""
         told: dict[str, Any] = {
             "program": list(self.command.argv),
             "scope": list(self.scope_objects),
@@ -64,7 +64,7 @@ class ProgramTarget:
         return told
 
     def known(self) -> dict[str, Any]:
-        """What its results depend on."""
+        """Everything that its results depend on."""
         return self.context() | {"comparison": self.comparison.to_json()}
 
     def open(self) -> Workplace:
@@ -75,8 +75,8 @@ class ProgramTarget:
 class Workplace:
     """A scratch folder with the output files of one worker.
 
-    Nothing is ever removed outside of it. Where files are compared the program runs in a folder in
-    it that is made anew for every run.
+    Nothing outside it is ever removed. If files are compared, the program runs in a folder in it
+    that is made anew for every run.
     """
 
     kind = "program"
@@ -101,7 +101,7 @@ class Workplace:
         """Start the program, stopped at its entry point.
 
         Raises:
-            TargetError: it ends before its entry point.
+            TargetError: the program ends before its entry point.
         """
         self._renew_folder()
         tracee = spawn(
@@ -127,7 +127,7 @@ class Workplace:
             raise TargetError(self.name, problem) from None
 
     def image(self, tracee: Tracee) -> Image:
-        """What a run has in its memory."""
+        """The memory image of a run."""
         return Image(tracee.pid)
 
     def scope(self, image: Image) -> Scope:
@@ -135,18 +135,18 @@ class Workplace:
         return scope_of(image, self.target.scope_objects)
 
     def context(self) -> dict[str, Any]:
-        """What every record says of the program."""
+        """Entries of every record about the program."""
         return self.target.context()
 
     def _parts(self) -> dict[str, bytes | None]:
-        """What the last run left, by name of the output."""
+        """The outputs of the last run, by name."""
         folder = self._folder or self._command.directory
         return self.target.comparison.parts(folder, self._stdout)
 
     def profile(
         self, rng: np.random.Generator, *, windows: int = 16, watch: Watch | None = None
     ) -> TargetProfile:
-        """Step the fault-free run, or sampled invocations of the target's function.
+        """Step the golden run, or sampled calls of the target's function.
 
         Raises:
             WindowTooLong: too many instructions.
@@ -160,10 +160,10 @@ class Workplace:
         return profile_calls(self, rng, [entry], windows=windows, limit=limit, watch=watch)
 
     def fault_free(self) -> Golden:
-        """One run without a fault, timed from the entry point.
+        """Run once without a fault, timed from the entry point.
 
         Raises:
-            TargetError: it is killed by a signal, or does not write a file that is compared.
+            TargetError: a signal kills it, or it does not write a compared file.
         """
         before_s = _children_cpu_s()
         tracee = self.start()
@@ -187,7 +187,7 @@ class Workplace:
         )
 
     def unlike(self, golden: Golden, again: Golden) -> str:
-        """How two fault-free runs differ; empty where they do not."""
+        """How two fault-free runs differ; empty if they are equal."""
         if again.exit_code != golden.exit_code:
             return f"their exit codes are {golden.exit_code} and {again.exit_code}"
         if self.target.comparison.same(golden.output, again.output):
@@ -199,7 +199,7 @@ class Workplace:
         return f"their outputs differ {where}; --ignore-lines leaves out lines that change"
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
-        """Judge the last run; `ended` is None where it was cut off."""
+        """Judge the last run; `ended` is None if it exceeded its limit."""
         parts, tolerance = self._parts(), self.target.comparison.tolerance
         output = joined(parts)
         outcome, difference = judged(golden, ended, output, compared, tolerance=tolerance)

@@ -1,4 +1,4 @@
-"""Repeat recorded runs of kernels to the bit."""
+"""Repeats recorded runs of kernels bit by bit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.sources import own_digest
 from mavfi_cli.fi.tracer import record
 
-# What a replay must repeat; how long things took is not part of it.
+# A replay must repeat these entries; durations are not among them.
 _COMPARED = (
     "outcome", "signal", "error", "magnitude", "within_tolerance", "output_sha256",
     "not_injected_reason", "activation",
@@ -33,7 +33,7 @@ class Replay:
 
     kernel: str
     run: int
-    differs: tuple[str, ...]  # keys of the record; empty: identical
+    differs: tuple[str, ...]  # keys of the record that differ; empty if it is identical
     record: dict[str, Any]
 
 
@@ -41,18 +41,18 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
     """Repeat the runs of a campaign's folder.
 
     Args:
-        folder: of the campaign.
-        kernels: only these; all of ours where none is named.
-        runs: only as many of each kernel, the first; 0 for all.
+        folder: folder of the campaign.
+        kernels: names of the kernels; all of ours if none is named.
+        runs: number of runs of each kernel, from the first; 0 for all.
 
     Raises:
-        RecordError: the folder holds no runs of kernels that can be repeated.
+        RecordError: the folder has no kernel runs that can be repeated.
         BuildMismatch: a record is of another build; says what differs.
     """
     plan = read_plan(folder)
     if "inputs_sha256" not in plan:
         raise RecordError(f"{folder}: holds runs of a program; only our kernels' can be repeated")
-    if plan.get("sources") != own_digest():  # other code lays out the memory otherwise
+    if plan.get("sources") != own_digest():  # other code has another memory layout
         raise BuildMismatch(["our own code"])
     found = False
     for kernel in catalogue.select(kernels):

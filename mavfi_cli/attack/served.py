@@ -1,8 +1,8 @@
-"""A Python program that is attacked, or whose forks are: started afresh, always the same.
+"""Starts a Python program that is attacked, or whose forks are, always in the same state.
 
-Its memory depends on what it is told only, so a corrupted pointer meets the same things in every
-repetition: no address randomisation, a fixed environment, and all bytecode in its place. A fork of
-the process that attacks would carry the traces of everything that ran there before.
+Its memory depends only on its messages, so a corrupted pointer meets the same data in every
+repetition. It has no address randomisation, a fixed environment, and all bytecode cached. A fork of
+the attacking process would carry traces of everything that ran there before.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from mavfi_cli.core.channel import receive, send
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 
-CHANNEL = 3  # file descriptor of the program's end
+CHANNEL = 3  # file descriptor of the program's end of the socket
 _FILE_CLOCK = 5  # CLOCK_REALTIME_COARSE, which stamps files; `time.time_ns` runs ahead of it
-# Nothing else of the environment reaches it, so that its memory does not depend on the shell.
+# It gets no other environment variables, so that its memory does not depend on the shell.
 _KEPT = (
     "HOME", "LANG", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "PATH", "PYTHONPATH", "VIRTUAL_ENV",
 )  # fmt: skip
@@ -34,17 +34,17 @@ _FIXED = {
 
 
 class ServedProcess:
-    """A started program; it may load much before it is told what to be, so start it early.
+    """A started program; it may load much before its first message, so start it early.
 
-    A program that compiles its modules has another memory than one that finds their bytecode. So
-    one that has left something in a cache is ended, and another started, which finds it there.
+    A program that compiles its modules has another memory than one that finds their bytecode. So a
+    program that wrote to a cache is ended, and another is started, which finds its entry there.
 
     Attributes:
         pid: its process id.
         connection: our end of the socket to it.
 
     Args:
-        module: the program. It takes one message, and answers with a value and `newest_cache_ns`.
+        module: the program. It takes one message and answers with a value and `newest_cache_ns`.
         output: file descriptor of its standard output; None: nowhere.
     """
 
@@ -63,7 +63,7 @@ class ServedProcess:
             (os.POSIX_SPAWN_DUP2, self._errors, 2),
             (os.POSIX_SPAWN_DUP2, theirs.fileno(), CHANNEL),
         ]
-        # -P: where we stand must not decide what is imported, and so how its memory lies.
+        # -P: the working directory must not decide what is imported, and so the memory layout.
         line = [sys.executable, "-P", "-m", self._module]
         self._started_ns = time.clock_gettime_ns(_FILE_CLOCK)
         with theirs, linux.fixed_addresses():
@@ -73,14 +73,14 @@ class ServedProcess:
             )  # fmt: skip
 
     def begin(self, message: Any, name: str) -> Any:
-        """Tell it what to be, and wait until it is ready; its answer.
+        """Send the first message, wait until the program is ready, and return its answer.
 
         Args:
-            message: to it.
-            name: what it is, for the error.
+            message: the message.
+            name: name of the program, for the error.
 
         Raises:
-            TargetError: it could not start; says why.
+            TargetError: the program could not start; says why.
         """
         answer, cached_ns = self._ask(message, name)
         if cached_ns >= self._started_ns:
@@ -98,7 +98,7 @@ class ServedProcess:
         return answer
 
     def last_words(self) -> str:
-        """The last line that it wrote to its standard error."""
+        """The last line that the program wrote to its standard error."""
         said = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
         return said[-1] if said else "its process ended"
 
@@ -110,7 +110,7 @@ class ServedProcess:
             os.waitpid(self.pid, 0)
 
     def kill(self) -> None:
-        """End it, if nobody else did."""
+        """Kill the program if it has not ended."""
         self._end()
         if self._errors >= 0:
             os.close(self._errors)
@@ -118,14 +118,14 @@ class ServedProcess:
 
 
 def channel() -> socket.socket:
-    """In the program: its end of the socket."""
+    """The program's end of the socket; call it in the program."""
     return socket.socket(fileno=CHANNEL)
 
 
 def newest_cache_ns() -> int:
-    """When a file was last added to a cache of the code that this process has loaded.
+    """Time of the newest file in the caches of the code that this process has loaded.
 
-    Bytecode, or compiled kernels beside it; ns since the epoch.
+    It counts bytecode and compiled kernels beside it, in ns since the epoch.
     """
     specs = [getattr(module, "__spec__", None) for module in sys.modules.values()]
     files = [spec.cached for spec in specs if spec is not None and spec.cached is not None]

@@ -1,4 +1,4 @@
-"""Counts, shares and intervals of a campaign, with all that the numbers depend on."""
+"""Counts, shares and intervals of a campaign, with everything that the numbers depend on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHOWN = (Outcome.BENIGN, Outcome.CRASH, Outcome.HANG, Outcome.SDC, Outcome.NOT_
 
 
 def _counts(runs: TargetRuns) -> dict[str, Any]:
-    """What is counted of every target."""
+    """The counts of one target."""
     records, profile = runs.records, runs.profile
     windows = [] if profile is None else [profile.window_of(entry) for entry in records]
     found = shares((Outcome(entry["outcome"]) for entry in records), windows)
@@ -62,7 +62,7 @@ def _count_lines(counts: Mapping[str, Any], indent: str) -> Iterator[str]:
 
 
 def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
-    """The whole campaign on kernels as plain values."""
+    """Summarise a campaign on kernels as plain values."""
     return {
         "schema": SCHEMA,
         "plan": plan.to_json(campaign[0].target),
@@ -104,7 +104,7 @@ def _kernel(runs: TargetRuns) -> dict[str, Any]:
 
 
 def table(summary: Mapping[str, Any]) -> str:
-    """The summary as text: one row a kernel, shares of injected runs with 95 % intervals."""
+    """Format the summary: one row a kernel, shares of injected runs with 95 % intervals."""
     head = ["kernel", "runs", *(outcome.title for outcome in _SHOWN)]
     rows = [
         [each["title"], str(each["runs"]), *(_cell(each["outcomes"][o.value]) for o in _SHOWN)]
@@ -148,7 +148,7 @@ def _notes(kernel: Mapping[str, Any]) -> list[str]:
 
 
 def summarise_program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
-    """The campaign on one program as plain values: summary, golden run and all records."""
+    """Summarise a campaign on one program as plain values, with golden run and all records."""
     return {
         "summary": _program(plan, runs),
         "golden": {
@@ -178,7 +178,7 @@ def _program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
 
 
 def program_table(summary: Mapping[str, Any]) -> str:
-    """The summary of a program as text: one row an outcome."""
+    """Format the summary of a program: one row an outcome."""
     lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
     for name, row in summary["outcomes"].items():
         share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
@@ -199,7 +199,7 @@ def program_table(summary: Mapping[str, Any]) -> str:
 
 
 def csv_rows(columns: Sequence[str], campaign: Iterable[TargetRuns]) -> Iterator[list[str]]:
-    """Header and one row a run; what a record does not have is empty."""
+    """Header and one row a run; entries that a record lacks are empty."""
     yield list(columns)
     for entry in (entry for runs in campaign for entry in runs.records):
         flat = {**entry, **(entry.get("corruption") or {}), **entry["injection"]}

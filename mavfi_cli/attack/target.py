@@ -1,8 +1,7 @@
-"""What an attack asks of its target, and how the end of a run is judged.
+"""The interface of targets, and the judgement of a run.
 
-An `AttackTarget` is plain values that can be handed to a worker process. `open` gives the place
-where it runs, again and again from the same memory. A class with these methods is a target of your
-own.
+An `AttackTarget` is plain values that can be sent to a worker process. `open` returns the place
+where it runs repeatedly from the same memory. Any class with these methods can be a target.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ if TYPE_CHECKING:
 class RunLimits:
     """When a run counts as hung, and how far to step."""
 
-    factor: float = 10.0  # times the golden CPU time and duration
+    factor: float = 10.0  # multiple of the golden CPU time and duration
     cpu_grace_s: float = 1.0
-    wall_grace_s: float = 5.0  # a loaded machine delays; only a blocked target waits this long
+    wall_grace_s: float = 5.0  # for delays on a loaded machine; only a blocked target waits as long
     follow_window: int = 64  # instructions after a destination fault
     profile_steps: int = 2_000_000  # of one window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Golden:
-    """The fault-free run."""
+    """The golden run."""
 
     output: bytes
     cpu_s: float
@@ -45,18 +44,18 @@ class Golden:
 
     @property
     def sha256(self) -> str:
-        """Of the output."""
+        """SHA-256 of the output."""
         return digest(self.output)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunVerdict:
-    """What the end and the output of a run amount to.
+    """The judgement of a run from its end and its output.
 
     Attributes:
-        outcome: as if every flip had been applied.
-        output_sha256: empty where there is no output.
-        details: what else belongs in the record, `magnitude` among it.
+        outcome: the outcome, on the assumption that every flip was applied.
+        output_sha256: hash of the output; empty if there is none.
+        details: further entries of the record, such as `magnitude`.
     """
 
     outcome: Outcome
@@ -65,7 +64,7 @@ class RunVerdict:
 
 
 class AttackPlace(Protocol):
-    """Where a target runs, again and again from the same start."""
+    """A place where a target runs repeatedly from the same start."""
 
     @property
     def name(self) -> str:
@@ -73,19 +72,19 @@ class AttackPlace(Protocol):
 
     @property
     def kind(self) -> str:
-        """What the target is, for messages: kernel, node or program."""
+        """Kind of the target for messages: kernel, node or program."""
 
     def start(self) -> Tracee:
         """Start a run, stopped before anything that can be hit."""
 
     def image(self, tracee: Tracee) -> Image:
-        """What a run has in its memory."""
+        """The memory image of a run."""
 
     def scope(self, image: Image) -> Scope:
         """The code that may be hit."""
 
     def close(self) -> None:
-        """Leave nothing behind."""
+        """End all processes and remove all temporary files."""
 
 
 class JudgedPlace(AttackPlace, Protocol):
@@ -93,30 +92,30 @@ class JudgedPlace(AttackPlace, Protocol):
 
     @property
     def target(self) -> AttackTarget:
-        """The target, with what was found out about it, so that a worker opens it faster."""
+        """The target with the facts found so far, so that a worker opens it faster."""
 
     @property
     def limits(self) -> RunLimits:
-        """When a run counts as hung."""
+        """The limits beyond which a run counts as hung."""
 
     def context(self) -> dict[str, Any]:
-        """What every record says of the target."""
+        """Entries of every record about the target."""
 
     def profile(self, rng: np.random.Generator, *, windows: int, watch: Watch) -> TargetProfile:
-        """Step the fault-free run, or a sample of it."""
+        """Step the golden run, or a sample of it."""
 
     def fault_free(self) -> Golden:
         """Run once without a fault.
 
         Raises:
-            TargetError: it fails.
+            TargetError: the run fails.
         """
 
     def unlike(self, golden: Golden, again: Golden) -> str:
-        """How two fault-free runs differ, in words; empty where they do not."""
+        """How two fault-free runs differ, in words; empty if they are equal."""
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
-        """Judge the last run; `ended` is None where it was cut off."""
+        """Judge the last run; `ended` is None if it exceeded its limit."""
 
 
 class AttackTarget(Protocol):
@@ -124,29 +123,29 @@ class AttackTarget(Protocol):
 
     @property
     def name(self) -> str:
-        """As progress and errors call it."""
+        """The target's name in progress and errors."""
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """Stream of its random numbers; empty where a campaign has no other target."""
+        """Stream of its random numbers; empty if a campaign has no other target."""
 
     def known(self) -> dict[str, Any]:
-        """What its results depend on; the same for all targets of a campaign."""
+        """Everything that its results depend on; the same for all targets of a campaign."""
 
     def open(self) -> JudgedPlace:
-        """Get ready, in this process."""
+        """Make a place for runs in this process."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """How far an output is from the golden one.
+    """The difference between an output and the golden one.
 
     Attributes:
-        relative: what a tolerance is compared with; inf where the outputs cannot be compared
+        relative: the value to compare with a tolerance; inf if the outputs cannot be compared
             number by number (another shape, another kind of answer, not a number).
         absolute: the same in `unit`, or inf.
-        unit: of `absolute`.
-        text: what differs, in words.
+        unit: unit of `absolute`.
+        text: the difference in words.
     """
 
     relative: float
@@ -155,7 +154,7 @@ class Difference:
     text: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """For a record: a size that is no number is null."""
+        """Entries of a record; a size that is not a number is null."""
         finite = math.isfinite(self.relative)
         return {
             "relative": self.relative if finite else None,
@@ -173,14 +172,14 @@ def judged(
     *,
     tolerance: float | None,
 ) -> tuple[Outcome, Difference | None]:
-    """The outcome of a run, and the size of its difference where there is one to tell.
+    """Judge a run: its outcome, and the size of its difference if it is known.
 
     Args:
-        golden: the fault-free run.
-        ended: how the run ended; None where it was cut off.
-        output: what it left; None where that is not whole.
-        compare: golden and other output to their difference; None where none can be told.
-        tolerance: largest relative difference that is benign; None where every byte counts.
+        golden: the golden run.
+        ended: how the run ended; None if it exceeded its limit.
+        output: its output; None if that is not complete.
+        compare: function from golden and other output to their difference, or to None.
+        tolerance: largest relative difference that is benign; None if every byte counts.
     """
     if ended is None:
         return Outcome.HANG, None

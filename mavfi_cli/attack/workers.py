@@ -1,4 +1,4 @@
-"""Worker processes that keep a target open, and run its faults in order."""
+"""Worker processes that keep a target open and run its faults in order."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer.fault import InstructionFault
 
-_CHUNK = 32  # tasks that are handed over at once
+_CHUNK = 32  # tasks that are sent at once
 Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn at its moment
 
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """Tracer and target hand over to each other all the time: fastest on one processor."""
+    """Stay on one processor: tracer and target switch all the time, which is fastest there."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, [max(before)])
     try:
@@ -38,26 +38,26 @@ def one_processor() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bench:
-    """A target with its golden run, as it is handed to a worker process: plain values."""
+    """A target with its golden run, as plain values for a worker process."""
 
     plan: Plan
     target: AttackTarget
     golden: Golden
 
     def generator(self, *what: str | int) -> np.random.Generator:
-        """Random numbers of the target's own: of fault number i they depend on i only."""
+        """The target's own random numbers; those of fault number i depend on i only."""
         return generator(self.plan.seed, Stream.FAULT, *self.target.stream, *what)
 
 
 class _Open:
-    """What a worker process keeps between chunks: one target."""
+    """The one target that a worker process keeps open between chunks."""
 
     stream: tuple[str, ...] | None = None
     attacker: Attacker | None = None
 
     @classmethod
     def of(cls, bench: Bench) -> Attacker:
-        """The attacker of a bench: the one that is open, or a new one in its place."""
+        """The attacker of a bench: the open one, or a new one in its place."""
         if cls.attacker is None or cls.stream != bench.target.stream:
             cls.keep(bench, Attacker(place=bench.target.open(), golden=bench.golden))
         assert cls.attacker is not None
@@ -65,13 +65,13 @@ class _Open:
 
     @classmethod
     def keep(cls, bench: Bench, attacker: Attacker) -> None:
-        """Keep an attacker open for what comes, and close the one before."""
+        """Keep an attacker open for later chunks, and close the previous one."""
         cls.close()
         cls.attacker, cls.stream = attacker, bench.target.stream
 
     @classmethod
     def close(cls) -> None:
-        """Close what is open, if anything is."""
+        """Close the open attacker, if there is one."""
         if cls.attacker is not None:
             cls.attacker.place.close()
             cls.attacker = None
@@ -93,14 +93,14 @@ def _settle(queue: Any) -> None:
     os.sched_setaffinity(0, [queue.get()])
 
 
-class Workers:
-    """Worker processes, or this process where one is enough; a context, of one campaign."""
+class AttackWorkers:
+    """The workers of one campaign, or this process if one is enough; a context manager."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
         self._pool: ProcessPoolExecutor | None = None
 
-    def __enter__(self) -> Workers:
+    def __enter__(self) -> AttackWorkers:
         if self._jobs > 1:
             context = multiprocessing.get_context("spawn")
             processors, queue = sorted(os.sched_getaffinity(0)), context.Queue()
@@ -117,7 +117,7 @@ class Workers:
             self._pool.shutdown(cancel_futures=True)
 
     def take(self, bench: Bench, attacker: Attacker) -> None:
-        """Take over what was prepared in this process; what no worker here needs is closed."""
+        """Keep an attacker prepared in this process, or close it if no worker here needs it."""
         if self._pool is None:
             _Open.keep(bench, attacker)
         else:
@@ -127,8 +127,8 @@ class Workers:
         """The results in the order of the tasks.
 
         Raises:
-            FaultError: a worker was killed.
-            TargetError: the target cannot be handed to one.
+            FaultError: something killed a worker.
+            TargetError: the target cannot be sent to a worker.
         """
         size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
         jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
@@ -140,7 +140,7 @@ class Workers:
             return
         try:
             pickle.dumps(bench)
-        except Exception as error:  # whatever the target's parts raise
+        except Exception as error:  # the target may raise anything
             problem = f"cannot be handed to a worker process: {error}"
             raise TargetError(bench.target.name, problem) from None
         try:

@@ -1,6 +1,6 @@
-"""Campaigns: missions by the thousand. Calling the package reads a campaign.
+"""Campaigns: planned lists of missions with a ledger of their results.
 
-The library's function `mavfi_cli.campaign` and this package share one name. Python binds the name
+Calling the package reads a campaign. The library's function `mavfi_cli.campaign` and this package share one name. Python binds the name
 to the package as soon as one of its modules is imported, so the package itself can be called.
 """
 

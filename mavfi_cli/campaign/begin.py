@@ -1,4 +1,4 @@
-"""From what a user names to a campaign's folder with its list, ready to be flown."""
+"""Prepares a campaign's folder and list from the preset, file or folder that a user names."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.campaign.specification.fixed_world import FixedWorld
 from mavfi_cli.campaign.specification.spec import Spec, load_spec, parse_spec, presets
 from mavfi_cli.campaign.specification.text import to_toml
-from mavfi_cli.campaign.stopping import Gate
+from mavfi_cli.campaign.stopping import BatchLimiter
 from mavfi_cli.campaign.unchanged import require_unchanged
 from mavfi_cli.campaign.world_search import with_worlds
 from mavfi_cli.core.errors import ConfigError, UnknownName
@@ -43,18 +43,18 @@ _ALIKE = ("seed", "time_limit_s", "isolate")
 def chosen(
     what: str, out: Path | None, scale: float | None, changes: Sequence[str] = ()
 ) -> tuple[Spec, Path]:
-    """The campaign that is named, and its folder.
+    """Find the named campaign and its folder.
 
     Args:
-        what: a preset, a TOML file, or the folder of a campaign that was begun.
-        out: the folder; None: campaigns/NAME, or the one that is named.
-        scale: of the repetitions; of a folder, only what it was begun with.
+        what: a preset, a TOML file, or the folder of an existing campaign.
+        out: the folder; None means campaigns/NAME, or the named folder.
+        scale: fraction of the repetitions; for a folder, only the one it was begun with.
         changes: factors to replace, as `specification.changes`; the default folder's name has them.
 
     Raises:
-        ConfigError: the specification, or the scale, cannot be used; or a preset without `out`
+        ConfigError: the specification or the scale cannot be used; or a preset without `out`
             has the name of a campaign here.
-        UnknownName: neither of them exists.
+        UnknownName: no preset, file or folder has this name.
     """
     spec = chosen_spec(what, scale, changes, folder_fits=out is None)
     if _is_folder(what):
@@ -67,15 +67,15 @@ def chosen(
 def chosen_spec(
     what: str, scale: float | None, changes: Sequence[str] = (), *, folder_fits: bool = True
 ) -> Spec:
-    """The specification that is named; what `chosen` gives without its folder.
+    """Find the named specification, as `chosen` does, without its folder.
 
     Args:
         what, scale, changes: as for `chosen`.
-        folder_fits: False refuses the folder of a campaign, as `scale` and `changes` do.
+        folder_fits: False refuses a campaign's folder, as `scale` and `changes` do.
 
     Raises:
         ConfigError: the specification, or the scale, cannot be used.
-        UnknownName: neither preset nor file nor folder.
+        UnknownName: no preset, file or folder has this name.
     """
     if not _is_folder(what):
         _require_known(what)
@@ -88,15 +88,15 @@ def chosen_spec(
 
 
 def folder_of(what: str) -> Path:
-    """The folder that is named, or into which what is named is flown.
+    """The named folder, or the folder into which the named campaign is flown.
 
     Args:
         what: a preset, a TOML file, or the folder of a campaign. A preset's name is the preset;
             ./NAME is the folder. Where ./NAME holds a campaign, the name alone is refused.
 
     Raises:
-        ConfigError: a file that is no specification, or a name with two meanings.
-        UnknownName: a single word that is neither a preset nor a folder.
+        ConfigError: a file is not a specification, or a name has two meanings.
+        UnknownName: a single word is neither a preset nor a folder.
     """
     if _is_folder(what):
         return Path(what)
@@ -106,7 +106,7 @@ def folder_of(what: str) -> Path:
 
 
 def _is_folder(what: str) -> bool:
-    """Whether a campaign's folder is named, not a preset or a file."""
+    """True if the name is that of a campaign's folder, not of a preset or a file."""
     folder = Path(what)
     return what not in presets() and (
         folder.is_dir() or (os.sep in what and folder.suffix != ".toml")
@@ -114,7 +114,7 @@ def _is_folder(what: str) -> bool:
 
 
 def _require_known(what: str) -> None:
-    """Refuse a word that is no preset; campaigns/NAME may be meant."""
+    """Refuse a word that is not a preset; the error may suggest campaigns/NAME."""
     if what not in presets() and Path(what).suffix != ".toml":
         begun = sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
         meant = [each for each in begun if Path(each).name == what]
@@ -122,7 +122,7 @@ def _require_known(what: str) -> None:
 
 
 def _require_one_meaning(what: str) -> None:
-    """Refuse a preset's name where a folder of that name holds a campaign: either may be meant."""
+    """Refuse a preset's name if a folder of that name holds a campaign."""
     if what in presets() and (Path(what) / LEDGER).is_file():
         own = DEFAULT / what
         raise ConfigError(
@@ -132,21 +132,21 @@ def _require_one_meaning(what: str) -> None:
 
 
 def resumed(asked: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[Spec, bool]:
-    """The campaign of a study to fly in a folder, and whether its list grows.
+    """Return the campaign of a study to fly in a folder, and whether its list grows.
 
-    More repetitions of the same study go on from fewer: lists grow repetition by repetition.
+    More repetitions of the same study continue fewer, because lists grow by repetition.
 
     Args:
-        what, repetitions: what the study and its repetitions are called.
+        what, repetitions: names of the study and of its repetitions, for errors.
 
     Raises:
-        ConfigError: the folder holds another one; says in what it differs.
+        ConfigError: the folder holds another campaign; says how it differs.
     """
     if not (folder / LEDGER).is_file():
         return asked, False
     with Ledger(folder) as ledger:
         text = ledger.meta("spec")
-    if text is None:  # killed before it was said, or no such study: the list will tell
+    if text is None:  # killed before it was stored, or another study: the list decides
         return asked, False
     stored = parse_spec(text, folder / LEDGER)
     ours = replace(asked, name=stored.name, about=stored.about, keep=stored.keep)
@@ -167,18 +167,18 @@ def _stored_spec(ledger: Ledger) -> Spec:
 
 
 def _differing(ledger: Ledger, spec: Spec) -> list[str]:
-    """In what a specification differs from the stored one; empty where a program made the list."""
+    """Differences of a specification from the stored one; empty if a program made the list."""
     return [] if ledger.meta("spec") is None else differences(_stored_spec(ledger), spec)
 
 
 def stopped(ledger: Ledger) -> list[str]:
-    """The settings that the campaign's own rule has ended before all of their missions."""
+    """The settings that the campaign's stopping rule has ended early."""
     text = ledger.meta("spec")
     stop = None if text is None else parse_spec(text, ledger.folder / SPEC).stop
     if stop is None:
         return []
     cells = ledger.cells()
-    gate = Gate(stop, ledger.cell_of_each(), ledger.fates())
+    gate = BatchLimiter(stop, ledger.cell_of_each(), ledger.fates())
     return [label_text(cells[cell]) for cell in sorted(gate.stopped)]
 
 
@@ -191,22 +191,22 @@ def begin(
     options: Options | None = None,
     spectator: Spectator | None = None,
 ) -> Ledger:
-    """Open the folder of a campaign for flying, its list stored.
+    """Open the folder of a campaign for flying, and store its list.
 
     Args:
-        options, spectator: of the flights by which fixed worlds are found, where there are any.
+        options, spectator: for the flights that find fixed worlds, if there are any.
 
     Raises:
-        ConfigError: the folder holds another campaign, or none with `missing_only`.
-        MavfiError: a world, vehicle, planner ... that no mission could be flown with; no world
-            fits the rule of fixed worlds.
+        ConfigError: the folder holds another campaign, or none although `missing_only` is set.
+        MavfiError: no mission can be flown with a world, vehicle, planner or other choice; or
+            no world fits the rule of fixed worlds.
     """
     begun = (folder / LEDGER).is_file()
     if missing_only and not begun:
         raise ConfigError("no campaign was begun there", path=folder)
     if begun:
         spec = _with_stored_worlds(spec, folder, append=append)
-    missions = None if begun else flyable(spec)  # before there is a folder
+    missions = None if begun else flyable(spec)  # before a folder exists
     if spec.fixed_world is not None and (append or not begun):
         spec = with_worlds(
             spec, missions or flyable(spec), folder, options or Options(), spectator or Spectator()
@@ -232,10 +232,10 @@ def begin(
 
 
 def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
-    """The specification with the world seeds that its campaign was begun with.
+    """Return the specification with the world seeds that its campaign was begun with.
 
     Raises:
-        ConfigError: missions are to be appended, and their worlds would follow another rule.
+        ConfigError: the worlds of missions to append follow another rule.
     """
     with Ledger(folder) as ledger:
         told = ledger.meta("spec") is not None
@@ -256,27 +256,27 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
 
 
 def fixed_world(ledger: Ledger) -> FixedWorld | None:
-    """The rule of fixed worlds that the campaign follows, with what it has found."""
+    """The campaign's rule of fixed worlds, with the worlds that it has found."""
     return None if ledger.meta("spec") is None else _stored_spec(ledger).fixed_world
 
 
 def flyable(spec: Spec) -> list[PlannedMission]:
-    """The missions of a campaign, each of a kind that can be flown.
+    """List the missions of a campaign after a check that each kind can be flown.
 
     Raises:
-        MavfiError: a world, vehicle, planner, target ... that no mission could be flown with.
+        MavfiError: no mission can be flown with a world, vehicle, planner, target or other choice.
     """
     _check(spec.kinds())
     return spec.missions()
 
 
 def _check(missions: list[PlannedMission]) -> None:
-    """Ask once for each kind of mission, and once for each kind of vehicle process."""
+    """Check each kind of mission once, and each kind of vehicle process once."""
     seen: set[str] = set()
     asked: set[str] = set()
 
     def vehicle(config: MissionConfig) -> None:
-        """Have the vehicle process judge a mission's world, vehicle and places, once a kind."""
+        """Have the vehicle process check world, vehicle, start and goal, once for each kind."""
         simple = replace(golden_of(config), seed=0)
         key = canonical({**changes_of(simple), "planner": None, "platform": None, "stack": None})
         if key not in asked:
@@ -292,7 +292,7 @@ def _check(missions: list[PlannedMission]) -> None:
 
 
 def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """What can be wrong with a mission whatever its seeds."""
+    """The changes that can be wrong whatever the seeds."""
     kind = {name: value for name, value in changes.items() if name not in _ALIKE}
     for name in ("fault", "instruction"):
         if kind.get(name) is not None:

@@ -1,4 +1,4 @@
-"""Which run folders of a campaign are kept."""
+"""The policy of keeping a campaign's run folders."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.record.run_folder import RESULT
 
-SAMPLE = 20  # about one success in so many is kept by `sampled`
+SAMPLE = 20  # `sampled` keeps about one success in 20
 _WORD = 1 << 32
 
 
 class Keep(Enum):
-    """The policy. A failure is every end but success."""
+    """Which run folders are kept. Every outcome but success is a failure."""
 
     NONE = "none"
     FAILURES = "failures"
@@ -22,23 +22,23 @@ class Keep(Enum):
     ALL = "all"
 
     def wants(self, number: int, outcome: str | None) -> bool:
-        """Whether the run folder of this mission is kept."""
+        """True if the run folder of this mission is kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
         return outcome != "success" or (self is Keep.SAMPLED and _sampled(number))
 
 
 def _sampled(number: int) -> bool:
-    """Whether this success is one of the sample: of every setting, however many take turns."""
+    """True if this success is in the sample, which covers every setting however they alternate."""
     mixed = number
-    for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers become one
+    for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
         mixed = mixed * factor % _WORD
         mixed ^= mixed >> 15
     return mixed < _WORD // SAMPLE
 
 
 def put_away(run: Path, runs: Path, number: int) -> Path:
-    """Move a run folder to its place among those that are kept; the place.
+    """Move a run folder to the kept ones; return its new path.
 
     Raises:
         RecordError: it cannot be moved.

@@ -1,6 +1,6 @@
 """The ledger of a campaign: SQLite in WAL mode, one writer, one transaction a mission.
 
-    meta      what the campaign is: schema, versions, name, spec
+    meta      schema, versions, name and specification of the campaign
     cells     the settings, by their labels
     missions  the numbered list, written before the first mission flies
     results   one short row a mission that is over
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
-from mavfi_cli.campaign.outcome import Injected, MissionResult, State
+from mavfi_cli.campaign.outcome import Injected, MissionResult, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.record.measures import fields_of
@@ -71,7 +71,7 @@ class Ledger:
     """
 
     def __init__(self, folder: Path, *, writing: bool = False) -> None:
-        """Open the ledger of a folder; a writer makes it where there is none.
+        """Open the ledger of a folder; a writer creates it if there is none.
 
         Raises:
             RecordError: there is none, it is damaged, or it cannot be opened.
@@ -102,7 +102,7 @@ class Ledger:
         self.close()
 
     def close(self) -> None:
-        """Close it; a writer makes room for the next."""
+        """Close the ledger; a writer releases its lock."""
         self._db.close()
         self._unlock()
 
@@ -129,7 +129,7 @@ class Ledger:
         connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30.0)
         if self._writing:
             connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = FULL")  # a power cut costs no finished mission
+            connection.execute("PRAGMA synchronous = FULL")  # a power cut loses no finished mission
         else:
             connection.execute("PRAGMA query_only = ON")
         return connection
@@ -162,23 +162,23 @@ class Ledger:
                 with contextlib.suppress(sqlite3.Error):
                     self._db.execute("ROLLBACK")
 
-    # What the campaign is -------------------------------------------------------------------------
+    # The campaign ---------------------------------------------------------------------------------
 
     def meta(self, key: str) -> str | None:
-        """A word about the campaign; None where it was never said."""
+        """An entry about the campaign; None if it was never stored."""
         row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return None if row is None else str(row[0])
 
     def set_meta(self, values: Mapping[str, str]) -> None:
-        """Say words about the campaign, all or none."""
+        """Store entries about the campaign, all or none."""
         with self._transaction():
             self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values.items())
 
     def plan(self, missions: Iterable[PlannedMission]) -> int:
-        """Add missions at the end of the list; how many.
+        """Add missions at the end of the list; return their number.
 
         Raises:
-            RecordError: the disk is full, or something else kept it from being written.
+            RecordError: the ledger cannot be written, for example because the disk is full.
         """
         first = self.planned()
         known = {labels: cell for cell, labels in self._db.execute("SELECT * FROM cells")}
@@ -195,7 +195,7 @@ class Ledger:
         return count
 
     def planned(self) -> int:
-        """How many missions the list has."""
+        """Number of missions in the list."""
         return int(self._db.execute("SELECT count(*) FROM missions").fetchone()[0])
 
     def cells(self) -> list[dict[str, Any]]:
@@ -210,7 +210,7 @@ class Ledger:
             "ORDER BY number"
         )
 
-    # What is to be done ---------------------------------------------------------------------------
+    # Missions to fly ------------------------------------------------------------------------------
 
     def missing(self, *, errors: bool = False) -> Iterator[tuple[int, int, dict[str, Any]]]:
         """Number, cell and changes of every mission without a result, in the order of the list.
@@ -218,7 +218,7 @@ class Ledger:
         Read in portions, so that results may be added meanwhile.
 
         Args:
-            errors: those that could not begin count as missing too.
+            errors: missions that could not begin count as missing too.
         """
         over = "SELECT 1 FROM results WHERE results.number = missions.number"
         over += " AND state <> 'error'" if errors else ""
@@ -245,14 +245,14 @@ class Ledger:
             yield number, (fate[0], fate[1])
 
     def over(self) -> int:
-        """How many missions have a row."""
+        """Number of missions with a row."""
         return int(self._db.execute("SELECT count(*) FROM results").fetchone()[0])
 
     def add(
         self,
         number: int,
         *,
-        state: State,
+        state: ResultState,
         result: Mapping[str, Any],
         reason: str,
         injected: Injected | None,
@@ -260,10 +260,10 @@ class Ledger:
         attempts: int,
         path: str | None,
     ) -> None:
-        """Put a mission's result in, in one transaction; a row that is there is replaced.
+        """Store a mission's result in one transaction; an existing row is replaced.
 
         Raises:
-            RecordError: the disk is full, or something else kept it from being written.
+            RecordError: the ledger cannot be written, for example because the disk is full.
         """
         columns = fields_of(result)
         row = (
@@ -283,10 +283,10 @@ class Ledger:
             self._db.execute(f"REPLACE INTO results VALUES ({marks})", row)
             self._db.execute("REPLACE INTO records VALUES (?, ?)", (number, blob))
 
-    # What came of it ------------------------------------------------------------------------------
+    # Results --------------------------------------------------------------------------------------
 
     def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
-        """What is over, in the order of the list.
+        """Results of the missions that are over, in the order of the list.
 
         Args:
             numbers: only these missions.
@@ -305,7 +305,7 @@ class Ledger:
                 mission=PlannedMission(
                     config=config_from(json.loads(changes)), labels=json.loads(labels), pair=pair
                 ),
-                state=State(state),
+                state=ResultState(state),
                 outcome=outcome,
                 reason=reason,
                 result=json.loads(zlib.decompress(blob)),
@@ -329,7 +329,7 @@ class Ledger:
             yield list(zip(*portion, strict=True))
 
     def errors_by_cell(self) -> dict[int, int]:
-        """How many missions of a cell could not begin, where there are any."""
+        """Number of missions that could not begin, by cell that has any."""
         return dict(
             self._db.execute(
                 "SELECT cell, count(*) FROM results JOIN missions USING (number) "
@@ -338,6 +338,6 @@ class Ledger:
         )
 
     def planned_by_cell(self) -> list[int]:
-        """How many missions each cell has."""
+        """Number of missions of each cell."""
         rows = self._db.execute("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
         return [count for (count,) in rows]

@@ -1,4 +1,4 @@
-"""The missions of a campaign: a numbered list, each complete enough to be flown by itself."""
+"""The missions of a campaign: a numbered list in which each mission is complete by itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.mission.config import MissionConfig
 
 Label = str | int | float | bool | None
-_FIRST = ("setting", "world")  # labels that are told before the others
+_FIRST = ("setting", "world")  # labels that come before the others
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,7 +22,7 @@ class PlannedMission:
     """One mission of a campaign; its number is its place in the list, from 0.
 
     Attributes:
-        config: what is flown.
+        config: the mission's configuration.
         labels: the setting that the mission belongs to; missions of equal labels are counted
             together.
         pair: missions of equal pairs share world, start and noise; empty: by `pair_of`.
@@ -39,17 +39,17 @@ class PlannedMission:
 
 _DEFAULT = MissionConfig()
 _BASE: Mapping[str, Any] = json.loads(json.dumps(asdict(_DEFAULT)))
-# What a golden flight has not: faults, and what protects it from them.
+# Faults and protection, which a golden run does not have.
 _TREATMENT = ("fault", "instruction", "detector", "isolate")
 
 
 def canonical(value: Any) -> str:
-    """JSON of a value, one text for equal values."""
+    """Canonical JSON of a value: equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
 def changes_of(config: MissionConfig) -> dict[str, Any]:
-    """What a mission has other than by default, as plain values."""
+    """The values of a mission that differ from the defaults, as plain values."""
     changed = {
         each.name: value
         for each in fields(MissionConfig)
@@ -60,7 +60,7 @@ def changes_of(config: MissionConfig) -> dict[str, Any]:
 
 
 def config_from(changes: Mapping[str, Any]) -> MissionConfig:
-    """The mission of `changes_of`.
+    """Make the mission from the result of `changes_of`.
 
     Raises:
         ConfigError: a key or a value that this version of mavfi does not have.
@@ -77,7 +77,7 @@ def golden_of(config: MissionConfig) -> MissionConfig:
 
 
 def pair_of(config: MissionConfig) -> str:
-    """A name for all that golden, faulty and protected flights of a pair share."""
+    """A hash of everything that golden, faulty and protected flights of a pair share."""
     text = canonical(changes_of(golden_of(config)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -94,14 +94,14 @@ def label_value(value: Label) -> str:
 
 
 def ordered(names: Iterable[str]) -> list[str]:
-    """Names of labels in the order in which they are told."""
+    """Names of labels in the order in which they are shown."""
     found = set(names)
     return [name for name in _FIRST if name in found] + sorted(found - set(_FIRST))
 
 
 @contextlib.contextmanager
 def naming(labels: Mapping[str, Label]) -> Iterator[None]:
-    """Have a known error in here say which setting it is about.
+    """Make a known error inside name the setting that it concerns.
 
     Raises:
         ConfigError: instead of any MavfiError.

@@ -1,4 +1,4 @@
-"""What a mission of a campaign came to, as the ledger keeps it."""
+"""Result of a campaign's mission, as the ledger keeps it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from mavfi_cli.campaign.missions import PlannedMission
 
 
-class State(Enum):
+class ResultState(Enum):
     """Whether a mission has a result."""
 
     FLOWN = "flown"  # it ended, well or badly: `outcome` says how
@@ -19,7 +19,7 @@ class State(Enum):
 
 
 class Injected(Enum):
-    """What became of the fault of a flown mission."""
+    """What happened to the fault of a flown mission."""
 
     GOLDEN = "golden"  # none was asked for
     ACTIVE = "active"  # it struck, and what it struck was read afterwards
@@ -30,7 +30,7 @@ class Injected(Enum):
     NULL = "null"  # everything but the flip, as was asked for
 
 
-# Missions in whose success the fault, if there was one, had a part.
+# Missions whose success the fault, if there was one, could affect.
 COUNTED = frozenset(
     each.value for each in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
 )
@@ -41,19 +41,19 @@ class MissionResult:
     """One row of the ledger.
 
     Attributes:
-        number: of the mission, its place in the list.
+        number: the mission's place in the list.
         result: its result.json, the same as of `mavfi fly`; of a mission that crashed or hung
             before it could write one, what is known of it. Empty for an error.
-        injected: what became of its fault; None for an error.
-        reason: what the record says about the outcome, or why the mission could not begin.
-        wall_s: host seconds of the attempt that counts.
-        attempts: how often it was begun; more than once where something killed it from outside.
-        path: of the run folder that was kept, absolute; None where none was.
+        injected: what happened to its fault; None for an error.
+        reason: the record's reason for the outcome, or why the mission could not begin.
+        wall_s: wall time of the attempt that counts, s.
+        attempts: number of attempts; more than one if something outside killed it.
+        path: absolute path of the kept run folder; None if it was not kept.
     """
 
     number: int
     mission: PlannedMission
-    state: State
+    state: ResultState
     outcome: str | None
     reason: str
     result: Mapping[str, Any]
@@ -76,11 +76,11 @@ _BY_ACTIVATION = {
 
 
 def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
-    """What became of the fault, from the record of the mission.
+    """Read from the record of the mission what happened to its fault.
 
     Args:
         result: result.json.
-        asked: whether the mission was to have a fault.
+        asked: true if the mission was to have a fault.
     """
     fault = result.get("fault")
     if not asked:
@@ -95,7 +95,7 @@ def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
 
 
 def _caught(result: Mapping[str, Any]) -> bool:
-    """Whether an alarm withheld what the fault had struck: at that stamp, or naming that state."""
+    """True if an alarm withheld the struck value: at its stamp, or by the name of its state."""
     strikes = result["fault"].get("strikes") or []
     stamps = {strike["stamp_s"] for strike in strikes}
     states = {change["state"] for strike in strikes for change in strike["changes"]}

@@ -1,4 +1,4 @@
-"""What the simulated vehicle says to a mission, before a thousand like it are begun."""
+"""Asks the simulated vehicle whether it accepts a mission before a thousand like it begin."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mavfi_cli.mission.vehicle import EmbeddedVehicle
 
 
 def ask_vehicle(config: MissionConfig) -> None:
-    """Start the vehicle of a mission, and end it at once.
+    """Start the vehicle of a mission and end it at once.
 
     Raises:
         VehicleProcessError: it refuses the world, the vehicle, the start or the goal.

@@ -1,4 +1,4 @@
-"""How far a campaign is, for whoever watches it."""
+"""Progress of a campaign, for its spectators."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ class Progress:
 
     Attributes:
         total: missions of the list.
-        before: of them over before this run began.
-        over: over now, those of before included.
-        running: in flight.
-        again: attempts that something outside ended, so that they were begun again.
-        elapsed_s: of this run, host time.
-        inside_s: of it within missions, summed over the workers.
+        before: missions that were over before this run began.
+        over: missions that are over now, including `before`.
+        running: missions in flight.
+        again: attempts that something outside ended and that were repeated.
+        elapsed_s: wall time of this run, s.
+        inside_s: wall time within missions, summed over the workers, s.
         workers: missions that can fly at the same time; None where that changes, as on a cluster.
         outcomes: of the missions that this run flew, by setting, in the order of the list.
     """
@@ -46,7 +46,7 @@ class Progress:
 
     @property
     def outside(self) -> float | None:
-        """Share of the workers' time outside missions; None where their number is not known."""
+        """Fraction of the workers' time outside missions; None if their number is not known."""
         if self.workers is None or self.elapsed_s <= 0.0:
             return None
         return max(0.0, 1.0 - self.inside_s / (self.workers * self.elapsed_s))
@@ -58,7 +58,7 @@ class Progress:
 
     @property
     def success_rates(self) -> dict[str, float]:
-        """The same of each setting of which a mission is over."""
+        """Success rate of each setting that has a finished mission."""
         shares = {setting: _share(outcomes) for setting, outcomes in self.outcomes.items()}
         return {setting: share for setting, share in shares.items() if share is not None}
 
@@ -69,13 +69,13 @@ def _share(outcomes: Counter[str]) -> float | None:
 
 
 class Spectator:
-    """Watches a campaign. This one looks away."""
+    """Watches a campaign. This base class ignores all events."""
 
     def on_progress(self, progress: Progress) -> None:
-        """A mission is over, or a second has passed."""
+        """Handle progress: a mission is over, or a second has passed."""
 
     def on_end(self, progress: Progress) -> None:
-        """Nothing flies any more: all is over, or somebody asked to stop."""
+        """Handle the end: all missions are over, or the user asked to stop."""
 
     def on_note(self, text: str) -> None:
-        """Something that is worth a line."""
+        """Handle a note for the user."""

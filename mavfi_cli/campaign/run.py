@@ -1,4 +1,4 @@
-"""Run a campaign on this machine: every mission of the list that has no result yet."""
+"""Runs a campaign: every mission of the list that has no result yet."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from typing import Any
 from mavfi_cli.campaign.keep import Keep, put_away
 from mavfi_cli.campaign.ledger import RUNS, Ledger
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
-from mavfi_cli.campaign.outcome import State, injected_of
+from mavfi_cli.campaign.outcome import ResultState, injected_of
 from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.specification.spec import Stop
-from mavfi_cli.campaign.stopping import Entry, Gate, Queue
+from mavfi_cli.campaign.stopping import BatchLimiter, Entry, Queue
 from mavfi_cli.campaign.unchanged import note_files, require_unchanged
-from mavfi_cli.campaign.workers.base import Assignment, Ended, Workers
+from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd, Workers
 from mavfi_cli.campaign.workers.local import TASK, LocalWorkers
 from mavfi_cli.campaign.workers.verdict import CampaignStopped, Verdict, judge
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
 from mavfi_cli.mission.run import interruptible
 
 WORK, PROFILES = "work", "profiles"
-ATTEMPTS = 3  # so often a mission is begun that something outside ends
+ATTEMPTS = 3  # most attempts at a mission that something outside ends
 LIMIT_S = 900.0  # wall time of one mission; the slowest takes some twenty seconds
-_GIVE_UP = 5  # so many missions that cannot begin, and none that can, end a campaign
+_GIVE_UP = 5  # a campaign ends after this many missions that cannot begin, if none could
 _LOOK_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How missions are run; changes no result.
+    """How missions are run; the options change no result.
 
     Attributes:
         jobs: missions at the same time.
-        limit_s: wall time of one mission; one that takes longer hangs.
+        limit_s: wall time of one mission, s; missions that exceed it are recorded as `hang`.
         task: module that does the work.
-        errors: fly those again that could not begin.
+        errors: fly missions again that could not begin.
         cluster: address of a scheduler of dask.distributed, instead of workers on this machine.
     """
 
@@ -62,15 +62,15 @@ def run_campaign(
     append: bool = False,
     stop: Stop | None = None,
 ) -> Ledger:
-    """Fly a list of missions into a folder; what is there already is not flown again.
+    """Fly a list of missions into a folder; missions with a result are not flown again.
 
     Args:
         missions: the list.
-        folder: of the campaign: ledger.sqlite, and runs/ with the run folders that are kept.
+        folder: the campaign's folder, with ledger.sqlite and the kept run folders in runs/.
         options: how to run them.
         spectator: hears of progress.
-        append: missions that the folder does not know are added to its list.
-        stop: ends settings early.
+        append: add missions that the folder does not have to its list.
+        stop: rule that ends settings early.
 
     Returns:
         The ledger, open for reading; `results()` come in the order of the list.
@@ -95,7 +95,7 @@ def store_plan(
     differing: Sequence[str] = (),
     can_append: str = "",
 ) -> None:
-    """Write the list down before anything flies, or compare it with the one that is there.
+    """Store the list before anything flies, or compare it with the stored one.
 
     Args:
         append: missions that are not among the stored ones are added; those that are only there
@@ -136,7 +136,7 @@ def _row(mission: PlannedMission) -> tuple[str, str, str]:
 
 
 def _first_of(new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]) -> list[str]:
-    """The first mission that is new, and the first that is gone."""
+    """Phrases for the first new mission and the first missing one."""
     firsts = {"new": _row(new[0]) if new else None, "gone": next(iter(gone), None)}
     return [f"the first {how} one is {row[0]} {row[2]}" for how, row in firsts.items() if row]
 
@@ -156,7 +156,7 @@ def fly_missing(
 
 @contextlib.contextmanager
 def _prepared(folder: Path) -> Iterator[None]:
-    """A clean place for the attempts; what a killed run left in it is gone."""
+    """Make a clean folder for the attempts; remnants of a killed run are removed."""
     work = folder / WORK
     try:
         shutil.rmtree(work, ignore_errors=True)
@@ -171,7 +171,7 @@ def _prepared(folder: Path) -> Iterator[None]:
 
 
 class _Run:
-    """One go at what is missing."""
+    """One run over the missing missions."""
 
     def __init__(
         self, ledger: Ledger, options: Options, spectator: Spectator, stop: Stop | None
@@ -180,7 +180,9 @@ class _Run:
         self._options = options
         self._spectator = spectator
         self._folder = ledger.folder.absolute()
-        self._gate = None if stop is None else Gate(stop, ledger.cell_of_each(), ledger.fates())
+        self._gate = (
+            None if stop is None else BatchLimiter(stop, ledger.cell_of_each(), ledger.fates())
+        )
         self._jobs = options.jobs or len(os.sched_getaffinity(0))
         self._queue = Queue(ledger.missing(errors=options.errors), self._gate)
         self._again: list[Entry] = []
@@ -195,7 +197,7 @@ class _Run:
         self._begun = time.monotonic()
 
     def fly(self, asked: Sequence[int]) -> None:
-        """Until nothing is missing, or somebody asks to stop."""
+        """Fly until nothing is missing, or the user asks to stop."""
         told = False
         with self._workers() as workers:
             while len(asked) < 2:
@@ -252,8 +254,8 @@ class _Run:
     def _out(self, number: int) -> Path:
         return self._folder / WORK / f"{number}-{self._attempts[number]}"
 
-    def _take(self, ended: Ended) -> None:
-        """Settle one attempt that is over."""
+    def _take(self, ended: AttemptEnd) -> None:
+        """Handle one attempt that is over."""
         number = ended.number
         entry = self._flying.pop(number)
         self._inside_s += ended.wall_s
@@ -271,15 +273,15 @@ class _Run:
             self._settle(ended, verdict, config)
         shutil.rmtree(out, ignore_errors=True)
 
-    def _settle(self, ended: Ended, verdict: Verdict, config: Mapping[str, Any]) -> None:
-        """A mission is over: its run folder first, then its row."""
+    def _settle(self, ended: AttemptEnd, verdict: Verdict, config: Mapping[str, Any]) -> None:
+        """Store a mission that is over: first its run folder, then its row."""
         assert verdict.state is not None
         number, result = ended.number, verdict.result
         path = None
         if verdict.run is not None and self._options.keep.wants(number, result.get("outcome")):
             place = put_away(verdict.run, self._folder / RUNS, number)
             path = str(place.relative_to(self._folder))
-        flown = verdict.state is State.FLOWN
+        flown = verdict.state is ResultState.FLOWN
         asked = bool(config.get("fault") or config.get("instruction"))
         injected = injected_of(result, asked=asked) if flown else None
         self._ledger.add(

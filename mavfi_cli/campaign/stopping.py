@@ -1,8 +1,8 @@
 """Sequential stopping: a setting is flown until the interval of its success rate is narrow enough.
 
-The interval is looked at after every batch of a setting, over exactly the first missions of the
-list up to there, whatever order they ended in; so when a setting stops does not depend on how many
-workers there are. Looking often makes the interval a little less sure than it says.
+The interval is checked after every batch of a setting, over exactly the first missions of the list
+up to there, in whatever order they ended. So the number of workers does not change when a setting
+stops. Frequent checks make the true confidence a little lower than the nominal one.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from mavfi_cli.campaign.specification.spec import Stop
 from mavfi_cli.stats.shares import half_width, rate
 
 Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission
-Row = tuple[str | None, str | None]  # outcome, what became of the fault
+Row = tuple[str | None, str | None]  # outcome, what happened to the fault
 
 
-class Gate:
+class BatchLimiter:
     """Lets missions through a batch of their setting at a time.
 
     Args:
@@ -47,12 +47,12 @@ class Gate:
             self.record(number, row)
 
     def passes(self, number: int) -> bool:
-        """Whether this mission may begin now."""
+        """True if this mission may begin now."""
         cell = self._cells[number]
         return cell not in self.stopped and self._place[number] < self._open[cell]
 
     def record(self, number: int, row: Row) -> None:
-        """A mission is over."""
+        """Note that a mission is over."""
         cell = self._cells[number]
         self._over[number] = row
         if self._place[number] < self._open[cell]:
@@ -67,7 +67,7 @@ class Gate:
             self._finished[cell] += sum(number in self._over for number in batch)
 
     def _complete(self, cell: int) -> bool:
-        """All that may have begun is over, and there is more to come."""
+        """True if all admitted missions are over and more follow."""
         return cell not in self.stopped and self._finished[cell] == self._open[cell] < len(
             self._members[cell]
         )
@@ -81,13 +81,13 @@ class Gate:
 
 
 class Queue:
-    """The missing missions in the order of the list, each when its gate lets it through.
+    """The missing missions in the order of the list, each as soon as its limiter admits it.
 
     Args:
         missing: number, setting and changes of each mission.
     """
 
-    def __init__(self, missing: Iterator[Entry], gate: Gate | None) -> None:
+    def __init__(self, missing: Iterator[Entry], gate: BatchLimiter | None) -> None:
         self._missing = missing
         self._gate = gate
         self._held: dict[int, deque[Entry]] = {}  # by setting, in the order of the list
@@ -98,15 +98,15 @@ class Queue:
             return next(self._missing, None)
         return self._released(self._gate) or self._fresh(self._gate)
 
-    def _released(self, gate: Gate) -> Entry | None:
-        """The first of those that had to wait."""
+    def _released(self, gate: BatchLimiter) -> Entry | None:
+        """The first waiting mission that may begin now."""
         self._held = {
             cell: held for cell, held in self._held.items() if held and cell not in gate.stopped
         }
         ready = [held for held in self._held.values() if gate.passes(held[0][0])]
         return min(ready, key=lambda held: held[0][0]).popleft() if ready else None
 
-    def _fresh(self, gate: Gate) -> Entry | None:
+    def _fresh(self, gate: BatchLimiter) -> Entry | None:
         for entry in self._missing:
             number, cell, _ = entry
             if gate.passes(number):

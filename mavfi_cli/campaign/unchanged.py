@@ -1,4 +1,4 @@
-"""What all missions of a campaign fly with: the same versions, the same files of the user's."""
+"""Ensures that all missions of a campaign fly with the same versions and the same user files."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
 
-_VERSIONS, _FILES = "versions", "files"  # words of the ledger
+_VERSIONS, _FILES = "versions", "files"  # keys of the ledger's `meta`
 
 
 def require_unchanged(ledger: Ledger) -> None:
-    """Have one campaign flown by one version of everything, with files that stay as they are.
+    """Require that versions and files are those with which the campaign was begun.
 
     Raises:
-        ConfigError: it was begun with others; names them.
+        ConfigError: the campaign was begun with others; names them.
     """
     versions = installed_versions()
     stored = ledger.meta(_VERSIONS)
@@ -39,7 +39,7 @@ def require_unchanged(ledger: Ledger) -> None:
 
 
 def note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
-    """Note what the files hold that missions name, for `require_unchanged`."""
+    """Store hashes of the files that missions name, for `require_unchanged`."""
     noted = _noted(ledger)
     named = {name for mission in missions for name in mission.config.files}
     new = {name: _digest(name) for name in sorted(named - noted.keys())}
@@ -53,7 +53,7 @@ def _noted(ledger: Ledger) -> dict[str, str]:
 
 
 def _digest(name: str) -> str:
-    """Of a file's bytes; empty where there is none."""
+    """Hash of a file's bytes; empty if there is no file."""
     try:
         return hashlib.sha256(Path(name).read_bytes()).hexdigest()
     except OSError:

@@ -1,6 +1,6 @@
-"""The search for fixed worlds: candidates are flown golden, in turn, until one fits the rule.
+"""Searches for fixed worlds: candidates get golden runs in turn until one fits the rule.
 
-The search is a campaign of its own, in a folder of the campaign's. One that was interrupted goes on
+The search is a separate campaign in a subfolder of the campaign. An interrupted search continues
 where it stopped.
 """
 
@@ -21,11 +21,11 @@ from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.record.measures import fields_of
 
 SEARCH = "world-search"  # the folder
-_AT_ONCE = 4  # candidates whose flights fill the workers together
+_AT_ONCE = 4  # candidates that are flown at the same time
 
 
 class NoWorldFits(ConfigError):
-    """None of the candidates fits the rule; says how often their flights replan."""
+    """None of the candidates fits the rule; the message has the replans of their flights."""
 
     def __init__(self, world: str, rule: FixedWorld, flown: Flown) -> None:
         often = sorted(count for replans in flown for count in replans)
@@ -38,7 +38,7 @@ class NoWorldFits(ConfigError):
 
 
 class _Notes(Spectator):
-    """Hands on notes only: the progress of a search is none of the campaign."""
+    """Passes on notes only, because the progress of a search is not that of the campaign."""
 
     def __init__(self, spectator: Spectator) -> None:
         self.on_note = spectator.on_note  # type: ignore[method-assign]
@@ -51,14 +51,14 @@ def with_worlds(
     options: Options,
     spectator: Spectator,
 ) -> Spec:
-    """The specification with a seed for every world that the rule is for.
+    """Return the specification with a seed for every world that the rule is for.
 
     A world is judged by the first mission in it, flown without fault and protection. The first
     mission has the first of all values, so all stacks and platforms share one world.
 
     Args:
-        missions: of the specification.
-        folder: of the campaign.
+        missions: missions of the specification.
+        folder: folder of the campaign.
 
     Raises:
         NoWorldFits: no candidate fits.
@@ -91,7 +91,7 @@ def _search(
     options: Options,
     spectator: Spectator,
 ) -> Flown:
-    """The replans of candidates 1, 2, 3, ... up to the one that fits."""
+    """Find the replans of candidates 1, 2, 3, ... up to the one that fits."""
     flown: Flown = ()
     for first in range(1, rule.candidates + 1, _AT_ONCE):
         last = min(first + _AT_ONCE - 1, rule.candidates)
@@ -115,7 +115,7 @@ def _search(
 def _replans(
     missions: dict[int, list[MissionConfig]], folder: Path, options: Options, spectator: Spectator
 ) -> dict[MissionConfig, int | None]:
-    """How often each flight replans; None where it could not begin."""
+    """The number of replans of each flight; None if it could not begin."""
     planned = [
         PlannedMission(config=config, labels={"world": config.world, "world_seed": seed})
         for seed, configs in missions.items()

@@ -19,7 +19,7 @@ Scalar = float | int | bool
 
 
 class Field(Enum):
-    """Which part of a value is attacked."""
+    """The part of a value that is attacked."""
 
     SIGN = "sign"
     EXPONENT = "exponent"

@@ -17,7 +17,7 @@ from mavfi_cli.analysis.timeline import timeline_seed, timelines
 from mavfi_cli.campaign.begin import begin, resumed
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import State
+from mavfi_cli.campaign.outcome import ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
 from mavfi_cli.mission.config import MissionConfig
@@ -54,7 +54,7 @@ def compare(
         "errors": [
             f"mission {row['number']}: {row['reason']}"
             for row in rows_of(table, ["number", "state", "reason"])
-            if row["state"] == State.ERROR.value
+            if row["state"] == ResultState.ERROR.value
         ],
         **found,
         "timeline": _timelines(plan, found["flights"], folder / TIMELINE, options, spectator),

@@ -22,7 +22,7 @@ from mavfi_cli.analysis.flights import chosen, flights, flown, rows_of
 from mavfi_cli.analysis.scores import Scores, model_digest
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.outcome import State
+from mavfi_cli.campaign.outcome import ResultState
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
@@ -109,7 +109,9 @@ def _active_harm(faults: pa.Table) -> pa.Table:
 def _errors(tables: Iterable[pa.Table]) -> list[str]:
     rows = (row for table in tables for row in rows_of(table, ["labels", "state", "reason"]))
     return [
-        f"{row['labels']}: {row['reason']}" for row in rows if row["state"] == State.ERROR.value
+        f"{row['labels']}: {row['reason']}"
+        for row in rows
+        if row["state"] == ResultState.ERROR.value
     ]
 
 

@@ -21,7 +21,7 @@ from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.stack import DEFAULT
 from mavfi_cli.vpm.model import safe_velocity_mps
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
-from mavfi_cli.vpm.setting import Setting, outcome
+from mavfi_cli.vpm.setting import ModelInputs, outcome
 
 # Parts of the model that the simulation omits; printed with every report of flights.
 NOT_SCALED = (
@@ -61,7 +61,7 @@ class FlightPlan:
 
 
 def flight_plan(
-    setting: Setting,
+    setting: ModelInputs,
     scheme: Scheme,
     platform: PlatformProfile,
     chain_s: float,
@@ -133,7 +133,7 @@ def write_files(plan: FlightPlan) -> None:
         write_text(path, text)
 
 
-def vehicle_text(setting: Setting, scheme: Scheme, acceleration_mps2: float) -> str:
+def vehicle_text(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> str:
     """TOML of the simulated equivalent of the model's vehicle, with a scheme's boards."""
     vehicle, boards = setting.vehicle, scheme.copies
     told = f"{vehicle.name} of the performance model with {boards} x {setting.board.name}"

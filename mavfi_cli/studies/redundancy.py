@@ -9,7 +9,7 @@ from typing import Any
 from mavfi_cli.analysis.flights import chosen, flights
 from mavfi_cli.analysis.overhead import compute_overheads
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.outcome import State
+from mavfi_cli.campaign.outcome import ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.studies.beside_model import Beside, side_by_side
@@ -52,13 +52,13 @@ def fly_and_report(
             for (_, scheme), arm in arms.items()
             if scheme in DETECTORS
             for each in ledger.results(arm["number"].to_pylist())
-            if each.state is State.FLOWN
+            if each.state is ResultState.FLOWN
         )
     beside = {
         key: Beside(
             plan=each,
-            flights=chosen(arms[key], state=State.FLOWN.value) if key in arms else None,
-            errors=tuple(chosen(arms[key], state=State.ERROR.value)["reason"].to_pylist())
+            flights=chosen(arms[key], state=ResultState.FLOWN.value) if key in arms else None,
+            errors=tuple(chosen(arms[key], state=ResultState.ERROR.value)["reason"].to_pylist())
             if key in arms
             else (),
         )

@@ -24,7 +24,7 @@ from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS
 from mavfi_cli.studies.train import TrainingPlan, train
 from mavfi_cli.vpm.report import CHAINS, Choices, setting_of
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
-from mavfi_cli.vpm.vehicle import Vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 WORLDS = ("sparse", "dense")
 FLOWN, TRAINING = "flown", "training"
@@ -44,7 +44,7 @@ class RedundancyPlan:
         stack: stack of all flights.
     """
 
-    vehicles: Sequence[Vehicle]
+    vehicles: Sequence[ModelVehicle]
     choices: Choices
     worlds: tuple[str, ...] = WORLDS
     missions: int
@@ -108,7 +108,7 @@ def make_plans(
 
 def _plans_of(
     plan: RedundancyPlan,
-    vehicle: Vehicle,
+    vehicle: ModelVehicle,
     schemes: Sequence[Scheme],
     options: Options,
     spectator: Spectator,

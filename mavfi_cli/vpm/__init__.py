@@ -1,1 +1,1 @@
-"""The visual performance model: what the mass and power of compute cost in speed and time."""
+"""The visual performance model: the cost of compute mass and power in speed and flight time."""

@@ -1,4 +1,4 @@
-"""Boards: the computer as mass and power. TOML files, one a board."""
+"""Boards: the computer's mass and power, one TOML file a board."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Board:
     power_w: float  # thermal design power
     heatsink_kgpw: float  # mass of the heat sink for each watt of power_w
     description: str = ""
-    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
+    sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
 
     def __post_init__(self) -> None:
         check_hardware(self)
@@ -32,7 +32,7 @@ class Board:
 
     @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:
-        """The board of a platform; one that stays on the ground has neither mass nor power."""
+        """The board of a platform; a platform on the ground has neither mass nor power."""
         told = f"platform {platform.name}"
         sources = {key: f"{told}: {platform.sources.get(key, 'not given')}" for key in HARDWARE}
         if not platform.carried:

@@ -1,4 +1,4 @@
-"""The one free number of a vehicle, found from one published ratio of flight times."""
+"""Finds the one free number of a vehicle from one published ratio of flight times."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.vpm.board import Board, load_board
 from mavfi_cli.vpm.model import GRAVITY_MPS2
 from mavfi_cli.vpm.schemes import REFERENCE, SCHEMES, named
-from mavfi_cli.vpm.setting import Setting
-from mavfi_cli.vpm.vehicle import Vehicle
+from mavfi_cli.vpm.setting import ModelInputs
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
-_SPAN = 1.0e4  # from the smallest to the largest value that is tried
+_SPAN = 1.0e4  # ratio of the largest to the smallest tried value
 _STEPS = 200  # halvings of the interval; far below a float's resolution
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibrated:
-    """A vehicle with its free number found, and the ratios of flight times that follow."""
+    """A vehicle with its calibrated number, and the resulting ratios of flight times."""
 
-    vehicle: Vehicle
+    vehicle: ModelVehicle
     board: Board
     parameter: str
     value: float  # in the unit of the parameter
     published_ratio: float
     tmr_ratio: float  # flight time with TMR over that with detection and recovery
-    dmr_ratio: float  # a prediction: nothing was fitted to it
+    dmr_ratio: float  # a prediction, not fitted
 
 
-def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
-    """Find the vehicle's free number so that its published ratio comes out.
+def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated:
+    """Find the vehicle's free number that gives its published ratio.
 
-    The ratio falls as the free number grows, so that halving the interval finds it.
+    The ratio falls as the free number grows, so bisection finds it.
 
     Args:
-        vehicle: with a calibration.
-        board: of which the redundant computers consist, where not the calibration's own.
+        vehicle: a vehicle with a calibration.
+        board: the board of the redundant computers; None: the calibration's own.
 
     Raises:
-        ConfigError: no value gives the ratio; says what can be reached.
+        ConfigError: no value gives the ratio; says which ratios can be reached.
         UnknownName: the calibration's board does not exist.
     """
     plan = vehicle.calibration
@@ -48,7 +48,7 @@ def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
     board = board or load_board(plan.board)
     known = {scheme.name: scheme for scheme in SCHEMES}
 
-    def setting(value: float) -> Setting:
+    def setting(value: float) -> ModelInputs:
         """The vehicle with a trial value of the parameter."""
         pull_n, compute_s = vehicle.rotor_pull_n, vehicle.response_s
         if plan.parameter == "rotor_pull_n":
@@ -56,15 +56,15 @@ def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
         else:
             compute_s = value
         full = replace(vehicle, calibration=None, rotor_pull_n=pull_n, response_s=compute_s)
-        assert pull_n is not None  # the vehicle has the one that is not calibrated
+        assert pull_n is not None  # the vehicle has the number that is not calibrated
         assert compute_s is not None
-        return Setting(
+        return ModelInputs(
             vehicle=full, board=board, pull_n=pull_n, range_m=full.range_m,
             compute_s=compute_s, distance_m=1.0,
         )  # fmt: skip
 
     def ratio(value: float, scheme: str) -> float:
-        """Flight time of a scheme over the reference's; infinite where one cannot fly."""
+        """Flight time of a scheme over the reference's; infinite if one of them cannot fly."""
         fast = setting(value).velocity_mps(named(SCHEMES, REFERENCE))
         slow = setting(value).velocity_mps(known[scheme])
         return math.inf if fast is None or slow is None else fast / slow
@@ -95,7 +95,7 @@ def calibrated(vehicle: Vehicle, board: Board | None = None) -> Calibrated:
 def _halving(
     falling: Callable[[float], float], target: float, low: float, high: float
 ) -> float | None:
-    """Where a falling function takes the value `target`, or None outside its range."""
+    """The argument at which a falling function equals `target`; None outside its range."""
     if not falling(high) <= target <= falling(low):
         return None
     for _ in range(_STEPS):

@@ -1,4 +1,4 @@
-"""The whole report as plain data: what is printed, drawn and written as JSON or CSV."""
+"""The whole report as plain data, to be printed, drawn, or written as JSON or CSV."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from mavfi_cli.vpm.calibrate import Calibrated, calibrated
 from mavfi_cli.vpm.model import KNEE_SHARE, safe_velocity_mps
 from mavfi_cli.vpm.schemes import REFERENCE, Scheme, named, unlike_sources
 from mavfi_cli.vpm.sensitivity import sensitivity
-from mavfi_cli.vpm.setting import Outcome, Setting, outcome
-from mavfi_cli.vpm.vehicle import SMALLEST, Vehicle
+from mavfi_cli.vpm.setting import ModelInputs, SchemePerformance, outcome
+from mavfi_cli.vpm.vehicle import SMALLEST, ModelVehicle
 
-# How the latencies of a platform's kernels make one response time, and how that is told.
+# How the latencies of a platform's kernels add up to one response time, and the words for it.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
     "serial": (sum, "sum"),
     "pipelined": (max, "slowest"),
 }
-OTHER_BOARD = "tx2"  # calibrations are repeated with it: what a heavier copy would mean
+OTHER_BOARD = "tx2"  # calibrations are repeated with this heavier board
 RATIOS = ("velocity", "flight_time", "energy", "missions")
 _CURVE_HZ = np.logspace(-1.0, 3.0, 161)
 _COMMAND = "command line"
-_FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # of what a calibration sets
+_FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # units of what a calibration sets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """What the user chose; None: the vehicle's own."""
+    """The user's choices; None means the vehicle's own value."""
 
     platform: PlatformProfile | None = None
     chain: str = "serial"  # one of CHAINS
@@ -43,13 +43,13 @@ class Choices:
 
 
 def report(
-    vehicles: Sequence[Vehicle], choices: Choices, schemes: tuple[Scheme, ...]
+    vehicles: Sequence[ModelVehicle], choices: Choices, schemes: tuple[Scheme, ...]
 ) -> dict[str, Any]:
-    """The model's answer for each vehicle; every key of a number names its unit or is a ratio.
+    """Compute the model's answer for each vehicle; keys of numbers but ratios name the unit.
 
     Raises:
         CannotLift: a vehicle does not lift even one board.
-        ConfigError: a vehicle lacks what the choices do not give either.
+        ConfigError: neither the vehicle nor the choices give a needed value.
     """
     return {
         "model": "F-1, IEEE CAL 19(1), equations 1 to 3",
@@ -61,7 +61,7 @@ def report(
     }
 
 
-def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
+def _one(vehicle: ModelVehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
     found = calibrated(vehicle) if vehicle.calibration else None
     setting, parameters = _setting(vehicle, choices, found)
     reference = outcome(setting, named(schemes, REFERENCE))
@@ -78,20 +78,20 @@ def _one(vehicle: Vehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dic
     }
 
 
-def setting_of(vehicle: Vehicle, choices: Choices) -> Setting:
-    """What the model works with for a vehicle, its free number calibrated.
+def setting_of(vehicle: ModelVehicle, choices: Choices) -> ModelInputs:
+    """Make the model's inputs for a vehicle with its free number calibrated.
 
     Raises:
-        ConfigError: the vehicle lacks what the choices do not give either.
+        ConfigError: neither the vehicle nor the choices give a needed value.
     """
     found = calibrated(vehicle) if vehicle.calibration else None
     return _setting(vehicle, choices, found)[0]
 
 
 def _setting(
-    vehicle: Vehicle, choices: Choices, found: Calibrated | None
-) -> tuple[Setting, list[dict[str, Any]]]:
-    """The numbers that the model works with, and the list of them with their sources."""
+    vehicle: ModelVehicle, choices: Choices, found: Calibrated | None
+) -> tuple[ModelInputs, list[dict[str, Any]]]:
+    """Collect the model's inputs, and list them with their sources."""
     full = found.vehicle if found else vehicle
     sources, free = dict(vehicle.sources), ""
     if found is not None and vehicle.calibration is not None:
@@ -124,7 +124,7 @@ def _setting(
     if choices.range_m is not None:
         sources["range_m"] = _COMMAND
     assert full.rotor_pull_n is not None
-    setting = Setting(
+    setting = ModelInputs(
         vehicle=replace(full, response_s=compute_s, range_m=choices.range_m or full.range_m),
         board=board,
         pull_n=full.rotor_pull_n,
@@ -136,9 +136,9 @@ def _setting(
 
 
 def _notes(
-    vehicle: Vehicle, choices: Choices, setting: Setting, found: Calibrated | None
+    vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: Calibrated | None
 ) -> list[str]:
-    """What a user who changed the computer might take for changed with it."""
+    """Name what did not change with the computer, although a user may think so."""
     notes, board = [], setting.board.name
     own_time = choices.platform is None and choices.response_s is None
     if own_time and board != vehicle.board:
@@ -155,7 +155,7 @@ def _notes(
     return notes
 
 
-def _other_calibration(vehicle: Vehicle, board: Board, found: Calibrated) -> str:
+def _other_calibration(vehicle: ModelVehicle, board: Board, found: Calibrated) -> str:
     unit = _FREE_UNITS[found.parameter]
     told = (
         f"{found.parameter} = {found.value:.4g} {unit} is calibrated with board {found.board.name}"
@@ -169,7 +169,7 @@ def _other_calibration(vehicle: Vehicle, board: Board, found: Calibrated) -> str
     return f"{told}; with board {board.name} it would be {other.value:.4g} {unit}"
 
 
-def _board(vehicle: Vehicle, choices: Choices) -> Board:
+def _board(vehicle: ModelVehicle, choices: Choices) -> Board:
     if choices.board is not None:
         return choices.board
     if choices.platform is not None:
@@ -180,7 +180,7 @@ def _board(vehicle: Vehicle, choices: Choices) -> Board:
     return load_board(vehicle.board)
 
 
-def _parameters(setting: Setting, sources: dict[str, str], free: str) -> list[dict[str, Any]]:
+def _parameters(setting: ModelInputs, sources: dict[str, str], free: str) -> list[dict[str, Any]]:
     units = {
         "mass_kg": "kg", "rotor_pull_n": "N", "tilt_deg": "deg", "range_m": "m",
         "sensor_hz": "Hz", "response_s": "s", "hover_power_w": "W", "battery_wh": "Wh",
@@ -200,13 +200,13 @@ def _parameters(setting: Setting, sources: dict[str, str], free: str) -> list[di
     return rows
 
 
-def _row(setting: Setting, scheme: Scheme, reference: Outcome) -> dict[str, Any]:
-    """A scheme's numbers and its ratios over the reference, or why it cannot fly."""
+def _row(setting: ModelInputs, scheme: Scheme, reference: SchemePerformance) -> dict[str, Any]:
+    """A scheme's numbers and its ratios to the reference, or why it cannot fly."""
     told = {
         "scheme": scheme.name, "title": scheme.title, "boards": scheme.copies,
         "overhead_percent": 100.0 * scheme.overhead, "source": scheme.source,
     }  # fmt: skip
-    numbers = [key.name for key in fields(Outcome) if key.name not in ("scheme", "bound")]
+    numbers = [key.name for key in fields(SchemePerformance) if key.name not in ("scheme", "bound")]
     if setting.velocity_mps(scheme) is None:
         nothing = dict.fromkeys([*numbers, *(f"{name}_ratio" for name in RATIOS), "bound"])
         weights = {"mass_kg": setting.mass_kg(scheme.copies),
@@ -225,8 +225,8 @@ def _row(setting: Setting, scheme: Scheme, reference: Outcome) -> dict[str, Any]
     }
 
 
-def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, Any]]:
-    """The paper's figure: with the calibration's board, and once more with a heavier one."""
+def _calibrations(vehicle: ModelVehicle, found: Calibrated | None) -> list[dict[str, Any]]:
+    """The paper's figure, with the calibration's board and with a heavier one."""
     if found is None:
         return []
     both = [found]
@@ -247,8 +247,8 @@ def _calibrations(vehicle: Vehicle, found: Calibrated | None) -> list[dict[str, 
     ]
 
 
-def _curves(setting: Setting, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
-    """Safe velocity against action throughput for one, two, three boards, where they fly."""
+def _curves(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
+    """Safe velocity against action throughput for the numbers of boards that can fly."""
     copies = sorted({scheme.copies for scheme in schemes})
     flying = [(n, setting.acceleration_mps2(n)) for n in copies]
     return {
@@ -262,7 +262,7 @@ def _curves(setting: Setting, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
 
 
 def schemes_of(told: dict[str, Any]) -> list[dict[str, Any]]:
-    """One flat row a vehicle and scheme, for CSV."""
+    """One flat row for each vehicle and scheme, for CSV."""
     return [
         {"vehicle": one["vehicle"], "board": one["board"], "distance_m": told["distance_m"], **row}
         for one in told["vehicles"]

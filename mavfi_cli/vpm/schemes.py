@@ -1,4 +1,4 @@
-"""Ways to protect a computer, and what each costs: copies of the board, or compute time."""
+"""Protection schemes and their cost: copies of the board, or compute time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.mission.platform import LARGEST
 
-REFERENCE = "aad"  # what the paper's Fig. 15 holds redundancy against
+REFERENCE = "aad"  # the paper's Fig. 15 compares redundancy with it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,7 +18,7 @@ class Scheme:
     name: str
     title: str
     copies: int = 1  # boards with their heat sinks
-    overhead: float = 0.0  # longer compute, as a share of it
+    overhead: float = 0.0  # additional compute time, as a fraction of it
     source: str = ""
 
 
@@ -35,15 +35,15 @@ DETECTORS = tuple(scheme.name for scheme in SCHEMES if scheme.overhead > 0.0)
 
 
 def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> tuple[Scheme, ...]:
-    """The schemes, with measured overheads in place of the paper's.
+    """Return the schemes with measured overheads in place of the paper's.
 
     Args:
-        overheads: of a detector's name to its overhead, per cent of the compute time, and where
-            that comes from.
+        overheads: detector name -> its overhead in per cent of the compute time, and the source
+            of that number.
 
     Raises:
-        UnknownName: a scheme that does not detect and recover.
-        ConfigError: an overhead that is negative, not finite, or a slip of the unit.
+        UnknownName: no scheme of this name detects and recovers.
+        ConfigError: an overhead is negative, not finite, or probably in the wrong unit.
     """
     for name, (percent, _) in overheads.items():
         if name not in DETECTORS:
@@ -62,7 +62,7 @@ def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> tuple[Scheme, ..
 
 
 def unlike_sources(schemes: tuple[Scheme, ...]) -> str | None:
-    """What is to be said where one detector's overhead is the paper's and another's is not."""
+    """A note if one detector's overhead is from the paper and another's is not."""
     detectors = [scheme for scheme in schemes if scheme.name in DETECTORS]
     papers = [scheme.name for scheme in detectors if scheme.source == _TABLE_V]
     others = [scheme.name for scheme in detectors if scheme.source != _TABLE_V]
@@ -75,5 +75,5 @@ def unlike_sources(schemes: tuple[Scheme, ...]) -> str | None:
 
 
 def named(schemes: tuple[Scheme, ...], name: str) -> Scheme:
-    """The scheme of this name, which must be there."""
+    """The scheme of this name, which must exist."""
     return next(scheme for scheme in schemes if scheme.name == name)

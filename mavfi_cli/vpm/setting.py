@@ -1,4 +1,4 @@
-"""One vehicle with its compute in numbers, and what a protection scheme makes of it."""
+"""The model's inputs for one vehicle, and its performance with a protection scheme."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mavfi_cli.vpm.model import (
     safe_velocity_mps,
 )
 from mavfi_cli.vpm.schemes import Scheme
-from mavfi_cli.vpm.vehicle import Vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 _J_PER_WH = 3600.0
 
 
 class Bound(Enum):
-    """What keeps the vehicle from flying faster."""
+    """The limit that keeps the vehicle from flying faster."""
 
     BODY = "body dynamics"
     SENSOR = "sensor"
@@ -30,10 +30,10 @@ class Bound(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setting:
-    """Everything that the model needs to know."""
+class ModelInputs:
+    """The model's inputs for one vehicle with its computer."""
 
-    vehicle: Vehicle
+    vehicle: ModelVehicle
     board: Board
     pull_n: float
     range_m: float
@@ -45,26 +45,26 @@ class Setting:
         return copies * self.board.total_kg
 
     def mass_kg(self, copies: int) -> float:
-        """Mass of all that flies, kg."""
+        """Mass of everything that flies, kg."""
         return self.vehicle.mass_kg + self.carried_kg(copies)
 
     def acceleration_mps2(self, copies: int) -> float:
-        """Largest acceleration, m/s^2; zero or less where the vehicle cannot lift its compute."""
+        """Largest acceleration, m/s^2; zero or less if the vehicle cannot lift its computer."""
         return acceleration_mps2(self.pull_n, self.mass_kg(copies), self.vehicle.tilt_rad)
 
     def response_s(self, overhead: float = 0.0) -> float:
-        """From sensing to acting, s, CAL20 equation 1: the slower of sensor and computer."""
+        """Time from sensing to acting, s, CAL20 equation 1: the slower of sensor and computer."""
         return max(1.0 / self.vehicle.sensor_hz, self.compute_s * (1.0 + overhead))
 
     def velocity_mps(self, scheme: Scheme) -> float | None:
-        """Safe velocity with a scheme, m/s; None where the vehicle cannot lift it."""
+        """Safe velocity with a scheme, m/s; None if the vehicle cannot lift it."""
         accel = self.acceleration_mps2(scheme.copies)
         if accel <= 0.0:
             return None
         return safe_velocity_mps(accel, self.response_s(scheme.overhead), self.range_m)
 
     def too_heavy(self, copies: int) -> CannotLift:
-        """The error that says why so many boards cannot be lifted."""
+        """The error that says why this many boards cannot be lifted."""
         return CannotLift(
             self.vehicle.name,
             pull_n=self.pull_n,
@@ -75,8 +75,8 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
-    """What flying with a scheme is like; numbers are for hovering power and a straight path."""
+class SchemePerformance:
+    """Performance with a scheme, for hovering power and a straight path."""
 
     scheme: Scheme
     mass_kg: float
@@ -84,7 +84,7 @@ class Outcome:
     thrust_to_weight: float
     acceleration_mps2: float
     throughput_hz: float  # actions a second, the inverse of the response time
-    compute_hz: float  # what the computer alone could do
+    compute_hz: float  # rate of the computer alone
     knee_hz: float
     roof_mps: float
     sensor_ceiling_mps: float
@@ -94,14 +94,14 @@ class Outcome:
     flight_time_s: float
     power_w: float  # rotors and boards
     energy_j: float
-    missions: float  # a battery charge, not rounded
+    missions: float  # missions for each battery charge, not rounded
 
 
-def outcome(setting: Setting, scheme: Scheme) -> Outcome:
-    """What a scheme makes of a setting.
+def outcome(setting: ModelInputs, scheme: Scheme) -> SchemePerformance:
+    """Compute the performance of a vehicle with a scheme.
 
     Raises:
-        CannotLift: the rotors do not lift so many boards.
+        CannotLift: the rotors do not lift this many boards.
     """
     vehicle, copies = setting.vehicle, scheme.copies
     accel, velocity = setting.acceleration_mps2(copies), setting.velocity_mps(scheme)
@@ -113,7 +113,7 @@ def outcome(setting: Setting, scheme: Scheme) -> Outcome:
     power_w = rotors_w + copies * setting.board.power_w
     time_s = setting.distance_m / velocity
     slower = Bound.SENSOR if 1.0 / vehicle.sensor_hz > compute_s else Bound.COMPUTE
-    return Outcome(
+    return SchemePerformance(
         scheme=scheme,
         mass_kg=mass_kg,
         compute_kg=setting.carried_kg(copies),

@@ -1,4 +1,4 @@
-"""Vehicles as the model sees them: mass, rotor pull, sensor, battery. TOML files, one a vehicle."""
+"""Vehicles of the model: mass, rotor pull, sensor and battery, one TOML file a vehicle."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 from mavfi_cli.core.config import load_shipped, shipped_names
 from mavfi_cli.mission.platform import LARGEST
 
-CALIBRATED = ("rotor_pull_n", "response_s")  # what a calibration may set
-SMALLEST = 1.0e-6  # in any unit; less is a slip of the unit
+CALIBRATED = ("rotor_pull_n", "response_s")  # the parameters that a calibration may set
+SMALLEST = 1.0e-6  # in any unit; a smaller value is probably in the wrong unit
 SMALL_KG = 0.67  # geometric mean of the simulated vehicles, 0.3 kg and 1.5 kg
 _FOLDER = Path(__file__).parent / "vehicles"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """One number that nobody published, set so that one published ratio comes out."""
+    """One unpublished number, set so that the model gives one published ratio."""
 
     parameter: str  # one of CALIBRATED
-    board: str  # a shipped board, of which the redundant computers consist
+    board: str  # the shipped board of the redundant computers
     tmr_time_ratio: float  # flight time with TMR over that with detection and recovery
-    source: str  # of the ratio
+    source: str  # source of the ratio
 
     def __post_init__(self) -> None:
         if self.parameter not in CALIBRATED:
@@ -32,22 +32,22 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Vehicle:
-    """A quadrotor for the model; a number that is calibrated is None until it is."""
+class ModelVehicle:
+    """A quadrotor of the model; a number is None until it has been calibrated."""
 
     name: str
     mass_kg: float  # frame, rotors and battery, without the boards
     rotor_pull_n: float | None = None  # thrust of all rotors at full throttle
-    response_s: float | None = None  # from sensing to acting, where no platform is named
-    range_m: float  # how far the sensor sees
+    response_s: float | None = None  # from sensing to acting, if no platform is named
+    range_m: float  # range of the sensor
     sensor_hz: float
     hover_power_w: float  # at mass_kg
     battery_wh: float
     tilt_deg: float = 0.0
-    board: str = ""  # a shipped board, where no platform is named
+    board: str = ""  # a shipped board, if no platform is named
     flies_as: str = ""  # the simulated vehicle that stands in for it; empty: one of its size
     description: str = ""
-    sources: dict[str, str] = field(default_factory=dict)  # key -> where its number is from
+    sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
     calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class Vehicle:
 
     @property
     def stand_in(self) -> str:
-        """The simulated vehicle on which flights of this one are based."""
+        """The simulated vehicle that flies in place of this one."""
         if self.flies_as:
             return self.flies_as
         return "spark" if self.mass_kg < SMALL_KG else "solo"
@@ -90,11 +90,11 @@ def vehicle_names() -> list[str]:
     return shipped_names(_FOLDER)
 
 
-def load_vehicle(name_or_path: str) -> Vehicle:
+def load_vehicle(name_or_path: str) -> ModelVehicle:
     """A shipped vehicle of the model by name, or a user's own by the path of its TOML file.
 
     Raises:
         UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
         ConfigError: the file cannot be used.
     """
-    return load_shipped("vehicle", name_or_path, _FOLDER, Vehicle)
+    return load_shipped("vehicle", name_or_path, _FOLDER, ModelVehicle)

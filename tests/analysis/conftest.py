@@ -5,7 +5,7 @@ from flown_twice import whole  # noqa: F401
 
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 
@@ -26,7 +26,7 @@ class Book:
         self.ledger.plan([mission])
         quality = {"flight_time_s": time_s, "distance_m": 50.0, "energy_regression_j": 9e3}
         self.ledger.add(
-            number, state=State.FLOWN, reason="", injected=injected, wall_s=1.0, attempts=1,
+            number, state=ResultState.FLOWN, reason="", injected=injected, wall_s=1.0, attempts=1,
             path=path, result={
                 "outcome": outcome, "quality_of_flight": quality, "pilot": {"replans": seed},
                 **(record or {}),

@@ -13,7 +13,7 @@ from mavfi_cli.analysis.groups import METRICS, groups
 from mavfi_cli.analysis.summary import qualities, summarise
 from mavfi_cli.campaign.begin import stopped
 from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel
@@ -60,7 +60,7 @@ def test_errors_are_counted_nowhere_else(book):
     fill(book)
     book.ledger.plan([PlannedMission(config=MissionConfig(seed=99), labels={"setting": "golden"})])
     book.ledger.add(
-        30, state=State.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
+        30, state=ResultState.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
         attempts=1, path=None,
     )  # fmt: skip
     golden = named(summarise(book.ledger)).cells[0]

@@ -7,7 +7,7 @@ from mavfi_cli.analysis import trajectories
 from mavfi_cli.campaign.begin import chosen
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.detector_config import DetectorConfig
@@ -86,7 +86,7 @@ def test_what_is_not_in_the_picture_is_told(book):
         fault = FaultConfig(target=target, seed=1)
         book.ledger.plan([PlannedMission(config=MissionConfig(seed=1, fault=fault), labels=labels)])
     book.ledger.add(
-        5, state=State.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
+        5, state=ResultState.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
         attempts=1, path=None,
     )  # fmt: skip
     drawn = pair(book.ledger, 6)

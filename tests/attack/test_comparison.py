@@ -28,7 +28,8 @@ def place(native_program, tmp_path):
         path.write_text(f"#!/bin/sh\n{script}\n")
         path.chmod(0o755)
         target = ProgramTarget(
-            command=Command.of([str(path)]), comparison=OutputComparison.of(outputs, **options)
+            command=Command.of([str(path)]),
+            comparison=OutputComparison.of(outputs, **options),
         )
         places.append(target.open())
         return places[-1]

@@ -16,7 +16,7 @@ from mavfi_cli.fi.tracer import linux, record, tracee
 from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.fault import InstructionFault, Role, Stage, explicit_corruption
 from mavfi_cli.fi.tracer.image import Image, Location, executable_mapping, scope_of
-from mavfi_cli.fi.tracer.inject import Activation
+from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.sampling import strategy
 from mavfi_cli.fi.tracer.thread import EntryCounter
 from mavfi_cli.fi.tracer.tracee import Tracee
@@ -264,7 +264,7 @@ def test_drawn_faults_repeat_in_the_node(profiled, node, tmp_path):
         answers.append(ask(node, 1, 2, 3))
         done = tracer.result()
         assert done.injection.applied
-        assert done.followed.activation is not Activation.NOT_INJECTED
+        assert done.followed.activation is not BitActivation.NOT_INJECTED
     assert len({repr(answer) for answer in answers}) == 1
     assert ask(node, 1, 2, 3) == 14.0
 

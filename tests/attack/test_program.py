@@ -32,7 +32,7 @@ from mavfi_cli.fi.tracer.fault import (
     explicit_corruption,
 )
 from mavfi_cli.fi.tracer.image import Image
-from mavfi_cli.fi.tracer.inject import Activation
+from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.spawn import Command
 from mavfi_cli.stats.shares import design_effect, wilson
 
@@ -142,12 +142,12 @@ def test_what_was_overwritten_before_it_was_read_is_benign(target, sites):
     model = FaultModel(roles=frozenset((Role.DESTINATION,)), sites=sites)
     campaign = attacked(target("sorting"), runs=80, seed=3, model=model)
     fates = {
-        (Activation(entry["activation"]["activation"]), Outcome(entry["outcome"]))
+        (BitActivation(entry["activation"]["activation"]), Outcome(entry["outcome"]))
         for entry in campaign.records
-        if entry["activation"]["activation"] == Activation.OVERWRITTEN.value
+        if entry["activation"]["activation"] == BitActivation.OVERWRITTEN.value
     }
-    expected = set() if sites != DATA_REGISTERS else {(Activation.OVERWRITTEN, Outcome.BENIGN)}
-    assert fates - {(Activation.OVERWRITTEN, Outcome.BENIGN)} == set()
+    expected = set() if sites != DATA_REGISTERS else {(BitActivation.OVERWRITTEN, Outcome.BENIGN)}
+    assert fates - {(BitActivation.OVERWRITTEN, Outcome.BENIGN)} == set()
     assert fates >= expected
     assert {entry["outcome"] for entry in campaign.records} > {"benign"}
 
@@ -189,7 +189,7 @@ def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplac
     result = attacker.run(late)
     assert result.outcome is Outcome.NOT_INJECTED
     assert "ended before execution 100000 of counting+0x" in result.reason
-    assert result.followed.activation is Activation.NOT_INJECTED
+    assert result.followed.activation is BitActivation.NOT_INJECTED
 
 
 def test_another_instruction_at_the_place_is_refused(target, workplace):

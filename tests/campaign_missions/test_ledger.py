@@ -14,14 +14,14 @@ from mavfi_cli.campaign.missions import (
     golden_of,
     pair_of,
 )
-from mavfi_cli.campaign.outcome import Injected, State, injected_of
+from mavfi_cli.campaign.outcome import Injected, ResultState, injected_of
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.instruction_config import InstructionConfig
 
 ROW = {
-    "state": State.FLOWN,
+    "state": ResultState.FLOWN,
     "result": {"outcome": "success", "quality_of_flight": {"flight_time_s": 20.0}},
     "reason": "",
     "injected": Injected.GOLDEN,
@@ -67,7 +67,7 @@ def test_what_has_no_row_is_missing(tmp_path):
     with written(tmp_path, 2500) as ledger:
         for number in (0, 3, 2400):
             ledger.add(number, **ROW)
-        ledger.add(5, **{**ROW, "state": State.ERROR, "result": {}, "injected": None})
+        ledger.add(5, **{**ROW, "state": ResultState.ERROR, "result": {}, "injected": None})
         missing = [number for number, *_ in ledger.missing()]
         assert missing == [n for n in range(2500) if n not in (0, 3, 5, 2400)]
         assert [n for n, *_ in ledger.missing(errors=True)][2:5] == [4, 5, 6]

@@ -14,7 +14,7 @@ from plans import planned
 
 from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.outcome import Injected, State
+from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.campaign.run import ATTEMPTS
 from mavfi_cli.campaign.workers.verdict import CampaignStopped
 from mavfi_cli.core.errors import ConfigError, Interrupted
@@ -78,7 +78,7 @@ def test_a_second_run_flies_nothing(campaign):
 )
 def test_a_mission_that_ends_badly_is_a_result(campaign, world, outcome, reason):
     result = only(campaign.run(planned(world)))
-    assert (result.state, result.outcome, result.reason) == (State.FLOWN, outcome, reason)
+    assert (result.state, result.outcome, result.reason) == (ResultState.FLOWN, outcome, reason)
     assert result.attempts == 1
 
 
@@ -117,7 +117,7 @@ def test_a_mission_whose_vehicle_is_killed_each_time_is_still_to_be_flown(campai
 
 def test_a_node_that_is_killed_each_time_is_believed_at_last(campaign):
     result = only(campaign.run(planned("node:killed by SIGKILL")))
-    assert (result.state, result.attempts) == (State.FLOWN, ATTEMPTS)
+    assert (result.state, result.attempts) == (ResultState.FLOWN, ATTEMPTS)
 
 
 @pytest.mark.parametrize(
@@ -129,14 +129,14 @@ def test_a_node_that_is_killed_each_time_is_believed_at_last(campaign):
 )
 def test_a_mission_that_cannot_begin_has_no_outcome(campaign, world, reason, attempts):
     result = only(campaign.run(planned(world)))
-    assert (result.state, result.outcome, result.reason) == (State.ERROR, None, reason)
+    assert (result.state, result.outcome, result.reason) == (ResultState.ERROR, None, reason)
     assert result.injected is None
     assert result.attempts == attempts
 
 
 def test_a_defect_is_an_error_with_its_traceback(campaign):
     result = only(campaign.run(planned("defect")))
-    assert result.state is State.ERROR
+    assert result.state is ResultState.ERROR
     assert result.reason.endswith("ZeroDivisionError: a defect")
 
 

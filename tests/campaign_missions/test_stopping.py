@@ -9,7 +9,7 @@ from plans import planned
 
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.specification.spec import Stop
-from mavfi_cli.campaign.stopping import Gate, Queue
+from mavfi_cli.campaign.stopping import BatchLimiter, Queue
 from mavfi_cli.stats.shares import half_width, rate
 
 STOP = Stop(margin=0.12, batch=10)
@@ -17,7 +17,7 @@ STOP = Stop(margin=0.12, batch=10)
 
 def fly(outcomes, cells, slots, seed):
     """Which missions are flown where `slots` of them fly at a time and end in a random order."""
-    gate = Gate(STOP, cells)
+    gate = BatchLimiter(STOP, cells)
     queue = Queue(((n, cell, {}) for n, cell in enumerate(cells)), gate)
     rng = random.Random(seed)
     flying, flown = [], []
@@ -52,7 +52,7 @@ def test_slots_and_order_make_no_difference(outcomes, seed):
 
 
 def test_faults_that_did_nothing_make_no_interval_narrow():
-    gate = Gate(STOP, [0] * 100)
+    gate = BatchLimiter(STOP, [0] * 100)
     for number in range(20):
         gate.record(number, ("success", Injected.NOT_ACTIVATED.value))
     assert not gate.stopped
@@ -65,7 +65,7 @@ def test_what_was_flown_before_counts():
     cells = [0] * 100
     outcomes = dict(zip(range(100), ["success"] * 100, strict=True))
     flown, _ = fly(outcomes, cells, 1, 0)
-    gate = Gate(STOP, cells, [(n, ("success", "golden")) for n in flown])
+    gate = BatchLimiter(STOP, cells, [(n, ("success", "golden")) for n in flown])
     assert Queue(((n, 0, {}) for n in range(100) if n not in flown), gate).next() is None
 
 

@@ -1,1 +1,1 @@
-"""One kernel of the autonomy at a time, one bit flip a run, and what became of its output."""
+"""Attacks on one kernel of the companion at a time, with one fault a run."""

@@ -1,4 +1,4 @@
-"""The kernels that can be attacked in isolation: how each is called and how outputs compare."""
+"""The kernels that can be attacked in isolation: how they are called and their outputs compared."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Kernel:
     Attributes:
         name: as `--kernel` takes it.
         title: as tables print it.
-        prepare: from the inputs to a call; everything before the kernel itself happens here.
-        compare: size of the difference of two outputs.
-        repeatable: the call leaves no state behind, so it is warmed up by calling it.
-        too_long: to be stepped as a whole; a sample of windows is.
-        inner: compiled functions where windows begin, beside those of its scope.
-        code: entry and scope of a kernel that is not ours, asked where it has run.
+        prepare: function from the inputs to a call; everything before the kernel itself runs here.
+        compare: function that returns the size of the difference of two outputs.
+        repeatable: true if the call leaves no state behind, so that calling it warms it up.
+        too_long: true if the kernel is too long to be stepped whole; windows are sampled.
+        inner: compiled functions at which windows begin, beside those of its scope.
+        code: for a plug-in kernel, function that returns entry and scope; called after it has run.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Kernel:
     code: Callable[[], KernelScope] | None = None
 
     def scope(self) -> KernelScope:
-        """Its machine code that can be hit, in a process in which it has run."""
+        """The machine code that can be hit, in a process in which the kernel has run."""
         found = kernel_scope(self.name) if self.code is None else self.code()
         more = tuple(compiled_region(function)[1] for function in self.inner)
         return replace(found, inner=(*found.inner, *more))
@@ -58,7 +58,7 @@ def _point_cloud(inputs: KernelInputs) -> Call:
     params = point_cloud.PointCloudParams()
 
     def call() -> Output:
-        """One depth frame to points, ENU, m."""
+        """Convert one depth frame to points, ENU, m."""
         cloud = point_cloud.generate(inputs.frame, params)
         return {"points_enu_m": cloud.points_enu_m, "origin_enu_m": cloud.origin_enu_m}
 
@@ -71,7 +71,7 @@ def _octomap(inputs: KernelInputs) -> Call:
         world.insert(cloud)
 
     def call() -> Output:
-        """One more cloud into the map; its serialised tree and number of nodes."""
+        """Insert one more cloud into the map; return its serialised tree and number of nodes."""
         world.insert(inputs.cloud)
         payload = np.frombuffer(world.snapshot().payload, np.uint8)
         return {"payload": payload, "nodes": np.array(world.nodes)}
@@ -83,7 +83,7 @@ def _collision_check(inputs: KernelInputs) -> Call:
     params = collision.CollisionParams()
 
     def call() -> Output:
-        """One check of the rest of a trajectory."""
+        """Check the rest of a trajectory once."""
         _, report = collision.step(collision.CollisionState(), inputs.check, params)
         return {
             "collision": np.array(report.collision),
@@ -96,14 +96,14 @@ def _collision_check(inputs: KernelInputs) -> Call:
 
 def _planner(name: str) -> Callable[[KernelInputs], Call]:
     def prepare(inputs: KernelInputs) -> Call:
-        """A planner's call on the recorded task, the problem posed beforehand."""
+        """Prepare a planner's call on the recorded task, with the problem already set up."""
         task, planner = inputs.task, planners.find(name)
         problem = pose_problem(
             task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
         )
 
         def call() -> Output:
-            """One search; the path (n, 3), ENU, m."""
+            """Search once; return the path (n, 3), ENU, m."""
             result = planner.plan(problem, task.seed)
             return {"found": np.array(result.found), "path_enu_m": result.path_enu_m}
 
@@ -114,7 +114,7 @@ def _planner(name: str) -> Callable[[KernelInputs], Call]:
 
 def _control(inputs: KernelInputs) -> Call:
     def call() -> Output:
-        """One control tick: the command and the integral part of its PID."""
+        """Run one control tick; return the command and the integral part of its PID."""
         state, command = tracking.step(
             inputs.tracking_state, inputs.tracking, inputs.tracking_params
         )
@@ -165,11 +165,11 @@ KERNELS = {
 
 @functools.cache
 def find(name: str) -> Kernel:
-    """A kernel by its name, or the `KERNEL` of a Python file of the user's own.
+    """Find a kernel by its name, or the `KERNEL` of a user's Python file.
 
     Raises:
-        UnknownName: there is none; names the nearest.
-        TargetError: the file has none.
+        UnknownName: there is no such kernel; names the nearest.
+        TargetError: the file has no kernel.
     """
     if name.endswith(".py"):
         return _own(Path(name))
@@ -183,11 +183,11 @@ def _own(path: Path) -> Kernel:
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None or not path.is_file():
         raise TargetError(str(path), "no such file")
-    sys.path.insert(0, str(path.parent))  # as of a script: what lies beside it can be imported
+    sys.path.insert(0, str(path.parent))  # as for a script: modules beside it can be imported
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever the user's file raises
+    except Exception as error:  # the user's file may raise anything
         raise TargetError(str(path), f"cannot be loaded: {error!r}") from None
     kernel = getattr(module, "KERNEL", None)
     if not isinstance(kernel, Kernel):
@@ -196,12 +196,12 @@ def _own(path: Path) -> Kernel:
 
 
 def select(names: Iterable[str]) -> tuple[str, ...]:
-    """What `find` knows the named kernels by; all of ours where none is named.
+    """Return the names by which `find` knows the kernels; all of ours if none is named.
 
     Ours come first, in the order of the pipeline.
 
     Raises:
-        UnknownName: there is none of a name; names the nearest.
+        UnknownName: there is no kernel of a name; names the nearest.
     """
     chosen = list(names)
     files = [str(Path(name).resolve()) for name in chosen if name.endswith(".py")]

@@ -1,4 +1,4 @@
-"""How far a kernel's output is from the golden one, in terms of what the kernel computes."""
+"""Difference between a kernel's output and the golden one, in terms of what it computes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavfi_cli.autonomy.octree import occupied_leaves
 
 Output = dict[str, NDArray[np.generic]]
 
-# What numpy raises when it reads an array whose header is no header, beside ValueError.
+# Errors that numpy raises for an array with a broken header, beside ValueError.
 _DAMAGE = (
     OSError, EOFError, SyntaxError, MemoryError, TypeError, OverflowError, SystemError,
     tokenize.TokenError,
@@ -26,7 +26,7 @@ Compare = Callable[[Output, Output], Difference]
 
 
 def pack(output: Output) -> bytes:
-    """The arrays as bytes, in the order of the dictionary; equal outputs give equal bytes."""
+    """Pack the arrays in the order of the dictionary; equal outputs give equal bytes."""
     buffer = io.BytesIO()
     for name, array in output.items():
         np.save(buffer, np.array(name))
@@ -38,7 +38,7 @@ def unpack(data: bytes) -> Output:
     """Read what `pack` wrote.
 
     Raises:
-        ValueError: something else.
+        ValueError: the bytes are something else.
     """
     buffer, output = io.BytesIO(data), {}
     try:
@@ -51,7 +51,7 @@ def unpack(data: bytes) -> Output:
 
 
 def numbers(golden: Output, output: Output) -> Difference:
-    """Largest difference of a number; relative to the golden one, absolute where that is 0."""
+    """Largest difference of a number, relative to the golden one, or absolute if that is 0."""
     changed, largest, relative = 0, 0.0, 0.0
     for name, expected in golden.items():
         got = output.get(name)
@@ -80,9 +80,9 @@ def _nan(array: NDArray[np.generic]) -> NDArray[np.bool_]:
 
 
 def voxels(golden: Output, output: Output) -> Difference:
-    """How many voxels are occupied in one map only, relative to those of the golden map.
+    """Number of voxels occupied in only one map, relative to those of the golden map.
 
-    Where the same voxels are occupied, the difference is in the number of the tree's nodes.
+    If the same voxels are occupied, the difference is in the number of the tree's nodes.
     """
     ours, theirs = _occupied(golden), _occupied(output)
     count = len(ours ^ theirs)
@@ -110,7 +110,7 @@ def _occupied(output: Output) -> set[tuple[int, int, int]]:
 
 
 def paths(golden: Output, output: Output) -> Difference:
-    """Difference in length of a planned path, and how far its ends are off, m."""
+    """Difference of a planned path in length and in the position of its ends, m."""
     ours, theirs = golden["path_enu_m"], output["path_enu_m"]
     if bool(golden["found"]) != bool(output["found"]):
         return _incomparable("a path" if output["found"] else "no path")

@@ -1,4 +1,4 @@
-"""What the kernels are fed: the inputs of one moment in the middle of a golden flight."""
+"""Inputs of the kernels, from one moment in the middle of a golden run."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import DepthFrame, FloatArray, PointCloud
 
-INPUTS = "inputs.pickle"  # file of a campaign's folder
+INPUTS = "inputs.pickle"  # file in a campaign's folder
 _PROTOCOL = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningTask:
-    """One request of the flight to a planner."""
+    """One request to a planner during the flight."""
 
     snapshot: MapSnapshot
     start_enu_m: FloatArray  # (3,)
@@ -31,11 +31,11 @@ class PlanningTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelInputs:
-    """Inputs and states of all kernels, each as of one invocation of the golden flight."""
+    """Inputs and states of all kernels, each from one invocation of the golden run."""
 
-    flight: str  # which flight, in words
+    flight: str  # name of the flight, in words
     frame: DepthFrame
-    mapped: tuple[PointCloud, ...]  # clouds that the map held already
+    mapped: tuple[PointCloud, ...]  # clouds that the map already contained
     cloud: PointCloud  # the next one
     check: CollisionInputs
     task: PlanningTask
@@ -45,7 +45,7 @@ class KernelInputs:
 
 
 def save_inputs(path: Path, inputs: KernelInputs) -> str:
-    """Write the inputs; returns the SHA-256 of the file.
+    """Write the inputs; return the SHA-256 of the file.
 
     Raises:
         RecordError: the file could not be written.
@@ -61,7 +61,7 @@ def load_inputs(path: Path) -> tuple[KernelInputs, str]:
     The file is a pickle: load only what you wrote yourself.
 
     Raises:
-        RecordError: no such file, or something else.
+        RecordError: no such file, or it holds something else.
     """
     try:
         data = path.read_bytes()
@@ -72,10 +72,10 @@ def load_inputs(path: Path) -> tuple[KernelInputs, str]:
 
 
 def inputs_of_bytes(data: bytes) -> KernelInputs:
-    """The inputs in the bytes of such a file.
+    """Read the inputs from the bytes of such a file.
 
     Raises:
-        pickle.UnpicklingError: something else.
+        pickle.UnpicklingError: the bytes are something else.
     """
     inputs = pickle.loads(data)
     if not isinstance(inputs, KernelInputs):

@@ -1,11 +1,12 @@
-"""What "the kernel" is for an instruction-level fault: its native entry, and the code in scope.
+"""Native entry and code in scope of a kernel, for instruction-level faults.
 
-Of a planner there are two answers. In isolation the kernel is a search, since there is always one:
-OMPL's `solve`. In a mission it is what the planner node does for one request, whether the straight
-way is free or has to be searched for (`node_scope`).
+A planner has two scopes. In isolation the kernel is a search, OMPL's `solve`, because there always
+is one. In a mission the kernel is the planner node's work for one request, with or without a
+search (`node_scope`).
 
-Ask in the process in which the kernel runs, after it has run once (`autonomy.warm_up`): a
-just-in-time compiled kernel has an address only then. The answer can be sent to a tracer.
+Call these functions in the process in which the kernel runs, after it has run once
+(`autonomy.warm_up`): a just-in-time compiled kernel has an address only then. The result can be
+sent to a tracer.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from mavfi_cli.fi.tracer.image import Image, Location, Part, Region, executable_
 PLANNERS = ("rrtstar", "rrt", "rrtconnect")
 KERNELS = ("point_cloud", "octomap", "collision_check", *PLANNERS, "control")
 
-# Code of libompl that belongs to a planner lies together: what the compiler made of its source
-# file, templates included, and the classes that every planner here calls.
+# A planner's code in libompl is contiguous: it is compiled from one source file with its templates.
+# The classes that every planner here calls belong to it too.
 _OMPL_CLASS = {
     "rrtstar": "ompl9geometric7RRTstar",
     "rrt": "ompl9geometric3RRTE",
@@ -70,14 +71,14 @@ class KernelScope:
     """Entry and scope of one kernel in one process.
 
     Attributes:
-        entry: its invocation counts as one invocation of the kernel. The collision check enters
-            once for every point that it tries. Of a planner node it is where a request begins.
-        objects: in scope, by name; regions among them.
-        regions: for `Image`: compiled code without a file, and objects of which a part only is
-            in scope.
-        inner: functions of the kernel. Where it executes too many instructions for a profile of
-            all, invocations of these are sampled; of a planner node, windows that begin at them,
-            and the first is the search.
+        entry: one execution of it counts as one invocation of the kernel. The collision check
+            enters once for every point that it tries. A planner node enters where a request begins.
+        objects: names of the objects in scope, regions included.
+        regions: for `Image`: compiled code without a file, and objects that are only partly in
+            scope.
+        inner: functions of the kernel. If it executes too many instructions to profile them all,
+            invocations of these functions are sampled. For a planner node, windows that begin at
+            them are sampled, and the first function is the search.
     """
 
     kernel: str
@@ -88,11 +89,11 @@ class KernelScope:
 
 
 def kernel_scope(kernel: str) -> KernelScope:
-    """Entry and scope of a kernel in this process.
+    """Find entry and scope of a kernel in this process.
 
     Raises:
         UnknownName: no such kernel; names the nearest.
-        FaultError: it has not run in this process yet.
+        FaultError: the kernel has not run in this process yet.
     """
     if kernel in PLANNERS:
         return _planner(kernel)
@@ -108,7 +109,7 @@ def kernel_scope(kernel: str) -> KernelScope:
 
 
 def library_scope(library: str, function: str) -> KernelScope:
-    """Entry and scope of a kernel that is a function of a shared library; all its code counts.
+    """Find entry and scope of a function of a shared library; all the library's code counts.
 
     Args:
         library: file name of the library, which this process has loaded.
@@ -122,11 +123,11 @@ def library_scope(library: str, function: str) -> KernelScope:
 
 
 def node_scope(node: str, planner: str) -> KernelScope:
-    """Entry and scope of what a mission's node does, in this process.
+    """Find entry and scope of the work of a mission's node, in this process.
 
-    A planner node begins a request with reading the map, which is not in scope, as building the
-    obstacle grid of it is not. In scope is what follows up to the answer: each test whether a
-    straight segment or a piece of the trajectory is free, and the search where there is one.
+    A planner node first reads the map and builds its obstacle grid; neither is in scope. Everything
+    after that is in scope up to the answer: each test whether a straight segment or a piece of the
+    trajectory is free, and the search if there is one.
 
     Raises:
         UnknownName: no such node or planner; names the nearest.
@@ -205,7 +206,7 @@ def _collision_check() -> KernelScope:
 
 
 def _tests_spheres(symbol: str) -> bool:
-    """Whether a function of FCL takes part in testing a sphere against an octree."""
+    """True if a function of FCL takes part in testing a sphere against an octree."""
     if "OcTree" in symbol and "Sphere" in symbol:
         return "libccd" in symbol
     return any(name in symbol for name in _FCL_USED)
@@ -229,7 +230,7 @@ def _planner(kernel: str) -> KernelScope:
 
 
 def _nearest(image: Image, library: str, kernel: str) -> tuple[Location, ...]:
-    """The nearest-neighbour searches of a planner's tree, those that it may call."""
+    """The nearest-neighbour searches that a planner's tree may call."""
     found = [
         Location(library, function.start)
         for function in _facts(image, library).functions_with(_OMPL_MOTION[kernel])
@@ -258,7 +259,7 @@ def _object_of(image: Image, prefix: str, folder: str = "") -> str:
 
 
 def _part(functions: Iterable[Function]) -> Part:
-    """The code of functions; what lies between two of them on a page counts too."""
+    """The code of functions; code between two of them on the same page counts too."""
     spans: list[range] = []
     for function in functions:
         start, end = function.start, function.start + function.size
@@ -270,13 +271,13 @@ def _part(functions: Iterable[Function]) -> Part:
 
 
 def compiled_region(dispatcher: Any) -> tuple[str, Location, Region]:
-    """Name, entry and code of a function that `core.compiled` compiled and that has run.
+    """Find name, entry and code of a function that `core.compiled` compiled and that has run.
 
-    The entry is the one that Python calls. The build is told by the compiled object itself, since
-    the code in memory holds addresses of the process.
+    Python calls this entry. The compiled object identifies the build, because the code in memory
+    contains addresses of the process.
 
     Raises:
-        FaultError: it has not run in this process yet.
+        FaultError: the kernel has not run in this process yet.
     """
     overloads = list(getattr(dispatcher, "overloads", {}).items())
     if not overloads:
@@ -290,7 +291,7 @@ def compiled_region(dispatcher: Any) -> tuple[str, Location, Region]:
 
 
 def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) -> Region:
-    """The text of the compiled object; the whole executable mapping where no cache has it."""
+    """The text of the compiled object; the whole executable mapping if no cache has it."""
     code = _cached_object(dispatcher, signature)
     if code is not None:
         elf: Any = ELFFile(io.BytesIO(code))
@@ -306,7 +307,7 @@ def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) 
 
 
 def _cached_object(dispatcher: Any, signature: Any) -> bytes | None:
-    """The relocatable object in numba's cache, as it was loaded."""
+    """The relocatable object from numba's cache, as it was loaded."""
     cache = getattr(dispatcher, "_cache", None)
     try:
         key = cache._index_key(signature, dispatcher.targetctx.codegen())  # type: ignore[union-attr]

@@ -1,6 +1,6 @@
 """One kernel as a target: a template process that forks itself for every run.
 
-The attacker's side of `attack.kernels.template`: it starts a run, stopped, takes its output
+This is the attacker's side of `attack.kernels.template`. It starts a stopped run, takes its output
 afterwards, and judges it in terms of what the kernel computes.
 """
 
@@ -44,22 +44,22 @@ _PROGRAM = "mavfi_cli.attack.kernels.template"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Where everything is in the memory of a kernel's runs; the same in every template."""
+    """Memory layout of a kernel's runs, the same in every template."""
 
     scope: KernelScope
     image: Image
-    digest: str  # of the addresses of all code
+    digest: str  # hash of the addresses of all code
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelTarget:
-    """A kernel and what it is fed.
+    """A kernel and its inputs.
 
     Attributes:
-        kernel: name of one of ours, or the file of a kernel of the user's own.
-        inputs: file of the inputs of one flight, which `flight` names in words.
-        tolerance: relative difference of an output that is no silent corruption.
-        layout: of a template that was started before; looking it up takes seconds.
+        kernel: name of one of ours, or the file of a user's kernel.
+        inputs: file with the inputs of one flight; `flight` names that flight in words.
+        tolerance: relative error of an output that still counts as benign.
+        layout: layout of an earlier template, because finding it takes seconds.
     """
 
     kernel: str
@@ -78,11 +78,11 @@ class KernelTarget:
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """A kernel's faults do not depend on which others are attacked."""
+        """The kernel's own stream: its faults do not depend on which other kernels are attacked."""
         return (self.name,)
 
     def known(self) -> dict[str, Any]:
-        """What its results depend on."""
+        """Everything that its results depend on."""
         return {
             "inputs_sha256": self.inputs_sha256,
             "flight": self.flight,
@@ -97,7 +97,7 @@ class KernelTarget:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CallOutput:
-    """What a run left: the times of its call, and its packed output or its error."""
+    """The result of a run: the times of its call, and its packed output or its error."""
 
     cpu_s: float
     wall_s: float
@@ -105,7 +105,7 @@ class CallOutput:
 
 
 class KernelPlace:
-    """Where one kernel runs: forks of one template. Belongs to the thread that made it."""
+    """Runs one kernel in forks of one template; use it only in the thread that made it."""
 
     kind = "kernel"
 
@@ -129,7 +129,7 @@ class KernelPlace:
         self.target = replace(target, layout=self.layout)
 
     def _look_up(self, known: Layout | None) -> Layout:
-        """Where everything is; what is known already where it is the same."""
+        """Find the memory layout; reuse the known one if it is the same."""
         pid, process = self._template.pid, self._template
         digest_of_code = _digest_of_code(pid)
         if known is not None and known.digest == digest_of_code:
@@ -142,7 +142,7 @@ class KernelPlace:
         return Layout(scope=scope, image=Image(pid, scope.regions), digest=digest_of_code)
 
     def start(self) -> Tracee:
-        """A fresh run, attached and stopped, that has not called the kernel yet.
+        """Start a run, attached and stopped, that has not called the kernel yet.
 
         Raises:
             TracingForbidden: the operating system refuses.
@@ -159,7 +159,7 @@ class KernelPlace:
         return tracee
 
     def image(self, _: Tracee) -> Image:
-        """What a run has in its memory: the same in all."""
+        """The memory image of a run, the same for all runs."""
         return self.layout.image
 
     def scope(self, image: Image) -> Scope:
@@ -167,14 +167,14 @@ class KernelPlace:
         return scope_of(image, self.layout.scope.objects)
 
     def context(self) -> dict[str, Any]:
-        """What every record says of the kernel."""
+        """Entries of every record about the kernel."""
         objects = list(self.layout.scope.objects)
         return {"scope": objects, "inputs_sha256": self.target.inputs_sha256}
 
     def profile(
         self, rng: np.random.Generator, *, windows: int, watch: Watch | None = None
     ) -> TargetProfile:
-        """Step a fault-free run of the kernel, or a sample of it where that is too long.
+        """Step a golden run of the kernel, or a sample of it if it is too long.
 
         Raises:
             TargetError: the kernel never enters its native code.
@@ -185,10 +185,10 @@ class KernelPlace:
         return profile_run(self, rng, markers=markers, windows=windows, limit=limit, watch=watch)
 
     def fault_free(self) -> Golden:
-        """One run without a fault.
+        """Run once without a fault.
 
         Raises:
-            TargetError: it fails.
+            TargetError: the run fails.
         """
         ended = run_out(self.start())
         output = self.left()
@@ -199,11 +199,11 @@ class KernelPlace:
         return Golden(output=output.data, cpu_s=output.cpu_s, wall_s=output.wall_s)
 
     def unlike(self, golden: Golden, again: Golden) -> str:
-        """How two fault-free runs differ; empty where they do not."""
+        """How two fault-free runs differ; empty if they are equal."""
         return "" if golden.output == again.output else "their outputs differ"
 
     def left(self) -> CallOutput | None:
-        """What the run that has ended left; None where it left nothing whole."""
+        """The result of the ended run; None if it is not complete."""
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None
@@ -211,7 +211,7 @@ class KernelPlace:
         return CallOutput(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
-        """Judge the last run; `ended` is None where it was cut off."""
+        """Judge the last run; `ended` is None if it exceeded its limit."""
         output = self.left()
         left = None if output is None or ended is None else output.data
         tolerance = self.target.tolerance or None
@@ -248,7 +248,7 @@ def _read(inputs: Path) -> bytes:
 
 
 def _digest_of_code(pid: int) -> str:
-    """Of the addresses of everything executable in a process."""
+    """Hash of the addresses of everything executable in a process."""
     maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
     code = [line.split() for line in maps if "x" in line.split()[1]]
     known = [f"{part[0]} {part[2]} {part[-1]}" for part in code]

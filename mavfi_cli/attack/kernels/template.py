@@ -1,14 +1,14 @@
-"""A warm process with one kernel loaded and fed, that forks itself for every run.
+"""A warm process with one kernel and its inputs loaded, which forks itself for every run.
 
-The message to it is the kernel's name and its inputs. From then on it is asked in single bytes on
-the same socket. `ASK_SCOPE` is answered by the kernel's scope. For every `RUN` a child is forked,
-which sends its process id (4 bytes), waits for `GO`, calls the kernel once, writes its output to
-standard output, a file, and ends. The next request must not come before the child has ended. The
-file holds CPU seconds and duration of the call (two float64), then the packed output, or the
-error's text where the exit code is `RAISED`.
+The first message is the kernel's name and its inputs. Later requests are single bytes on the same
+socket. The answer to `ASK_SCOPE` is the kernel's scope. For every `RUN` a child is forked: it sends
+its process id (4 bytes), waits for `GO`, calls the kernel once, writes its output to standard
+output, a file, and ends. The next request must not come before the child has ended. The file holds
+CPU seconds and duration of the call (two float64), then the packed output, or the error's text if
+the exit code is `RAISED`.
 
-Every run starts from the same memory: no garbage collection, and nothing is kept here from one fork
-to the next.
+Every run starts from the same memory: garbage collection is off, and nothing is kept here from one
+fork to the next.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ TIMES = struct.Struct("<dd")
 PID_BYTES = 4
 RUN, GO, ASK_SCOPE = b"r", b"g", b"s"
 OUTPUT = 1
-_EXTRA_MEMORY = 2 << 30  # a corrupted size must not take the machine down
+_EXTRA_MEMORY = 2 << 30  # a corrupted size must not exhaust the machine's memory
 _LARGEST_FILE = 1 << 28
 
 
 def main() -> None:
-    """Get warm, then fork until the other end closes."""
+    """Load and warm up the kernel, then fork until the other end closes."""
     connection = channel()
     name, inputs = receive(connection)
     kernel = catalogue.find(name)
@@ -59,18 +59,18 @@ def main() -> None:
             status = _in_child(lambda: _tell_scope(connection, kernel, call))
             if status:
                 _give_up(f"fails without a fault (wait status {status})")
-        elif request == RUN:  # not the GO of a child that was killed before it took it
+        elif request == RUN:  # not the GO of a child that was killed before reading it
             _in_child(lambda: _run(connection, call))
 
 
 def _give_up(why: str) -> None:
-    """End without the libraries' own last words, which would hide ours."""
+    """End without the libraries' own last messages, which would hide ours."""
     os.write(2, f"{why}\n".encode())
     os._exit(1)
 
 
 def _in_child(work: Callable[[], int]) -> int:
-    """Do work in a fork of this process, and wait for its end; its wait status."""
+    """Do work in a fork of this process; return its wait status when it has ended."""
     child = os.fork()
     if child:
         return os.waitpid(child, 0)[1]
@@ -92,21 +92,21 @@ def _limit() -> None:
 
 
 def _tell_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
-    """Look up where the kernel's code is; in a child, as that leaves much in the memory."""
+    """Find the kernel's code in a child, because that changes the memory much."""
     call()
     send(connection, kernel.scope())
     return 0
 
 
 def _run(connection: socket.socket, call: Call) -> int:
-    """One run of the kernel; the exit code."""
+    """Run the kernel once; return the exit code."""
     connection.send(os.getpid().to_bytes(PID_BYTES, "little"))
     if not connection.recv(1):
         return 0
     cpu_s, wall_s, code = time.process_time(), time.perf_counter(), 0
     try:
         data = pack(call())
-    except Exception as error:  # whatever the corrupted kernel raises is a result
+    except Exception as error:  # any error of the corrupted kernel is a result
         data, code = f"{type(error).__name__}: {error}".encode(), RAISED
     times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
     os.pwrite(OUTPUT, times + data, 0)

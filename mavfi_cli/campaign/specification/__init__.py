@@ -1,1 +1,1 @@
-"""What a campaign is to fly: campaign.toml, presets, factors; written down, changed, compared."""
+"""Specifications of campaigns: campaign.toml, presets and factors."""

@@ -1,4 +1,4 @@
-"""A specification with other values of some factors, as `--set KEY=VALUE[,VALUE]` asks for."""
+"""Replaces factors of a specification, as `--set KEY=VALUE[,VALUE]` requests."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from mavfi_cli.campaign.specification.spec import LISTS, Spec, read_spec
 from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 
-_ODD = re.compile(r"[^\w.+=-]+")  # what no folder's name gets
+_ODD = re.compile(r"[^\w.+=-]+")  # not in a folder's name
 _COMMA = re.compile(r',(?=(?:[^"]*"[^"]*")*[^"]*$)')  # outside double quotes
-_LONGEST = 100  # a folder's name; a longer one ends with a digest of the changes
+_LONGEST = 100  # characters of a folder's name; a longer one ends with a digest of the changes
 
 
 def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
-    """The specification with factors replaced, under a name that tells them.
+    """Return the specification with factors replaced, under a name that includes the changes.
 
-    A factor is replaced wherever the specification has it, in all settings; one of the mission that
-    it does not have is added to all missions.
+    A factor is replaced in all settings that have it. A factor of the mission that is
+    missing from the specification is added to all missions.
 
     Args:
-        changes: KEY=VALUE[,VALUE], each another key. A value with a comma is quoted as in TOML, and
-            all values may be written as one TOML list.
+        changes: KEY=VALUE[,VALUE], each with a different key. A value with a comma is quoted
+            as in TOML, and all values may be written as one TOML list.
 
     Raises:
         UnknownKey: no such factor; names the nearest.
-        ConfigError: no KEY=VALUE, a factor of faults that the specification has not, or values
-            that a specification cannot have.
+        ConfigError: a change is not KEY=VALUE, the specification lacks this factor of faults, or it
+            cannot have these values.
     """
     if not changes:
         return spec
@@ -73,7 +73,7 @@ def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
 
 
 def _values(key: str, text: str) -> list[Any]:
-    """The values; of a factor that is a list, the elements of one, or several lists."""
+    """Parse the values; for a list-valued factor, the elements of one list or several lists."""
     listed = text[0] == "[" and text[-1] == "]"
     if listed and isinstance(values := _value(text), list):
         return values
@@ -82,7 +82,7 @@ def _values(key: str, text: str) -> list[Any]:
 
 
 def _value(text: str) -> Any:
-    """A number, a truth value, a quoted text or a list as in TOML; else the text."""
+    """Parse a number, a truth value, a quoted text or a list as in TOML; else keep the text."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -1,4 +1,4 @@
-"""In what two specifications differ that decides which missions are flown."""
+"""Differences between two specifications that change which missions are flown."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _Choices = Mapping[str, Sequence[Any]]
 
 
 def differences(stored: Spec, asked: Spec, repetitions: str = "repetitions") -> list[str]:
-    """A phrase for each factor or number that differs; empty where only names and stops do.
+    """Return a phrase for each factor or number that differs; names and stops do not count.
 
     Args:
-        repetitions: what they are called.
+        repetitions: the word for repetitions.
     """
     found = list(_phrases(_choices(stored, repetitions), _choices(asked, repetitions)))
     return found or list(_between_settings(stored, asked))
@@ -27,7 +27,7 @@ def _phrases(there: _Choices, here: _Choices) -> Iterator[str]:
             continue
         gone = [value for value in old if value not in new]
         added = [value for value in new if value not in old]
-        if len(gone) < len(old) and (gone or added):  # they share values: only the others tell
+        if len(gone) < len(old) and (gone or added):  # they share values: name only the others
             parts = [f"{_told(gone)} only there"] if gone else []
             parts += [f"{_told(added)} only here"] if added else []
             yield f"{key} {', '.join(parts)}"
@@ -57,7 +57,7 @@ def _choices(spec: Spec, repetitions: str) -> _Choices:
 
 
 def _between_settings(stored: Spec, asked: Spec) -> Iterator[str]:
-    """The same values, but in other settings."""
+    """Phrases for equal values in other settings."""
     for there, here in zip(stored.settings, asked.settings, strict=True):
         name = f" of setting {here.name}" if here.name else ""
         for phrase in _phrases(_of_setting(there), _of_setting(here)):

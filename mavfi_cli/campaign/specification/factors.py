@@ -1,7 +1,7 @@
-"""The factors of a campaign: what may differ from mission to mission, and where it goes.
+"""The factors of a campaign: what may differ between missions, and the field that holds it.
 
-Adding one is a line in the table: the name under which a specification writes it, and the record
-that has it as a field.
+A new factor is one line in the table: its name in a specification, and the record that has it as a
+field.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from mavfi_cli.mission.instruction_config import InstructionConfig
 
 
 class Level(Enum):
-    """Where faults strike."""
+    """The level at which faults strike."""
 
     SOURCE = "source"
     INSTRUCTION = "instruction"
 
 
 _RECORDS = {Level.SOURCE: FaultConfig, Level.INSTRUCTION: InstructionConfig}
-# What a specification may call a field of the mission, and of either level's fault, otherwise.
+# Other names in a specification for fields of the mission and of either level's fault.
 _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
 _NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
-# What may differ without any fault.
+# Factors that may differ without any fault.
 MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NESTED | _NEVER)
 _DETECTOR = {"detector": "name"} | {
     each.name: each.name for each in fields(DetectorConfig) if each.name != "name"
@@ -52,20 +52,20 @@ NAMES = _names()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """One combination of factors, and the mission that it stands for but for its seeds."""
+    """One combination of factors: a mission without its seeds."""
 
     values: Mapping[str, Any]
 
     @property
     def target(self) -> str:
-        """What the fault is to strike; empty without one."""
+        """The target of the fault; empty without a fault."""
         return next((str(self.values[name]) for name in _ALIASES if name in self.values), "")
 
     def mission(self, seed: int, fault_seed: int) -> MissionConfig:
         """The mission.
 
         Raises:
-            ConfigError: factors that do not go together, values of the wrong type.
+            ConfigError: factors contradict each other, or a value has the wrong type.
         """
         mission = {name: self.values[name] for name in MISSION if name in self.values}
         mission["seed"] = self.values.get("seed", seed)
@@ -119,15 +119,15 @@ def _member(name: Any) -> Level:
 
 
 def check_names(config: MissionConfig, simulator: Callable[[MissionConfig], None]) -> None:
-    """Say now what would keep every mission like this one from being flown.
+    """Raise now what would keep every mission like this one from being flown.
 
     Args:
-        config: one mission of them.
-        simulator: raises what the simulated vehicle says to it.
+        config: one of these missions.
+        simulator: raises the simulated vehicle's error for the mission, if there is one.
 
     Raises:
-        MavfiError: a world, vehicle, planner, platform, stack or target that does not exist, a
-            model of another stack, values that make no fault, a start that is blocked.
+        MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model is
+            for another stack; values make no fault; or the start is blocked.
     """
     from mavfi_cli.autonomy import planners
     from mavfi_cli.mission.detector_config import detector_of

@@ -1,7 +1,7 @@
-"""Fixed worlds by rule: all missions in a world share one, chosen by how often flights replan.
+"""Fixed worlds by rule: all missions in a world share one, chosen by the number of replans.
 
-The paper flies one fixed world with many faults, and does not say which. The rule names worlds by
-what a golden flight does there; the search for them is in `campaign.world_search`.
+The paper flies one fixed world with many faults, and does not say which. The rule selects worlds by
+the replans of golden runs there. `campaign.world_search` searches for them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-Flown = tuple[tuple[int, ...], ...]  # of each candidate the replans of its golden flights
+Flown = tuple[tuple[int, ...], ...]  # for each candidate, the replans of its golden runs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,13 +18,13 @@ class FixedWorld:
     """The table `[fixed_world]` of a specification.
 
     Attributes:
-        replans: the least and the most replans, in the median over golden flights.
-        flights: so many golden flights of each candidate, with seeds from the campaign's first on.
-        candidates: the world seeds 1 to this are tried; the first one that fits is taken.
-        worlds: the rule is for these only; empty: for all of the campaign.
-        world_seed: the seed of a world, named by the user or found by the rule.
-        flown: how often the golden flights of candidates 1, 2, 3, ... have replanned; of a
-            candidate whose flights could not begin, less than `flights`.
+        replans: least and most replans, for the median over golden runs.
+        flights: golden runs of each candidate, with seeds from the campaign's first on.
+        candidates: world seeds 1 to this number are tried, and the first that fits is taken.
+        worlds: the worlds that the rule is for; empty: all worlds of the campaign.
+        world_seed: seed of each world, named by the user or found by the rule.
+        flown: replans of the golden runs of candidates 1, 2, 3, ...; fewer than `flights` values
+            for a candidate whose flights could not begin.
     """
 
     replans: tuple[int, int]
@@ -45,17 +45,17 @@ class FixedWorld:
                 raise ValueError(f"world_seed.{world}: must not be negative, is {seed}")
 
     def rules(self, world: str) -> bool:
-        """Whether missions in this world share one; a user's own boxes are one world already."""
+        """True if missions in this world share one; a user's own boxes already are one world."""
         named = world in self.worlds or world in self.world_seed
         return named or (not self.worlds and not world.endswith(".toml"))
 
     def fits(self, replans: Sequence[int]) -> bool:
-        """Whether a candidate is the one, by what its golden flights did."""
+        """True if a candidate fits the rule by the replans of its golden runs."""
         least, most = self.replans
         return len(replans) == self.flights and least <= statistics.median(replans) <= most
 
     def told(self) -> str:
-        """The rule and what it has found, in one line."""
+        """The rule and the worlds that it has found, in one line."""
         found = [
             f"{world} {seed}{self._median(world)}" for world, seed in self.world_seed.items()
         ] or ["none yet"]
@@ -69,7 +69,7 @@ class FixedWorld:
         return f"the first from 1 on whose golden flights replan {often} (median of {self.flights})"
 
     def _median(self, world: str) -> str:
-        """Of the candidate that was found; empty where the user has named the seed."""
+        """Median replans of the found candidate; empty if the user has named the seed."""
         if world not in self.flown:
             return " (named)"
         return f" (median {statistics.median(self.flown[world][-1]):g})"

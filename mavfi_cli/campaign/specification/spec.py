@@ -28,7 +28,7 @@ _SETTING = ("name", "repetitions")
 MOST = 1_000_000  # missions of one campaign
 # Factors whose value is a list already: a list of lists crosses several.
 LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
-_NO_VALUES = (datetime.date, datetime.time)  # what TOML has and no factor
+_NO_VALUES = (datetime.date, datetime.time)  # types that TOML has and factors do not
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +37,7 @@ class Setting:
 
     name: str = ""
     axes: Axes = field(default_factory=dict)
-    repetitions: int | None = None  # None: as many as the campaign says
+    repetitions: int | None = None  # None: as many as the campaign has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,9 +45,9 @@ class Stop:
     """When a setting has been flown often enough.
 
     Attributes:
-        margin: half of the Wilson interval of the success rate, at most.
-        confidence: of that interval.
-        batch: the interval is looked at after every so many missions of a setting.
+        margin: largest half-width of the Wilson interval of the success rate.
+        confidence: confidence of that interval.
+        batch: the interval is checked after every batch of this many missions of a setting.
     """
 
     margin: float
@@ -61,13 +61,13 @@ class Spec:
 
     Attributes:
         seed: root of the seeds of all faults.
-        first_seed: of the missions; repetition r flies with first_seed + r.
+        first_seed: first seed of the missions; repetition r flies with first_seed + r.
         repetitions: missions for each combination of factors.
-        fixed: what all missions have.
+        fixed: factors that all missions share.
         axes: factors that are crossed, each with its values.
         settings: lists of missions, each crossed with `axes`.
         stop: ends settings early; None flies everything.
-        fixed_world: has all missions of a world share one; None: the world changes with the seed.
+        fixed_world: has missions in a world share one; None: the world changes with the seed.
     """
 
     name: str
@@ -83,16 +83,16 @@ class Spec:
     fixed_world: FixedWorld | None = None
 
     def scaled(self, scale: float) -> Spec:
-        """The same campaign with so much of its repetitions, at least one each.
+        """Return the same campaign with a fraction of its repetitions, at least one each.
 
         Raises:
-            ConfigError: a scale that leaves nothing.
+            ConfigError: the scale leaves nothing.
         """
         if not (math.isfinite(scale) and scale > 0.0):
             raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
 
         def share(count: int) -> int:
-            """So many repetitions, scaled, at least one."""
+            """Scale a number of repetitions, to at least one."""
             return max(1, round(count * scale))
 
         settings = tuple(
@@ -104,10 +104,10 @@ class Spec:
         return replace(self, repetitions=share(self.repetitions), settings=settings)
 
     def missions(self) -> list[PlannedMission]:
-        """The list: repetition by repetition, so that pairs and settings grow together.
+        """List the missions repetition by repetition, so that pairs and settings grow together.
 
         Raises:
-            ConfigError: nothing to fly, more than MOST, or a combination that makes no mission.
+            ConfigError: there is nothing to fly, more than MOST, or a combination makes no mission.
         """
         points = self._points()
         return [
@@ -118,7 +118,7 @@ class Spec:
         ]
 
     def kinds(self) -> list[PlannedMission]:
-        """The first missions of the list, one of each combination; the others differ in seeds.
+        """The first missions of the list, one for each combination; the others differ in seeds.
 
         Raises:
             ConfigError: as `missions`.
@@ -126,7 +126,7 @@ class Spec:
         return [self._mission(point, labels, 0) for point, labels, _ in self._points()]
 
     def _points(self) -> list[tuple[Point, dict[str, Label], int]]:
-        """Each combination with its labels and its repetitions."""
+        """Combine the factors; return each combination with its labels and repetitions."""
         if (planned := sum(self._size(setting) for setting in self.settings)) > MOST:
             raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
         points = [
@@ -142,7 +142,7 @@ class Spec:
         return self.repetitions if setting.repetitions is None else setting.repetitions
 
     def _size(self, setting: Setting) -> int:
-        """How many missions a setting has, without making them."""
+        """Number of missions of a setting, without making them."""
         return self._count(setting) * math.prod(map(len, {**self.axes, **setting.axes}.values()))
 
     def _combinations(self, setting: Setting) -> Iterator[tuple[dict[str, Any], dict[str, Label]]]:
@@ -157,8 +157,8 @@ class Spec:
         self, point: Point, labels: Mapping[str, Label], repetition: int
     ) -> PlannedMission:
         seed = point.values.get("seed", self.first_seed + repetition)
-        # What is struck has a part in it, else the faults of all states would be one draw. Nothing
-        # else has: the same place gets the same fault whatever protects it or computes.
+        # The target is part of it, or the faults of all states would share one draw. Nothing else
+        # is: the same target gets the same fault under every detector and platform.
         fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition, point.target)
         with naming(labels):
             config = point.mission(seed, fault_seed)
@@ -181,7 +181,7 @@ def presets() -> tuple[str, ...]:
 
 
 def load_spec(name: str) -> Spec:
-    """A preset, or the specification in a TOML file.
+    """Load a preset, or the specification in a TOML file.
 
     Raises:
         UnknownName: neither a preset nor a file.
@@ -203,7 +203,7 @@ def load_spec(name: str) -> Spec:
 
 
 def parse_spec(text: str, path: Path) -> Spec:
-    """The specification in a TOML text; `path` is for messages and the default name."""
+    """Parse a specification in TOML; `path` is for messages and the default name."""
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -212,18 +212,18 @@ def parse_spec(text: str, path: Path) -> Spec:
 
 
 def read_spec(data: Mapping[str, Any], path: Path) -> Spec:
-    """The specification that TOML's tables hold; `path` as for `parse_spec`."""
+    """Read a specification from TOML's tables; `path` as for `parse_spec`."""
     return _Reader(path).spec(data)
 
 
 class _Reader:
-    """Reads the tables of one file, and says in which of them something is wrong."""
+    """Reads the tables of one file; its errors name the table."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def spec(self, data: Mapping[str, Any]) -> Spec:
-        """The whole file."""
+        """Read the whole file."""
         self._known(data, _TOP, "")
         settings = data.get("setting", [{}])
         if not isinstance(settings, list):
@@ -281,7 +281,7 @@ class _Reader:
         return values
 
     def _usable(self, name: str, value: Any, prefix: str) -> None:
-        """Refuse one value that no mission can have, whatever the factor's own type is."""
+        """Refuse a value that no mission can have, whatever the factor's type."""
         if name in LISTS and not isinstance(value, list):
             problem = f"expected a list, got {value!r}"
         elif isinstance(value, _NO_VALUES):
@@ -345,6 +345,6 @@ class _Reader:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rule:
-    """The table in its place, so that errors name it."""
+    """Wraps the table, so that errors name it."""
 
     fixed_world: FixedWorld

@@ -1,4 +1,4 @@
-"""A specification written down again, resolved: the campaign.toml in a campaign's folder."""
+"""Writes a resolved specification: the campaign.toml in a campaign's folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mavfi_cli.campaign.specification.spec import Axes, Spec
 
 
 def to_toml(spec: Spec) -> str:
-    """TOML of which `parse_spec` makes an equal specification."""
+    """Write TOML from which `parse_spec` makes an equal specification."""
     lines = _pairs(
         {
             "name": spec.name,
@@ -45,7 +45,7 @@ def _table(head: str, values: Mapping[str, Any]) -> list[str]:
 
 
 def _quoted(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with keys that may hold what no bare key of TOML has, as names of worlds do."""
+    """Quote the keys, because names of worlds may not be bare keys of TOML."""
     return {json.dumps(key, ensure_ascii=False): value for key, value in values.items()}
 
 
@@ -55,5 +55,5 @@ def _pairs(values: Mapping[str, Any]) -> list[str]:
 
 
 def _lists(axes: Axes) -> dict[str, Any]:
-    """Each factor as the list of its values; of list-valued ones a list of lists."""
+    """Each factor as the list of its values; a list-valued factor as a list of lists."""
     return {name: list(values) for name, values in axes.items()}

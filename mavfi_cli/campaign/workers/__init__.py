@@ -1,8 +1,8 @@
-"""The processes that fly a campaign's missions, and what their ends mean.
+"""The worker processes that fly a campaign's missions.
 
-base     what the runner knows of workers
+base     the interface of workers
 local    workers on this machine
-cluster  the same on dask.distributed; remote is the side of its workers
-task     what a worker does
-verdict  what the end of a mission's process means
+cluster  workers on dask.distributed; remote is the code on their side
+task     the work of a worker
+verdict  the meaning of the end of a mission's process
 """

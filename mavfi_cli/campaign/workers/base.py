@@ -1,4 +1,4 @@
-"""Workers fly missions: what the runner knows of those on this machine, and of a cluster's."""
+"""The interface of workers, on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any, Self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ended:
+class AttemptEnd:
     """How one attempt at a mission ended.
 
     Attributes:
-        exit: code with which the mission's process ended; None where it was killed.
-        signal: that killed it; None where its guard was killed too, or the time ran out.
-        timeout: the limit of wall time passed.
-        report: the mission's own last words: folder, or error and text, or traceback.
-        lost: why nobody knows how it ended.
-        wall_s: of the whole attempt, the guard's own work included.
+        exit: exit code of the mission's process; None if it was killed.
+        signal: signal that killed it; None if its guard was killed too, or the time ran out.
+        timeout: true if the limit of wall time passed.
+        report: the mission's last message: folder, or error and text, or traceback.
+        lost: why its end is unknown.
+        wall_s: wall time of the whole attempt, the guard's work included, s.
     """
 
     number: int
@@ -35,9 +35,9 @@ class Assignment:
     """One mission to be flown.
 
     Attributes:
-        number: of the mission.
-        changes: what it has other than by default.
-        out: the folder that is to hold what it leaves.
+        number: number of the mission.
+        changes: its values that differ from the defaults.
+        out: the folder for its run folder.
     """
 
     number: int
@@ -57,16 +57,16 @@ class Workers(ABC):
     @property
     @abstractmethod
     def free(self) -> int:
-        """How many missions may be started now."""
+        """Number of missions that may be started now."""
 
     @abstractmethod
     def start(self, mission: Assignment, limit_s: float) -> None:
-        """Start a mission that has `limit_s` of wall time."""
+        """Start a mission with a limit of wall time, s."""
 
     @abstractmethod
-    def wait(self, timeout_s: float) -> list[Ended]:
-        """The missions that ended, waiting for news or the time-out."""
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
+        """Wait for news or the time-out; return the missions that ended."""
 
     @abstractmethod
     def close(self) -> None:
-        """End what is still running."""
+        """End all missions that still run."""

@@ -1,4 +1,4 @@
-"""A campaign on dask.distributed: the same runner, whose workers are the threads of a cluster."""
+"""Workers of a campaign on dask.distributed: the threads of a cluster."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.workers.base import Assignment, Ended, Workers
+from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd, Workers
 from mavfi_cli.campaign.workers.local import TASK
 from mavfi_cli.campaign.workers.remote import Answer, Order, fly, unpack, worker_versions
 from mavfi_cli.core.errors import MavfiError
@@ -23,31 +23,31 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 CONNECT_S, WORKERS_S = 15.0, 60.0
-_BACKLOG = 2  # missions a thread of a worker has before it, so that it never waits for us
-_LOOK_S = 2.0  # how often the number of threads is asked for
+_BACKLOG = 2  # missions queued for each thread, so that it never waits for us
+_LOOK_S = 2.0  # interval between queries for the number of threads
 
 
 class ClusterError(MavfiError):
-    """A cluster that cannot be used."""
+    """The cluster cannot be used."""
 
 
 class Cluster(Workers):
     """The workers of one scheduler.
 
     Args:
-        address: of the scheduler, as tcp://host:8786.
-        keep: policy of the campaign; other run folders travel without their traces.
-        task: module that does the work.
+        address: address of the scheduler, such as tcp://host:8786.
+        keep: the campaign's policy; other run folders are sent without their traces.
+        task: the module that does the work.
 
     Raises:
-        ClusterError: dask is not installed, the scheduler is not there, no worker comes, or one of
-            them has another version of something that results depend on.
+        ClusterError: dask is not installed, the scheduler does not answer, no worker connects, or
+            a worker has another version of something that results depend on.
     """
 
     def __init__(self, address: str, keep: Keep, task: str = TASK) -> None:
         self._keep, self._task = keep, task
         self._versions = installed_versions()
-        self._token = uuid.uuid4().hex[:8]  # of this run: no other run's results are taken for ours
+        self._token = uuid.uuid4().hex[:8]  # tells this run's results from others
         self._submitted = 0
         self._futures: dict[int, tuple[Future, Path]] = {}
         self._done: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -60,14 +60,14 @@ class Cluster(Workers):
 
     @property
     def free(self) -> int:
-        """How many missions may be handed out now."""
+        """Number of missions that may be sent now."""
         if time.monotonic() - self._looked_s > _LOOK_S:
             self._threads = sum(self._client.nthreads().values())
             self._looked_s = time.monotonic()
         return _BACKLOG * self._threads - len(self._futures)
 
     def start(self, mission: Assignment, limit_s: float) -> None:
-        """Hand a mission out."""
+        """Send a mission to the cluster."""
         number = mission.number
         order = Order(
             number=number,
@@ -84,8 +84,8 @@ class Cluster(Workers):
         self._futures[number] = (future, Path(mission.out))
         future.add_done_callback(lambda _future: self._done.put(number))
 
-    def wait(self, timeout_s: float) -> list[Ended]:
-        """The missions that came back."""
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
+        """Wait for news or the time-out; return the missions that ended."""
         numbers = []
         with contextlib.suppress(queue.Empty):
             numbers.append(self._done.get(timeout=timeout_s))
@@ -93,18 +93,18 @@ class Cluster(Workers):
                 numbers.append(self._done.get_nowait())
         return [self._taken(number) for number in numbers]
 
-    def _taken(self, number: int) -> Ended:
+    def _taken(self, number: int) -> AttemptEnd:
         future, out = self._futures.pop(number)
         if future.status != "finished":
-            return Ended(number=number, lost=f"lost by the cluster: {future.exception()}")
+            return AttemptEnd(number=number, lost=f"lost by the cluster: {future.exception()}")
         answer: Answer = future.result()
         if answer.ended is None:
             raise ClusterError(f"a worker has other versions: {answer.refused}")
         unpack(answer.files, out)
-        return Ended(**answer.ended)
+        return AttemptEnd(**answer.ended)
 
     def close(self) -> None:
-        """Take back what was not begun; what flies on a worker ends there, and nobody hears it."""
+        """Cancel missions that have not begun; results of missions in flight are dropped."""
         with contextlib.suppress(OSError, TimeoutError):  # the cluster may be gone
             self._client.cancel([future for future, _ in self._futures.values()])
         self._futures.clear()
@@ -121,9 +121,9 @@ def _connect(address: str) -> Client:
     parts = urlsplit(address)
     try:
         usable = bool(parts.scheme and parts.hostname and parts.port)
-    except ValueError:  # a port that is no number
+    except ValueError:  # the port is not a number
         usable = False
-    if not usable:  # dask would try for half a minute, and then say so in a traceback
+    if not usable:  # dask would retry for half a minute, and then raise a traceback
         raise ClusterError(f"{address}: expected the scheduler's address, as tcp://host:8786")
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
@@ -133,7 +133,7 @@ def _connect(address: str) -> Client:
 
 
 def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> None:
-    """Have at least one worker, and none with other versions than ours."""
+    """Require at least one worker, and our versions on all of them."""
     try:
         client.wait_for_workers(1, timeout=WORKERS_S)
     except TimeoutError:

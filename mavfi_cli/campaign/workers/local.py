@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.workers.base import Assignment, Ended, Workers
+from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd, Workers
 from mavfi_cli.core.fork_server import PACKET, ForkServer
 
 TASK = "mavfi_cli.campaign.workers.task"
-_STOP_S = 10.0  # until a worker whose channel was closed counts as ended
+_STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
 
 
 class LocalWorkers(Workers):
@@ -22,22 +22,22 @@ class LocalWorkers(Workers):
 
     Args:
         jobs: missions at the same time.
-        module: that does the work.
+        module: the module that does the work.
 
     Attributes:
-        running: process id by mission number; 0 until the worker's guard has told it.
+        running: process id by mission number; 0 until the worker's guard has sent it.
     """
 
     def __init__(self, jobs: int, module: str = TASK) -> None:
         self._jobs = jobs
         self._server = ForkServer(module)
         self._selector = selectors.DefaultSelector()
-        self._number: dict[socket.socket, int] = {}  # of the mission, by its channel
+        self._number: dict[socket.socket, int] = {}  # mission number by channel
         self.running: dict[int, int] = {}
 
     @property
     def free(self) -> int:
-        """How many missions may be started now."""
+        """Number of missions that may be started now."""
         return self._jobs - len(self._number)
 
     def start(self, mission: Assignment, limit_s: float) -> None:
@@ -51,8 +51,8 @@ class LocalWorkers(Workers):
         self._number[channel] = mission.number
         self.running[mission.number] = 0
 
-    def wait(self, timeout_s: float) -> list[Ended]:
-        """The missions that ended, waiting for at least one word of a guard or the time-out."""
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
+        """Wait for a guard's message or the time-out; return the missions that ended."""
         ended = []
         for key, _ in self._selector.select(timeout_s):
             channel = key.fileobj
@@ -62,7 +62,7 @@ class LocalWorkers(Workers):
             if said is not None and "pid" in said:
                 self.running[number] = said["pid"]
                 continue
-            ended.append(Ended(number=number, **(said or {})))
+            ended.append(AttemptEnd(number=number, **(said or {})))
             self._release(channel)
         return ended
 
@@ -72,7 +72,7 @@ class LocalWorkers(Workers):
         channel.close()
 
     def close(self) -> None:
-        """Kill what is running, and wait until all of it has ended."""
+        """Kill all running missions and wait until they have ended."""
         for channel in self._number:
             channel.shutdown(socket.SHUT_WR)  # the guard ends its worker, and then itself
         for channel in list(self._number):
@@ -85,7 +85,7 @@ class LocalWorkers(Workers):
 
 
 def _heard(channel: socket.socket) -> Mapping[str, Any] | None:
-    """What a guard says next; None where it is gone, or says nothing in time."""
+    """Read a guard's next message; None if it is gone or sends nothing in time."""
     with contextlib.suppress(OSError):
         if packet := channel.recv(PACKET):
             said: dict[str, Any] = json.loads(packet)

@@ -1,7 +1,7 @@
-"""A worker's side of a campaign on a cluster: one mission in a fresh process, packed for its way.
+"""The worker's side of a campaign on a cluster: one mission in a fresh process, results packed.
 
-Imported by workers of dask.distributed; knows nothing of dask itself. Each thread of a dask
-worker keeps a worker of ours, so a dask worker with n threads flies n missions at a time.
+Workers of dask.distributed import this module, which does not use dask itself. Each thread of a
+dask worker keeps a worker of ours, so a dask worker with n threads flies n missions at a time.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.workers.base import Assignment, Ended
+from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd
 from mavfi_cli.campaign.workers.local import LocalWorkers
 from mavfi_cli.core.fork_server import SCRATCH
 from mavfi_cli.mission.record.run_folder import FAULT, RESULT
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
 
-_SMALL = (RESULT, FAULT)  # of a run folder that is not kept, what the runner reads
+_SMALL = (RESULT, FAULT)  # files that the runner reads of a run folder that is not kept
 _thread = threading.local()
 
 
@@ -38,17 +38,17 @@ class Order:
     limit_s: float
     keep: str
     task: str
-    versions: Mapping[str, str]  # of the runner
+    versions: Mapping[str, str]  # versions of the runner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """What became of it.
+    """A worker's answer to an order.
 
     Attributes:
-        refused: how this worker's versions differ from the runner's, which keeps it from flying.
-        ended: how the mission ended; None where it was refused.
-        files: what it left, compressed, by path in its folder.
+        refused: how this worker's versions differ from the runner's; it then does not fly.
+        ended: how the mission ended; None if it was refused.
+        files: its files, compressed, by path in its folder.
     """
 
     refused: str = ""
@@ -63,7 +63,7 @@ def worker_versions() -> dict[str, str]:
 
 
 def fly(order: Order) -> Answer:
-    """Fly a mission. Run folders that the campaign does not keep travel without their traces."""
+    """Fly a mission; run folders that the campaign does not keep are sent without their traces."""
     differing = version_differences(order.versions, worker_versions())
     if differing:
         return Answer(refused="; ".join(differing))
@@ -75,7 +75,7 @@ def fly(order: Order) -> Answer:
         workers = _workers(order.task)
         mission = Assignment(number=order.number, changes=order.changes, out=str(place))
         workers.start(mission, order.limit_s)
-        ended: list[Ended] = []
+        ended: list[AttemptEnd] = []
         while not ended:
             ended = workers.wait(60.0)
         return Answer(ended=asdict(ended[0]), files=_packed(place, order))
@@ -84,7 +84,7 @@ def fly(order: Order) -> Answer:
 
 
 def _workers(task: str) -> LocalWorkers:
-    """Those of this thread, one at a time."""
+    """The workers of this thread, one mission at a time."""
     kept: dict[str, LocalWorkers] = _thread.__dict__.setdefault("workers", {})
     if task not in kept:
         kept[task] = LocalWorkers(1, task)
@@ -114,7 +114,7 @@ def _packed(place: Path, order: Order) -> dict[str, bytes]:
 
 
 def unpack(files: Mapping[str, bytes], out: Path) -> None:
-    """Write what a worker sent where the mission would have left it."""
+    """Write a worker's files where the mission would have written them."""
     for name, data in files.items():
         path = out / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What a worker of a campaign does: fly one mission, and leave its run folder."""
+"""The work of a campaign's worker: fly one mission and write its run folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def prepare() -> None:
-    """Import and load all that a mission needs; every worker is a fork of this state."""
+    """Import and load everything that a mission needs; every worker is a fork of this state."""
     import pyarrow.parquet  # noqa: F401  # only imported: its threads start at the first use
 
     import mavfi_cli.mission.run
@@ -21,10 +21,10 @@ def prepare() -> None:
 
 
 def perform(changes: Mapping[str, Any], out: Path) -> Path:
-    """Fly one mission; its run folder.
+    """Fly one mission; return its run folder.
 
     Args:
-        changes: of the mission, by `missions.changes_of`.
+        changes: changes of the mission, by `missions.changes_of`.
         out: where the run folder goes.
 
     Raises:

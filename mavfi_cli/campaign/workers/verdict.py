@@ -1,4 +1,4 @@
-"""What the end of a mission's process means: a result, an error, or nothing that counts."""
+"""Judges the end of a mission's process: a result, an error, or an attempt that does not count."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.outcome import State
-from mavfi_cli.campaign.workers.base import Ended
+from mavfi_cli.campaign.outcome import ResultState
+from mavfi_cli.campaign.workers.base import AttemptEnd
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.fork_server import ERRORS, SCRATCH
 from mavfi_cli.core.types import Outcome
@@ -21,46 +21,46 @@ FULL_BYTES = 16 << 20  # with less free space a disk counts as full
 # A fault can make a process kill itself by other signals than these; these come from outside.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _OUTSIDE_WORDS = tuple(f"killed by {number.name}" for number in _FROM_OUTSIDE)
-# Errors that the machine can have made, so that another attempt may do better.
+# Errors that the machine may have caused, so that another attempt may succeed.
 _BY_CHANCE = ("VehicleProcessError", "LinkLost", "NoAutopilot", "TargetError")
 # Errors that every other mission would have too.
 _OF_THE_MACHINE = ("RecordError", "TracingForbidden", "BuildMismatch")
 
 
 class CampaignStopped(MavfiError):
-    """Something that is wrong with the machine, and not with one mission."""
+    """The machine has a problem that does not concern one mission only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What an attempt came to.
+    """The judgement of an attempt.
 
     Attributes:
-        state: None where it does not count: something outside ended it.
-        result: the mission's record; empty where there is none.
-        reason: in words.
-        run: the run folder that it left; None where it left none.
-        doubtful: there is a record, but something outside had a hand in it.
+        state: state of the mission; None if something outside ended the attempt.
+        result: the mission's record; empty if there is none.
+        reason: the reason in words.
+        run: its run folder; None if there is none.
+        doubtful: true if there is a record, but something outside may have affected it.
     """
 
-    state: State | None
+    state: ResultState | None
     result: Mapping[str, Any]
     reason: str
     run: Path | None = None
     doubtful: bool = False
 
 
-def judge(ended: Ended, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
-    """What the end of an attempt means.
+def judge(ended: AttemptEnd, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
+    """Judge the end of an attempt.
 
     Args:
         ended: how it ended.
-        out: the folder that was its own.
-        config: of the mission, as records carry it.
-        limit_s: of wall time that it had.
+        out: the attempt's own folder.
+        config: configuration of the mission, as in records.
+        limit_s: its limit of wall time, s.
 
     Raises:
-        CampaignStopped: the machine keeps missions from being flown (a full disk ...).
+        CampaignStopped: the machine keeps missions from being flown, for example by a full disk.
     """
     report = ended.report or {}
     if ended.exit == 0 and "folder" in report:
@@ -78,8 +78,8 @@ def judge(ended: Ended, out: Path, config: Mapping[str, Any], limit_s: float) ->
         if ended.signal in _FROM_OUTSIDE:
             return Verdict(state=None, result={}, reason=f"killed by {name}")
         return _cut_off(Outcome.CRASH, f"the companion was killed by {name}", out, config)
-    if "traceback" in report:  # a defect of ours; who reads the ledger sees where
-        return Verdict(state=State.ERROR, result={}, reason=report["traceback"].rstrip())
+    if "traceback" in report:  # our own defect; the ledger shows where
+        return Verdict(state=ResultState.ERROR, result={}, reason=report["traceback"].rstrip())
     return _cut_off(Outcome.CRASH, f"the companion ended with code {ended.exit}", out, config)
 
 
@@ -89,7 +89,7 @@ def _require_space(out: Path) -> None:
 
 
 def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
-    """A mission that wrote its record."""
+    """Judge a mission that wrote its record."""
     try:
         result = json.loads((run / "result.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -100,29 +100,31 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
     crashes = [
         crash["how"] for node in result.get("nodes", {}).values() for crash in node["crashes"]
     ]
-    if config.get("link") is None:  # no fault of the companion's can kill the simulated vehicle
+    if config.get("link") is None:  # no fault of the companion can kill the simulated vehicle
         if outcome == Outcome.LINK_LOST.value and reason.endswith(_OUTSIDE_WORDS):
             return Verdict(state=None, result={}, reason=reason)
         if result.get("referee", {}) is None:
             reason = "the vehicle died before it had saved the truth"
             return Verdict(state=None, result={}, reason=reason)
     doubts = [how for how in crashes if how.endswith(_OUTSIDE_WORDS)]
-    return Verdict(state=State.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts))
+    return Verdict(
+        state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts)
+    )
 
 
 def _refused(kind: str, text: str) -> Verdict:
-    """A mission that could not begin, or not write its record."""
+    """Judge a mission that could not begin or could not write its record."""
     if kind in _OF_THE_MACHINE:
         raise CampaignStopped(text)
     if kind == Interrupted.__name__:
         return Verdict(state=None, result={}, reason="interrupted")
     if kind in _BY_CHANCE and text.endswith(_OUTSIDE_WORDS):
         return Verdict(state=None, result={}, reason=text)
-    return Verdict(state=State.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
+    return Verdict(state=ResultState.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
 
 
 def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]) -> Verdict:
-    """A mission whose process ended before its record: what is known of it."""
+    """Judge a mission whose process ended before it wrote its record, by what is known of it."""
     runs = [path for path in out.glob("[!.]*/") if path.name != SCRATCH]
     run = runs[0] if len(runs) == 1 else None
     fault = None
@@ -140,4 +142,4 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]
         "quality_of_flight": {},
         "fault": fault,
     }
-    return Verdict(state=State.FLOWN, result=result, reason=reason, run=run)
+    return Verdict(state=ResultState.FLOWN, result=result, reason=reason, run=run)

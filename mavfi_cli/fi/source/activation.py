@@ -1,7 +1,7 @@
-"""What became of a struck value: was it read at all before it was replaced?
+"""Activation of a source-level fault: whether a corrupted value was read before it was replaced.
 
-A flip in a value that nobody reads is not a fault that the system survived. It is told apart, in
-the words of the instruction level (`fi.tracer.inject.Activation`).
+A flip in a value that nobody reads is not a fault that the system survived. The two are told apart
+with the words of the instruction level (`fi.tracer.inject.BitActivation`).
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from mavfi_cli.fi.source.injector import Strike
 
 
 class Activation(Enum):
-    """What became of the corrupted values, over all strikes of a fault."""
+    """What happened to the corrupted values, over all strikes of a fault."""
 
-    READ = "read"  # some receiver worked with a corrupted value
+    READ = "read"  # a receiver worked with a corrupted value
     WITHHELD = "withheld"  # the detector's gate kept it from its receivers
-    OVERWRITTEN = "overwritten"  # the message was replaced before
-    NOT_READ = "not_read"  # the mission ended before
-    UNCHANGED = "unchanged"  # the value was that already
+    OVERWRITTEN = "overwritten"  # the message was replaced before anyone read it
+    NOT_READ = "not_read"  # the mission ended before anyone read it
+    UNCHANGED = "unchanged"  # the strike did not change the value
     NOT_INJECTED = "not_injected"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reader:
-    """Who first worked with a corrupted value, and when."""
+    """The first receiver that worked with a corrupted value, and when."""
 
     name: str
     stamp_s: float
@@ -38,7 +38,7 @@ class Follower:
     """Follows the struck message until one of its corrupted values is read.
 
     Attributes:
-        activation: the best that is known; READ once, so for ever; WITHHELD, until one is read.
+        activation: the activation so far; READ is final, WITHHELD holds until a value is read.
         reader: the first one.
     """
 
@@ -50,11 +50,11 @@ class Follower:
 
     @property
     def waits(self) -> bool:
-        """Whether a struck message is on its way that nobody has read."""
+        """True while a struck message is on its way and nobody has read it."""
         return self._message is not None
 
     def struck(self, message: Message, strike: Strike) -> None:
-        """A message was corrupted; it goes on as `message`."""
+        """Note that a message was corrupted; it goes on as `message`."""
         if self.activation is Activation.READ:
             return
         self._corrupted = {c.state: c.index for c in strike.changes if c.bits}
@@ -72,7 +72,7 @@ class Follower:
         states: Collection[str],
         index: int | None = None,
     ) -> None:
-        """A receiver works with the states of a message; at one waypoint, or at all of them."""
+        """Note that a receiver works with a message's states, at one waypoint or at all of them."""
         if self._message is None or message is not self._message:
             return
         for state, at in self._corrupted.items():
@@ -82,17 +82,17 @@ class Follower:
                 return
 
     def withheld(self, message: Message) -> None:
-        """The gate does not let a message, or the struck part of it, pass."""
+        """Note that the gate withheld a message, or the struck part of it."""
         if message is self._message:
             self.activation, self._message = Activation.WITHHELD, None
 
     def settle(self, held: Callable[[Message], bool]) -> None:
-        """Anyone who asks whether the message still counts: if not, it was overwritten."""
+        """Note the message as overwritten if `held` says that it no longer counts."""
         if self._message is not None and not held(self._message):
             self._message = None
             self._become(Activation.OVERWRITTEN)
 
     def _become(self, activation: Activation) -> None:
-        """Of a later strike of a lasting fault: less than what befell an earlier one is no news."""
+        """Raise the activation; a later strike never lowers that of an earlier one."""
         if self.activation is not Activation.WITHHELD:
             self.activation = activation

@@ -1,4 +1,4 @@
-"""From what a user asks for to one exact fault: names resolved, the rest drawn from the seed."""
+"""Resolves a requested fault to one exact fault: names are looked up, the rest is drawn by seed."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def draw_fault(
     together: bool = False,
     bits: Sequence[int] | None = None,
 ) -> SourceFault:
-    """The fault that a target and a seed stand for.
+    """Draw the fault of a target and a seed.
 
     Args:
-        target: a stage (a state of it is drawn, of those that have the corruption's field), a
-            state, or a group of states (one is drawn, unless `together`).
+        target: a stage, a state, or a group of states. Of a stage, one state that has the
+            corruption's field is drawn. Of a group, one state is drawn, unless `together`.
         seed: root of the fault's own random stream.
         together: strike all states of the target's group at once, as the paper's Table III does
             with the three components of the acceleration.
@@ -37,7 +37,7 @@ def draw_fault(
 
     Raises:
         UnknownName: no such stage, state or group.
-        FaultSpecError: a bit outside the width, a field that the type has not.
+        FaultSpecError: a bit outside the width, a field that the type does not have.
     """
     rng = generator(seed, Stream.FAULT, "site")
     states = _states(target, rng, together, corruption.field)

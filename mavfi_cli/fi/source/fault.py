@@ -1,4 +1,4 @@
-"""A source-level fault = site x trigger x corruption: three small frozen types.
+"""Source-level faults: injection site, trigger and corruption as three small frozen types.
 
 Vocabulary: transient, intermittent and stuck-at faults as in Avizienis et al., "Basic concepts and
 taxonomy of dependable and secure computing", IEEE TDSC 1(1), 2004.
@@ -16,7 +16,7 @@ from mavfi_cli.fi.bits import Field
 
 
 class When(Enum):
-    """What a trigger waits for."""
+    """The event that a trigger waits for."""
 
     TIME = "time"  # seconds after the companion took over
     TICK = "tick"  # control ticks after it took over
@@ -27,15 +27,15 @@ class When(Enum):
 
 
 class Effect(Enum):
-    """What happens to the value."""
+    """The change that a corruption makes to a value."""
 
     FLIP = "flip"
     ZERO = "zero"
-    RANDOM = "random"  # every bit drawn anew
+    RANDOM = "random"  # every bit is drawn anew
 
 
 class Persistence(Enum):
-    """How long it happens."""
+    """How long a corruption lasts."""
 
     TRANSIENT = "transient"
     STUCK_AT = "stuck-at"
@@ -44,7 +44,7 @@ class Persistence(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger:
-    """When the fault strikes. RANDOM and FORESEEN use neither number nor name, PHASE the name."""
+    """When the fault strikes. PHASE uses the name, RANDOM and FORESEEN neither name nor number."""
 
     when: When = When.RANDOM
     number: float = 0.0  # seconds, ticks, or the count of the invocation (from 1)
@@ -59,12 +59,12 @@ class Trigger:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corruption:
-    """What is done to each attacked value, and for how long.
+    """The change to each attacked value, and its duration.
 
     Attributes:
-        bits: how many distinct bits of `field` are flipped.
-        duration_s: how long a stuck-at or intermittent fault goes on.
-        period_s: from one strike of an intermittent fault to the next.
+        bits: number of distinct bits of `field` that are flipped.
+        duration_s: duration of a stuck-at or intermittent fault, s.
+        period_s: time between two strikes of an intermittent fault, s.
     """
 
     effect: Effect = Effect.FLIP
@@ -88,10 +88,10 @@ class SourceFault:
     """One source-level fault.
 
     Attributes:
-        states: the attacked states, all of one message; several are struck together, each with
-            bits of its own.
-        bits: the exact bits of each state, where they are prescribed (a replay, a user's wish);
-            otherwise they are drawn.
+        states: the attacked states, all of one message. Several states are struck together,
+            each with its own bits.
+        bits: the exact bits of each state if they are prescribed, as in a replay; otherwise they
+            are drawn.
     """
 
     states: tuple[State, ...]

@@ -1,11 +1,10 @@
 """Applies a source-level fault to the messages between kernels.
 
-One mechanism for all of them: every message passes through `pass_on` when it is published, and
-the trajectory that is being flown through `strike_latched` once a tick, because a plan lives for
-many seconds and a fault may hit it at any moment of them.
+Every message passes through `pass_on` when it is published. The active plan also passes through
+`strike_latched` once a tick, because it lives for many seconds and a fault may hit it anytime.
 
-What a strike changed is told to a listener *before* the changed message goes on, so that a record
-survives whatever the fault does.
+A listener hears of each strike *before* the changed message goes on, so that the record survives
+whatever the fault does.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class Strike:
     stamp_s: float
     tick: int
     phase: str
-    invocation: int  # which output of the kernel it was
+    invocation: int  # number of the kernel's output
     changes: tuple[Change, ...]
 
 
@@ -55,15 +54,15 @@ class SourceInjector:
     """Carries one fault through one mission.
 
     Args:
-        fault: what to do.
+        fault: the fault.
         seed: root of the fault's random stream.
-        shortest_flight_s: no flight of this mission can be shorter; a random time is drawn
-            uniformly over it, so that it always comes.
-        listener: told of every strike before its message goes on.
+        shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
+            uniformly over it, so that the trigger always comes.
+        listener: called with every strike before its message goes on.
 
     Attributes:
-        strikes: what was done, oldest first; at most MAX_LISTED_STRIKES of them.
-        count: how many strikes there were.
+        strikes: the strikes, oldest first, at most MAX_LISTED_STRIKES.
+        count: number of strikes.
     """
 
     def __init__(
@@ -91,19 +90,19 @@ class SourceInjector:
         self._struck: Message | None = None
 
     def watch(self, moment: Moment) -> None:
-        """Note where the mission stands; once a control tick, and for every report."""
+        """Note the mission's present state, once a control tick and for every report."""
         self._schedule.watch(moment)
 
     @property
     def missed(self) -> str:
-        """Why nothing was struck, where nothing was."""
+        """The reason if the fault never struck."""
         return self._schedule.missed(_WORDS[self._kind])
 
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
-        """A message as its receiver gets it.
+        """Return the message as its receiver gets it.
 
         Args:
-            index: the waypoint that is followed first, for a trajectory.
+            index: for a trajectory, the waypoint that is followed first.
         """
         if type(message) is not self._kind:
             return message
@@ -115,7 +114,7 @@ class SourceInjector:
         return self._strike(message, moment, index)
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """The trajectory that is being flown, as it is from this tick on."""
+        """Return the active plan as it is from this tick on."""
         if self._kind is not Trajectory or not self._strikes_latched():
             return trajectory
         if trajectory is self._struck and self.fault.corruption.persistence is not (
@@ -129,7 +128,7 @@ class SourceInjector:
         return struck
 
     def _strikes_latched(self) -> bool:
-        """An invocation is met on publication; every other trigger while the plan is flown."""
+        """True for every trigger but an invocation, which is met on publication."""
         return self.fault.trigger.when is not When.INVOCATION
 
     def _strike(self, message: M, moment: Moment, first: int) -> M:
@@ -167,7 +166,7 @@ class SourceInjector:
 def change_of(
     name: str, index: int, before: Scalar, kind: bit_operations.BitType, corruption: Pattern
 ) -> Change:
-    """What a strike makes of one value."""
+    """Return the change that a strike makes to one value."""
     pattern = bit_operations.pattern_of(before, kind)
     corrupted = corruption.corrupt(pattern, kind)
     return Change(

@@ -1,6 +1,6 @@
-"""Faults in what a program keeps: an element of one of several named arrays.
+"""Faults in a program's memory: an element of one of several named arrays.
 
-For a detector's memory (thresholds, means, weights): the thing that guards may be hit as well.
+They attack a detector's memory (thresholds, means, weights): a detector can be hit as well.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ class MemoryInjector:
     """Carries one fault in a memory through one mission.
 
     Args:
-        memory: the arrays; they are changed in place.
-        array: the one that is attacked; None draws one, each in proportion to its bits.
-        trigger: an invocation is a control tick.
-        bits: prescribed; None draws them.
+        memory: the arrays, which are changed in place.
+        array: the attacked array; None draws one in proportion to its bits.
+        trigger: when to strike; an invocation is a control tick.
+        bits: the exact bits; None draws them.
         seed: root of the fault's random stream.
-        shortest_flight_s: over which a random time is drawn.
-        listener: told of every strike.
+        shortest_flight_s: a random time is drawn over this time, s.
+        listener: called with every strike.
 
     Attributes:
-        array, element: what is attacked; the element in C order.
-        strikes, count: as those of a `SourceInjector`.
+        array, element: the attacked array, and the index of the element in C order.
+        strikes, count: as in `SourceInjector`.
 
     Raises:
         UnknownName: there is no such array.
-        BitOutsideWidth, FieldUnavailable: bits that its elements do not have.
-        FaultSpecError: it has no elements.
+        BitOutsideWidth, FieldUnavailable: the array's elements do not have these bits.
+        FaultSpecError: the array has no elements.
     """
 
     def __init__(
@@ -81,16 +81,16 @@ class MemoryInjector:
         self.count = 0
 
     def watch(self, moment: Moment) -> None:
-        """Note where the mission stands; once a control tick, and for every report."""
+        """Note the mission's present state, once a control tick and for every report."""
         self._schedule.watch(moment)
 
     @property
     def missed(self) -> str:
-        """Why nothing was struck, where nothing was."""
+        """The reason if the fault never struck."""
         return self._schedule.missed("control tick")
 
     def strike(self, moment: Moment) -> None:
-        """Act on the memory if the moment has come."""
+        """Strike the memory if the fault is due."""
         if not self._schedule.due(moment, moment.tick):
             return
         self._schedule.acted(moment)

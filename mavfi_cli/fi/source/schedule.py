@@ -1,4 +1,4 @@
-"""When a fault acts, and what it makes of the bits that it meets: shared by all injectors."""
+"""Schedule and bit pattern of a fault, shared by all injectors."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from mavfi_cli.fi.source.fault import Corruption, Effect, Persistence, Trigger, 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """Where the mission stands: what triggers are compared with."""
+    """The mission's present state, which triggers are compared with."""
 
     stamp_s: float
     flight_s: float  # since the companion took over
     tick: int  # control ticks since then
     phase: str  # the pilot's mode
-    foresees: bool = False  # a report of a foreseen collision is being handed on
+    foresees: bool = False  # a report of a foreseen collision is being passed on
 
 
 class Schedule:
-    """Says at which moments a fault acts.
+    """Decides at which moments a fault strikes.
 
     Args:
-        drawn_time_s: into the flight, for a random trigger.
+        drawn_time_s: flight time of a random trigger, s.
     """
 
     def __init__(self, trigger: Trigger, corruption: Corruption, drawn_time_s: float) -> None:
-        self._came = False  # the trigger, whether or not there was anything to strike
+        self._came = False  # the trigger came, whether or not there was anything to strike
         self._trigger = trigger
         self._corruption = corruption
         self._drawn_time_s = drawn_time_s
@@ -38,14 +38,14 @@ class Schedule:
         self._last_s = -math.inf
 
     def watch(self, moment: Moment) -> None:
-        """Note where the mission stands, also where there is nothing to strike.
+        """Note the mission's present state, even if there is nothing to strike.
 
-        A phase may be over before the next message of the struck state; it has begun all the same.
+        A phase may begin and end before the next message with the attacked state.
         """
         self._came = self._came or self._comes(moment)
 
     def missed(self, what: str) -> str:
-        """Why it never acted, where it did not; `what` it waited for, as "report"."""
+        """The reason if the fault never struck; `what` is what it waited for, such as "report"."""
         trigger = self._trigger
         never, since = {
             When.PHASE: (
@@ -57,7 +57,7 @@ class Schedule:
         return f"no {what} came after {since}" if self._came else never
 
     def due(self, moment: Moment, invocations: int = 0) -> bool:
-        """Whether it acts now; `invocations` counts the outputs of the kernel so far."""
+        """True if the fault strikes now; `invocations` counts the kernel's outputs so far."""
         self.watch(moment)
         corruption = self._corruption
         if self._begun_s is None:
@@ -71,7 +71,7 @@ class Schedule:
         return True
 
     def acted(self, moment: Moment) -> None:
-        """It did."""
+        """Note a strike."""
         if self._begun_s is None:
             self._begun_s = moment.stamp_s
         self._last_s = moment.stamp_s
@@ -85,7 +85,7 @@ class Schedule:
         return self._comes(moment)
 
     def _comes(self, moment: Moment) -> bool:
-        """Whether the trigger is there, or has been; an invocation is the messages' own."""
+        """True if the trigger has come; invocations are counted with the messages instead."""
         trigger = self._trigger
         if trigger.when is When.TIME:
             return moment.flight_s >= trigger.number - 1e-9
@@ -101,10 +101,10 @@ class Schedule:
 
 
 class Pattern:
-    """What a fault makes of one place: its bits, and what they are set to, drawn once.
+    """The corruption of one value: its bits and what they are set to, drawn once.
 
     Args:
-        bits: prescribed; None draws them at the first strike.
+        bits: the exact bits; None draws them at the first strike.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Pattern:
         self._target = 0
 
     def corrupt(self, pattern: int, kind: bit_operations.BitType) -> int:
-        """The pattern after a strike."""
+        """Return the pattern after a strike."""
         if self._bits is None:
             self._bits = self._choose(pattern, kind)
         mask = bit_operations.mask_of(self._bits, kind)

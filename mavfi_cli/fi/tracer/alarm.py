@@ -1,7 +1,7 @@
 """Acts on a process after some wall or CPU time, from another thread, while the tracer waits.
 
-Only realtime matters live here: time limits of faulty runs, and the time triggers of the
-cpu-time and wall-clock sampling rules.
+It serves the time limits of faulty runs, and the triggers of the cpu-time and wall-clock sampling
+rules.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from types import TracebackType
 from mavfi_cli.fi.tracer import linux
 
 
-class Alarm:
-    """One alarm on one process; a context that is cancelled on leaving.
+class ProcessTimer:
+    """A timer on one process; leaving its context cancels it.
 
-    It goes off when the process has used `cpu_s` of CPU time since the alarm was set, or when
-    `wall_s` have passed, whichever is set and comes first. `fired` tells whether it did.
+    It fires when the process has used `cpu_s` of CPU time since the timer was set, or when
+    `wall_s` have passed, whichever is set and comes first. `fired` is true once it has.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Alarm:
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
-    def __enter__(self) -> Alarm:
+    def __enter__(self) -> ProcessTimer:
         self._thread.start()
         return self
 
@@ -56,10 +56,10 @@ class Alarm:
         try:
             signal.pidfd_send_signal(self._process, self._signal)
         except ProcessLookupError:
-            self.fired = False  # it had ended
+            self.fired = False  # the process had ended
 
     def _left_s(self) -> float:
-        """Lower bound of the time until the alarm; CPU time passes no faster than wall time."""
+        """Lower bound of the time left; CPU time passes no faster than wall time."""
         left = []
         if self._cpu_end is not None:
             left.append(self._cpu_end - linux.cpu_time_s(self._pid))

@@ -1,9 +1,9 @@
 """Execution breakpoints that stop exactly before the k-th execution of an instruction.
 
-Two mechanisms, the better first. `PERF`: the kernel counts the hits of a hardware breakpoint and
-raises SIGTRAP on the k-th (`perf_event_open` with `sigtrap`, Linux 5.13, perf_event_open(2));
-no performance counter is needed, so it works in virtual machines. `DEBUG`: the tracer writes the
-debug register itself and counts, one stop a hit.
+There are two mechanisms, the better first. `PERF`: the kernel counts the hits of a hardware
+breakpoint and raises SIGTRAP on the k-th (`perf_event_open` with `sigtrap`, Linux 5.13,
+perf_event_open(2)). It needs no performance counter, so it works in virtual machines. `DEBUG`: the
+tracer writes the debug register itself and counts, with one stop a hit.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class PerfBreakpoint:
         self._fd = _open_event(tid, address, count, _DISABLED_AT_EXEC_END)
 
     def close(self) -> None:
-        """Take the breakpoint away."""
+        """Remove the breakpoint."""
         os.close(self._fd)
 
 
 class ExecutionCounter:
-    """Counts the executions of one instruction without stopping; for checks."""
+    """Counts the executions of one instruction without stopping it, for checks."""
 
     def __init__(self, tid: int, address: int) -> None:
         self._fd = _open_event(tid, address, 0, 0)
@@ -67,12 +67,12 @@ class ExecutionCounter:
         return int.from_bytes(os.read(self._fd, 8), "little")
 
     def close(self) -> None:
-        """Take the counter away."""
+        """Remove the counter."""
         os.close(self._fd)
 
 
 def perf_allowed() -> str | None:
-    """None where counted breakpoints can be opened, else why not."""
+    """None if counted breakpoints can be opened, else the reason why not."""
     try:
         os.close(_open_event(0, 0x1000, 1_000_000, _DISABLED_AT_EXEC_END))
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What this machine can do for instruction-level injection, found out by doing it."""
+"""Checks of this machine for instruction-level injection; each tries the real operation."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _COUNTING = "counted breakpoints"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capability:
-    """One thing that was tried."""
+    """The result of one check."""
 
     name: str
     found: str = ""
     problem: str | None = None  # None: it works
-    remedy: str = ""  # where it does not work, or could work better
+    remedy: str = ""  # how to make it work, or work better
 
 
 def check_tracing(mechanism: Mechanism | None = None) -> Capability:
@@ -62,7 +62,7 @@ def _flip_and_back(tracee: Tracee) -> Capability:
 
 
 def check_counting() -> Capability:
-    """Which of the two mechanisms counts executions here; the worse one is tried."""
+    """Find the mechanism that counts executions here; the worse one is tried."""
     refused = perf_allowed()
     if refused is None:
         return Capability(name=_COUNTING, found="by the kernel (perf_event_open)")

@@ -1,6 +1,6 @@
-"""What an ELF file says about itself: build id, code, functions.
+"""Reads build id, code and functions of an ELF file.
 
-Functions are looked for in the raw tables: a library of 10 MB has tens of thousands of them with
+Functions are searched in the raw tables: a library of 10 MB has tens of thousands of them with
 long names, and a mission waits for the answer.
 """
 
@@ -39,7 +39,7 @@ class Function:
 
 
 class _Table:
-    """The functions of one symbol table, ascending, with their names still in one piece."""
+    """The functions of one symbol table, ascending, with their names in one string."""
 
     def __init__(self, symbols: NDArray[np.void], names: bytes) -> None:
         wanted = np.isin(symbols["info"] & 0xF, _FUNCTION_TYPES) & (symbols["value"] != 0)
@@ -63,13 +63,13 @@ class _Table:
         return map(self._function, range(first, end))
 
     def named(self, name: str) -> Iterator[Function]:
-        """The functions of exactly this name; names may share the end of a longer one."""
+        """The functions of exactly this name; a name may be stored as the end of a longer one."""
         end = name.encode() + b"\0"
         places = [match.start() for match in re.finditer(re.escape(end), self._names)]
         return map(self._function, np.flatnonzero(np.isin(self._symbols["name"], places)).tolist())
 
     def containing(self, part: str) -> NDArray[np.bool_]:
-        """(n,) whether a function's name contains the text."""
+        """(n,) mask of the functions whose names contain the text."""
         places = np.array([m.start() for m in re.finditer(re.escape(part.encode()), self._names)])
         ends = np.flatnonzero(np.frombuffer(self._names, np.uint8) == 0)
         begins = self._symbols["name"]
@@ -87,7 +87,7 @@ class _Table:
 
 @dataclass(frozen=True, kw_only=True)
 class ElfFacts:
-    """What one ELF file says about itself."""
+    """Build id, code and functions of one ELF file."""
 
     path: str
     build_id: str
@@ -96,7 +96,7 @@ class ElfFacts:
 
     @functools.cached_property
     def _tables(self) -> tuple[_Table, ...]:
-        """Read when first asked for: of the objects of a Python process, few are asked."""
+        """The symbol tables, read on first use: few objects of a Python process are needed."""
         try:
             with open(self.path, "rb") as stream:
                 return tuple(_read_tables(ELFFile(stream)))
@@ -104,14 +104,14 @@ class ElfFacts:
             raise FaultError(f"{self.path}: not a readable ELF object ({error})") from None
 
     def functions(self) -> list[Function]:
-        """All of them, ascending."""
+        """All functions, ascending."""
         return sorted({function for table in self._tables for function in table})
 
     def function_at(self, address: int) -> Function | None:
         """The function that holds a linked address.
 
-        Of several that start at one place it is the last of the greatest size and name; one
-        without a size reaches to the next.
+        If several start at one address, the last of the greatest size and name counts. A
+        function without a size reaches to the next.
         """
         found = [function for table in self._tables for function in table.at(address)]
         last = max(found, default=None)
@@ -124,13 +124,13 @@ class ElfFacts:
         return min((f for table in self._tables for f in table.named(name)), default=None)
 
     def functions_with(self, *parts: str) -> list[Function]:
-        """Those whose names contain one of the texts, ascending."""
+        """The functions whose names contain one of the texts, ascending."""
         return sorted({f for table in self._tables for f in table.with_any(parts)})
 
 
 @functools.lru_cache(maxsize=256)
 def elf_facts(path: str, _modified_ns: int = 0) -> ElfFacts:
-    """Read an ELF file; a file without build id is named by the hash of its contents.
+    """Read an ELF file; the hash of its contents replaces a missing build id.
 
     Raises:
         FaultError: not an ELF file.

@@ -1,4 +1,4 @@
-"""An instruction-level fault, fully resolved: trigger x corruption, and how one is drawn."""
+"""Instruction-level faults, fully resolved: trigger and corruption, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ E = TypeVar("E", bound=Enum)
 
 
 class Site(Enum):
-    """What kind of state a fault corrupts."""
+    """The kind of state that a fault corrupts."""
 
     GENERAL = "general"
     FLAGS = "flags"
@@ -50,15 +50,15 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Corruption:
-    """Which bits of what are inverted, relative to one execution of one instruction."""
+class InstructionCorruption:
+    """The inverted bits, relative to one execution of one instruction."""
 
     site: Site
     role: Role
-    register: str  # full register; empty for opcode and memory
+    register: str  # the full register; empty for opcode and memory
     operand: str  # as the assembler names it
     bits: tuple[int, ...]  # of the full register, of the opcode bytes, or of the memory operand
-    memory_operand: int = 0  # which of the instruction's memory operands
+    memory_operand: int = 0  # index among the instruction's memory operands
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,10 +66,10 @@ class InstructionFault:
     """One fault. The last stage of the trigger is the attacked instruction itself."""
 
     trigger: tuple[Stage, ...]
-    execution: int  # k: how often the instruction had run in the profiled scope, counted from 1
+    execution: int  # k: number of the execution in the profiled scope, from 1
     instruction: str
     instruction_bytes: bytes
-    corruption: Corruption | None  # None: null injection, everything but the flip
+    corruption: InstructionCorruption | None  # None: null injection, everything but the flip
 
     @property
     def target(self) -> Location:
@@ -79,7 +79,7 @@ class InstructionFault:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultModel:
-    """From which operands and bits a corruption is drawn."""
+    """The operands and bits from which a corruption is drawn."""
 
     sites: frozenset[Site] = DATA_REGISTERS
     roles: frozenset[Role] = frozenset((Role.SOURCE, Role.DESTINATION))
@@ -91,7 +91,7 @@ class FaultModel:
     def named(
         cls, *, sites: Iterable[str], roles: Iterable[str], field: str, bits: int
     ) -> FaultModel:
-        """From names; no site stands for the data registers, no role for both.
+        """Make a model from names; no site means the data registers, no role means both.
 
         Raises:
             UnknownName: a name that does not exist; names the nearest.
@@ -105,7 +105,7 @@ class FaultModel:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """What is drawn from, but for the habits of compat modes."""
+        """The model as plain values, without the peculiarities of compat modes."""
         return {
             "sites": sorted(site.value for site in self.sites),
             "roles": sorted(role.value for role in self.roles),
@@ -133,11 +133,11 @@ class _Candidate:
 
 def draw_corruption(
     instruction: Instruction, model: FaultModel, rng: np.random.Generator
-) -> Corruption | None:
-    """An operand of the instruction, uniformly, then distinct bits of it, uniformly.
+) -> InstructionCorruption | None:
+    """Draw an operand of the instruction uniformly, then distinct bits of it uniformly.
 
     Returns:
-        None where the instruction has no operand that the model allows.
+        None if the instruction has no operand that the model allows.
     """
     candidates = [
         candidate
@@ -149,7 +149,7 @@ def draw_corruption(
     chosen = candidates[int(rng.integers(len(candidates)))]
     available = bits.bits_of(chosen.mask)
     picked = rng.choice(len(available), size=model.count, replace=False)
-    return Corruption(
+    return InstructionCorruption(
         site=chosen.site,
         role=chosen.role,
         register=chosen.register,
@@ -164,8 +164,8 @@ def site_of(register: str) -> Site:
     return Site(register_kind(register))
 
 
-def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> Corruption:
-    """A corruption that the user names.
+def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> InstructionCorruption:
+    """Make the corruption that the user names.
 
     Raises:
         FaultError: no such register.
@@ -177,7 +177,7 @@ def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> Co
         raise FaultError(f"no register {register!r} on this processor") from None
     if not 0 <= bit < width:
         raise BitOutsideWidth(bit, register, width)
-    return Corruption(
+    return InstructionCorruption(
         site=site_of(register), role=role, register=register, operand=register, bits=(bit,)
     )
 

@@ -1,6 +1,6 @@
-"""What is mapped where: objects, build ids, symbols, and the code that is in scope.
+"""Memory maps of a process: objects, build ids, symbols, and the code in scope.
 
-A place is `(object, offset)`. For an ELF object the offset is the address as the linker wrote it
+A location is `(object, offset)`. For an ELF object the offset is the address that the linker wrote
 (what `objdump` and `nm` print), so it does not depend on where the object was loaded. Compiled
 code without a file (numba) is a named region, with offsets from its start.
 """
@@ -61,7 +61,7 @@ class Region:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """Of an object, the only code that counts as its text."""
+    """The only code of an object that counts as its text."""
 
     text: tuple[range, ...]  # offsets, ascending
 
@@ -77,8 +77,8 @@ class Image:
 
         Args:
             pid: the process.
-            regions: by name, addresses of compiled code without a file, and which part of a
-                loaded object counts as its text.
+            regions: by name, the addresses of compiled code without a file, and the parts of loaded
+                objects that count as their text.
         """
         self._files = _files(pid)
         self._paths: dict[str, str] = {}
@@ -101,17 +101,17 @@ class Image:
 
     @property
     def names(self) -> list[str]:
-        """Of all mapped files and regions; not every file needs to be an object."""
+        """Names of all mapped files and regions; a file need not be an object."""
         return [*self._loaded, *(name for name in self._paths if name not in self._loaded)]
 
     def path_of(self, name: str) -> str:
-        """Where a mapped file is; empty for a region."""
+        """Path of a mapped file; empty for a region."""
         return self._paths.get(name, "")
 
     def find(self, name: str) -> LoadedObject | None:
-        """An object or region by its name; None where no such object is loaded.
+        """An object or region by its name; None if no such object is loaded.
 
-        An object is read when it is first asked for: a Python process has hundreds.
+        An object is read on first use, because a Python process has hundreds.
         """
         if name not in self._loaded:
             path = self._paths.get(name)
@@ -137,14 +137,14 @@ class Image:
         return found
 
     def locate(self, address: int) -> Location:
-        """The place of an address; unknown memory is the object `?`."""
+        """The location of an address; unknown memory is the object `?`."""
         loaded = self.object_at(address)
         if loaded is None:
             return Location("?", address)
         return Location(loaded.name, address - loaded.bias)
 
     def address(self, location: Location) -> int:
-        """Where a place is in this process.
+        """The address of a location in this process.
 
         Raises:
             UnknownName: its object is not loaded.
@@ -152,7 +152,7 @@ class Image:
         return self.named(location.object).bias + location.offset
 
     def symbol(self, location: Location) -> str:
-        """`function+offset` of a place, or the empty string."""
+        """`function+offset` of a location, or the empty string."""
         loaded = self.find(location.object)
         if loaded is None or loaded.path is None:
             return ""

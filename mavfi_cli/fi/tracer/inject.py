@@ -1,4 +1,4 @@
-"""Corrupt a stopped thread, prove that the corruption is there, and follow what becomes of it."""
+"""Corrupts a stopped thread, verifies the corruption, and follows what happens to it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mavfi_cli.fi.tracer.arch import (
     erase_trap,
     width_of,
 )
-from mavfi_cli.fi.tracer.fault import Corruption, InstructionFault, Role, Site
+from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee, Trap
 
 
-class Activation(Enum):
-    """What became of the corrupted bits within the followed window."""
+class BitActivation(Enum):
+    """What happened to the corrupted bits within the followed window."""
 
     READ = "read"
     OVERWRITTEN = "overwritten"
@@ -34,10 +34,10 @@ class Activation(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Injection:
-    """What was done at the stop."""
+    """The result of corrupting at the stop."""
 
     applied: bool
-    reason: str  # why not applied, empty otherwise
+    reason: str  # why it was not applied, else empty
     address: int  # of the corrupted memory or opcode, else of the instruction
     before: int  # the full register, the opcode bytes or the memory operand
     after: int  # as read back
@@ -48,12 +48,12 @@ class Injection:
 class Followed:
     """The activation, and the instruction that decided it."""
 
-    activation: Activation
+    activation: BitActivation
     after_instructions: int  # 0: the attacked instruction itself
     instruction: str = ""
 
 
-NOTHING = Followed(activation=Activation.NOT_INJECTED, after_instructions=0)
+NOTHING = Followed(activation=BitActivation.NOT_INJECTED, after_instructions=0)
 
 
 def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
@@ -69,7 +69,7 @@ def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
 
 
 def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
-    """Decode what the target is about to execute."""
+    """Decode the instruction that the target is about to execute."""
     try:
         return decode(tracee.read_memory(address, 16), address)
     except OSError:
@@ -77,7 +77,7 @@ def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
 
 
 def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
-    """Execute one whole instruction and leave no trace of the trap flag in the target."""
+    """Execute one whole instruction without leaving a trace of the trap flag in the target."""
     if instruction is not None and instruction.run_over:
         if tracee.run_to(instruction.next_address):
             return Trap(code=0)
@@ -89,11 +89,11 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
     return result
 
 
-def apply(tracee: Tracee, instruction: Instruction, corruption: Corruption) -> Injection:
+def apply(tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption) -> Injection:
     """Invert the bits at the stop in front of `instruction`.
 
-    A destination is corrupted after the instruction has executed. The result is read back; what
-    the operating system discards or refuses is not applied.
+    A destination is corrupted after the instruction has executed. The result is read back: a
+    change that the operating system discards or refuses counts as not applied.
     """
     start = time.perf_counter_ns()
     place = instruction.address
@@ -126,7 +126,7 @@ def _not_applied(reason: str, place: int, value: int, start: int) -> Injection:
 
 
 def _invert(
-    tracee: Tracee, instruction: Instruction, corruption: Corruption, place: int
+    tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption, place: int
 ) -> tuple[int, int]:
     if corruption.site is Site.OPCODE:
         return _execute_corrupted(tracee, instruction, corruption)
@@ -143,9 +143,9 @@ def _invert(
 
 
 def _execute_corrupted(
-    tracee: Tracee, instruction: Instruction, corruption: Corruption
+    tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption
 ) -> tuple[int, int]:
-    """A transient fetch error: the corrupted bytes execute once, then the code is whole again."""
+    """Execute the corrupted bytes once, then restore the code: a transient fetch error."""
     corrupted = bits.flip_bytes(instruction.raw, corruption.bits)
     tracee.write_memory(instruction.address, corrupted)
     seen = tracee.read_memory(instruction.address, len(corrupted))
@@ -162,17 +162,17 @@ def _number(data: bytes) -> int:
 def follow(
     tracee: Tracee,
     instruction: Instruction,
-    corruption: Corruption,
+    corruption: InstructionCorruption,
     injection: Injection,
     *,
     window: int,
 ) -> Followed:
-    """Step on until the corrupted bits are read or overwritten, at most `window` instructions."""
+    """Step until the corrupted bits are read or overwritten, at most `window` instructions."""
     if not injection.applied:
         return NOTHING
     if corruption.role is Role.SOURCE or corruption.site is Site.INSTRUCTION_POINTER:
         return Followed(
-            activation=Activation.READ, after_instructions=0, instruction=instruction.text
+            activation=BitActivation.READ, after_instructions=0, instruction=instruction.text
         )
     remaining = bits.mask_of(corruption.bits, bits.raw(TRAITS.vector_bits))
     for distance in range(1, window + 1):
@@ -181,26 +181,26 @@ def follow(
             break
         read, remaining = _touch(tracee, current, corruption, injection.address, remaining)
         if read or not remaining:
-            what = Activation.READ if read else Activation.OVERWRITTEN
+            what = BitActivation.READ if read else BitActivation.OVERWRITTEN
             return Followed(activation=what, after_instructions=distance, instruction=current.text)
         if isinstance(clean_step(tracee, current), Ended):
-            return Followed(activation=Activation.ENDED_BEFORE_READ, after_instructions=distance)
-    what = Activation.NOT_READ_IN_WINDOW if window else Activation.NOT_FOLLOWED
+            return Followed(activation=BitActivation.ENDED_BEFORE_READ, after_instructions=distance)
+    what = BitActivation.NOT_READ_IN_WINDOW if window else BitActivation.NOT_FOLLOWED
     return Followed(activation=what, after_instructions=window)
 
 
 def strike(
     tracee: Tracee, fault: InstructionFault, *, window: int
 ) -> tuple[Injection | None, Followed]:
-    """At the stop in front of the attacked instruction: corrupt as the fault says, and follow.
+    """Corrupt the target at the stop in front of the attacked instruction, and follow.
 
     Args:
-        tracee: stopped there.
-        fault: with its corruption; without one nothing is done.
-        window: how many instructions a destination fault is followed.
+        tracee: the process, stopped there.
+        fault: the fault; without a corruption nothing is done.
+        window: number of instructions for which a destination fault is followed.
 
     Raises:
-        FaultError: another instruction is at the place.
+        FaultError: another instruction is at the location.
     """
     instruction = instruction_at(tracee, tracee.registers.ip)
     if instruction is None or instruction.raw != fault.instruction_bytes:
@@ -214,9 +214,13 @@ def strike(
 
 
 def _touch(
-    tracee: Tracee, current: Instruction, corruption: Corruption, place: int, remaining: int
+    tracee: Tracee,
+    current: Instruction,
+    corruption: InstructionCorruption,
+    place: int,
+    remaining: int,
 ) -> tuple[bool, int]:
-    """Whether an instruction reads the remaining bits, and which it leaves."""
+    """Tell whether an instruction reads the remaining bits, and which it leaves."""
     if corruption.site is Site.MEMORY:
         return _touch_memory(tracee, current, place, remaining)
     register = corruption.register

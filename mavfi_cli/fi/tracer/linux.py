@@ -1,7 +1,7 @@
-"""ptrace and its neighbours as typed functions; nothing here knows an architecture.
+"""ptrace and related system calls as typed functions, independent of the architecture.
 
 Request and option numbers: `<sys/ptrace.h>` of Linux; see ptrace(2), personality(2).
-A stopped thread is named by its thread id. ptrace obeys one thread only: whoever attached.
+A stopped thread is named by its thread id. ptrace obeys only the thread that attached.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class _IoVector(ctypes.Structure):
 
 
 def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
-    """One ptrace request; the result of a peek is unsigned.
+    """Make one ptrace request; the result of a peek is unsigned.
 
     Raises:
         OSError: with the errno of the request.
@@ -70,7 +70,7 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
     """Attach without stopping; new threads and children are attached by the kernel.
 
     Raises:
-        TracingForbidden: the operating system refuses; says how to allow it.
+        TracingForbidden: the operating system refuses; the error says how to allow it.
         ProcessLookupError: no such thread.
     """
     options = TRACE_OPTIONS | (OPTION_EXITKILL if kill_with_tracer else 0)
@@ -81,7 +81,7 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
 
 
 def get_registers(tid: int, note: int, buffer: ctypes.Array[ctypes.c_char]) -> int:
-    """Fill `buffer` with a register set; returns the number of bytes that the kernel has."""
+    """Fill `buffer` with a register set; return the number of bytes that the kernel has."""
     vector = _IoVector(ctypes.addressof(buffer), len(buffer))
     request(GETREGSET, tid, note, ctypes.addressof(vector))
     return int(vector.length)
@@ -100,7 +100,7 @@ def set_registers(tid: int, note: int, data: bytes) -> None:
 
 @dataclass(frozen=True, slots=True)
 class SignalInfo:
-    """What the kernel says about the signal of a stop."""
+    """The kernel's information about the signal of a stop."""
 
     number: int
     code: int
@@ -115,10 +115,10 @@ def signal_info(tid: int) -> SignalInfo:
 
 @contextmanager
 def fixed_addresses() -> Iterator[None]:
-    """Programs started inside get no address-space randomisation, so that addresses repeat."""
+    """Start programs inside without address-space randomisation, so that addresses repeat."""
     before = int(_personality(0xFFFF_FFFF))
     if before == -1 or int(_personality(before | ADDR_NO_RANDOMIZE)) == -1:
-        yield  # a sandbox may refuse; offsets still repeat, addresses then do not
+        yield  # a sandbox may refuse: then offsets still repeat, but addresses do not
         return
     try:
         yield
@@ -135,10 +135,10 @@ def threads_of(pid: int) -> list[int]:
 
 
 def share_processor(pid: int) -> None:
-    """Keep the calling thread, and the main thread of `pid`, on the processor where that ran last.
+    """Pin the calling thread and the main thread of `pid` to the processor where that ran last.
 
-    A tracer and its target hand over to each other at every step: on one processor that costs
-    half. Nobody moves them back, so call it from a thread and for a process made for this only.
+    Tracer and target switch at every step; on one processor that costs half. Nothing unpins
+    them, so call it only from a thread and for a process that were made for this.
     """
     stat = Path(f"/proc/{pid}/stat").read_text()
     processor = int(stat.rpartition(")")[2].split()[36])  # field 39, proc_pid_stat(5)
@@ -147,7 +147,7 @@ def share_processor(pid: int) -> None:
 
 
 def cpu_time_s(pid: int) -> float:
-    """CPU time that a process has used, all threads; 0 when it has ended.
+    """CPU time that all threads of a process have used, s; 0 when it has ended.
 
     The clock id encoding is that of clock_getcpuclockid(3) on Linux.
     """
@@ -175,12 +175,12 @@ class Status:
 
     @property
     def stopped(self) -> bool:
-        """The thread waits for us."""
+        """True if the thread waits for us."""
         return os.WIFSTOPPED(self.raw)
 
     @property
     def ended(self) -> bool:
-        """The thread is gone."""
+        """True if the thread is gone."""
         return os.WIFEXITED(self.raw) or os.WIFSIGNALED(self.raw)
 
     @property
@@ -195,7 +195,7 @@ class Status:
 
     @property
     def trapped(self) -> bool:
-        """Stopped by a SIGTRAP that is no ptrace event."""
+        """True if the stop is a SIGTRAP that is not a ptrace event."""
         return self.stopped and self.event == 0 and self.signal == signal.SIGTRAP
 
 

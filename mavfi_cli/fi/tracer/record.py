@@ -1,8 +1,8 @@
-"""The fault record: one JSON file that says what is going to be hit, then what was hit.
+"""The fault record: one JSON file that says what will be hit, and then what was hit.
 
-It is written and flushed to the disk *before* the target runs to the trigger, so that it
-survives whatever the fault does, and completed afterwards. Each write leaves the old file or
-the new one, never half of one.
+It is flushed to the disk *before* the target runs to the trigger, so that it survives whatever the
+fault does. It is completed afterwards. Each write leaves the old file or the new one, never a
+partial one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import write_text
-from mavfi_cli.fi.tracer.fault import Corruption, InstructionFault, Role, Site, Stage
+from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site, Stage
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
 
@@ -22,12 +22,12 @@ VERSION = 1
 
 
 def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, Any]:
-    """The record before the flip.
+    """Make the record before the flip.
 
     Args:
-        fault: as drawn.
-        image: of the process, for symbols and build ids.
-        context: what else belongs in it: seed, sampling rule, scope, kernel, program, run.
+        fault: the drawn fault.
+        image: image of the process, for symbols and build ids.
+        context: further entries: seed, sampling rule, scope, kernel, program, run.
     """
     target = fault.target
     return {
@@ -53,7 +53,7 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
     }
 
 
-def corruption_to_json(corruption: Corruption | None) -> dict[str, Any] | None:
+def corruption_to_json(corruption: InstructionCorruption | None) -> dict[str, Any] | None:
     """The corruption part of a record; null for a null injection."""
     if corruption is None:
         return None
@@ -70,7 +70,7 @@ def corruption_to_json(corruption: Corruption | None) -> dict[str, Any] | None:
 def completed(
     record: Mapping[str, Any], injection: Injection | None, followed: Followed, **result: Any
 ) -> dict[str, Any]:
-    """The record after the run; `injection` is None where the trigger was not reached."""
+    """Make the record after the run; `injection` is None if the trigger was not reached."""
     what: dict[str, Any] = {"applied": False}
     if injection is not None:
         what = {
@@ -90,7 +90,7 @@ def completed(
 
 
 def fault_of(record: Mapping[str, Any]) -> InstructionFault:
-    """The fault that a record describes, to repeat it.
+    """Read the fault that a record describes, to repeat it.
 
     Raises:
         RecordError: not a fault record, or one of another version.
@@ -113,9 +113,9 @@ def fault_of(record: Mapping[str, Any]) -> InstructionFault:
         raise RecordError(f"the fault record is damaged: {error!r}") from None
 
 
-def corruption_of(data: Mapping[str, Any]) -> Corruption:
+def corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
     """The corruption part of a record, read back."""
-    return Corruption(
+    return InstructionCorruption(
         site=Site(data["site"]),
         role=Role(data["role"]),
         register=data["register"],
@@ -129,7 +129,7 @@ def require_same_build(record: Mapping[str, Any], image: Image) -> None:
     """Refuse a record whose objects are not the loaded ones.
 
     Raises:
-        BuildMismatch: names each object that is missing or of another build.
+        BuildMismatch: an object is missing or of another build; names each.
     """
     differences = []
     for name, build_id in record["build_ids"].items():

@@ -1,4 +1,4 @@
-"""Sampling rules: from which population a fault is drawn. Every result names its rule."""
+"""Sampling rules: the population from which a fault is drawn. Every result names its rule."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from mavfi_cli.core.errors import FaultError, UnknownName
 from mavfi_cli.fi.tracer.arch import Instruction, decode
 from mavfi_cli.fi.tracer.fault import (
-    Corruption,
     FaultModel,
+    InstructionCorruption,
     InstructionFault,
     Site,
     draw_corruption,
@@ -31,22 +31,24 @@ class Rule(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strategy:
-    """A sampling rule with the habits that go with it."""
+    """A sampling rule with its peculiarities."""
 
     name: str
     rule: Rule
     model: FaultModel
-    refused: frozenset[str] = frozenset()  # operands whose draw is thrown away
-    attempts: int = 1  # time rules: how often another moment is tried
+    refused: frozenset[str] = frozenset()  # operands whose draw is discarded
+    attempts: int = 1  # time rules: how many moments are tried
     retry_s: float = 0.0  # time rules: how much later
     whole_process: bool = False  # hits code out of scope as well
     in_system_calls: bool = False  # hits a thread that waits in the operating system as well
-    bit_of: Callable[[Corruption, np.random.Generator], Corruption] = field(
+    bit_of: Callable[[InstructionCorruption, np.random.Generator], InstructionCorruption] = field(
         default=lambda corruption, _rng: corruption
     )
 
-    def draw_at(self, instruction: Instruction, rng: np.random.Generator) -> Corruption | None:
-        """A corruption at a stop, or None where this moment is to be given up."""
+    def draw_at(
+        self, instruction: Instruction, rng: np.random.Generator
+    ) -> InstructionCorruption | None:
+        """Draw a corruption at a stop; None gives up this moment."""
         drawn = draw_corruption(instruction, self.model, rng)
         if drawn is None or drawn.operand in self.refused:
             return None
@@ -54,21 +56,23 @@ class Strategy:
 
 
 # The released ROSFI injector refuses these registers, so that r8 to r13 and XMM get nearly all
-# faults (facts on the artefact: MAVBench/MAV_apps, branch mavfi, regManip.cpp and rosfi.cpp).
+# faults (MAVBench/MAV_apps, branch mavfi, regManip.cpp and rosfi.cpp).
 _ROSFI_REFUSED = frozenset(
     "rip rax rbx rcx rdx rsi rdi rbp rsp r14 r15 esi edi eax ecx edx bl cl dl".split()  # noqa: SIM905
 )
 
 
-def _rosfi_bit(corruption: Corruption, rng: np.random.Generator) -> Corruption:
-    """Its bits 52 to 62 (110 to 126 of XMM) land in byte 0, as the write goes there."""
+def _rosfi_bit(
+    corruption: InstructionCorruption, rng: np.random.Generator
+) -> InstructionCorruption:
+    """Move bits 52 to 62 (110 to 126 of XMM) to byte 0, where ROSFI writes them."""
     wide = corruption.site is Site.VECTOR
     bit = int(rng.integers(110, 127) if wide else rng.integers(52, 63))
     return replace(corruption, bits=(bit % 8,))
 
 
 def strategy(name: str, model: FaultModel | None = None, *, compat: str | None = None) -> Strategy:
-    """The strategy of a sampling rule, or of another injector whose habits are repeated.
+    """The strategy of a sampling rule, or of another injector that is imitated.
 
     Raises:
         UnknownName: no such rule or compatibility mode; names the nearest.
@@ -102,16 +106,16 @@ def draw_fault(
     code_at: Callable[[int], bytes],
     locate: Callable[[int], Location],
 ) -> InstructionFault:
-    """One fault, uniform over the executed instructions that have an operand the model allows.
+    """Draw a fault, uniformly over the executed instructions with an operand the model allows.
 
-    An instruction without such an operand is drawn again, so that the rest stay equally likely.
+    If an instruction has no such operand, another is drawn, so that the rest stay equally likely.
 
     Args:
-        stratum: windows of the fault-free run.
-        plan: the strategy; its rule is instruction-uniform.
+        stratum: windows of the golden run.
+        plan: a strategy whose rule is instruction-uniform.
         rng: the fault's own generator.
         code_at: 16 bytes of code at an address.
-        locate: the place of an address.
+        locate: the location of an address.
 
     Raises:
         FaultError: no executed instruction in scope has such an operand.

@@ -1,4 +1,4 @@
-"""Start a program under the tracer, stopped at its first instruction or its entry point."""
+"""Starts a program under the tracer, stopped at its first instruction or its entry point."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LAUNCHER = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """A program as it is started: fixed addresses, fixed environment, output in files."""
+    """A program to start with fixed addresses, a fixed environment and output in files."""
 
     argv: tuple[str, ...]
     directory: Path
@@ -43,7 +43,7 @@ class Command:
         environment: Mapping[str, str] | None = None,
         stdin: Path = Path(os.devnull),
     ) -> Command:
-        """A command with its program found on the path.
+        """Make a command whose program is looked up on the path.
 
         Raises:
             TargetError: no such program, or it cannot be executed.
@@ -90,7 +90,7 @@ def run_to_entry(tracee: Tracee) -> bool:
     """Run to the program's entry point, where its shared libraries are mapped.
 
     Returns:
-        False if the program ended before (a library is missing).
+        False if the program ended first, for example because a library is missing.
     """
     entry = linux.auxiliary(tracee.pid, ENTRY_ADDRESS)
     return entry is not None and tracee.run_to(entry)

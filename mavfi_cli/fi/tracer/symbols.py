@@ -1,4 +1,4 @@
-"""Names of functions as people read them."""
+"""Readable names of functions."""
 
 from __future__ import annotations
 

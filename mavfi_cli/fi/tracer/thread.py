@@ -1,6 +1,6 @@
-"""Work beside a running process: a thread that traces it, a counter that does not stop it.
+"""A thread that traces a running process, and a counter that does not stop it.
 
-Ptrace obeys only the thread that attached.
+ptrace obeys only the thread that attached.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ T = TypeVar("T")
 
 
 class TracerThread(Generic[T]):
-    """Work that traces a node, in a thread of its own: ptrace belongs to a thread.
+    """Runs work that traces a node in a thread of its own, because ptrace is bound to a thread.
 
     Args:
-        work: gets a function to call once the node runs towards what is awaited.
+        work: gets a function to call once the node runs towards the awaited event.
     """
 
     def __init__(self, work: Callable[[Callable[[], None]], T]) -> None:
@@ -31,10 +31,10 @@ class TracerThread(Generic[T]):
         self._error: BaseException | None = None
 
         def run() -> None:
-            """The thread's whole life."""
+            """Run the work, and keep its result or error."""
             try:
                 self._result.append(work(self._armed.set))
-            except BaseException as error:  # the thread's boundary: who awaits it raises it again
+            except BaseException as error:  # the thread's boundary: `result` raises it again
                 self._error = error
             finally:
                 self._armed.set()
@@ -43,13 +43,13 @@ class TracerThread(Generic[T]):
         self._thread.start()
 
     def await_armed(self) -> None:
-        """Wait until the node runs towards what is awaited; raises what went wrong before."""
+        """Wait until the node runs towards the awaited event; raise any earlier error."""
         self._armed.wait()
         if self._error is not None:
             raise self._error
 
     def result(self) -> T:
-        """Wait for the end of the work, and raise what it raised."""
+        """Wait for the end of the work; return its result or raise its error."""
         self._thread.join()
         if self._error is not None:
             raise self._error
@@ -57,14 +57,14 @@ class TracerThread(Generic[T]):
 
 
 class EntryCounter:
-    """Counts the executions of one instruction of a running node, which goes on meanwhile.
+    """Counts the executions of one instruction in a node that keeps running.
 
-    Where the operating system does not count, a tracer stops at each; the count is right whenever
-    the node has answered all the same, since it answers after its last stop.
+    If the operating system cannot count, a tracer stops at each execution. The count is still right
+    whenever the node has answered, because it answers after its last stop.
 
     Args:
         pid: the node; closing the counter may end it.
-        address: of the instruction.
+        address: address of the instruction.
     """
 
     def __init__(self, pid: int, address: int) -> None:
@@ -82,7 +82,7 @@ class EntryCounter:
         return self._stops if self._counter is None else self._counter.read()
 
     def close(self) -> None:
-        """Take the counter away, and with it a node that had to be traced."""
+        """Remove the counter, and end the node if it had to be traced."""
         if self._counter is not None:
             self._counter.close()
         if self._tracer is not None:

@@ -1,9 +1,8 @@
-"""One traced process: start or attach, stop exactly, step, resume, and hear how it ended.
+"""One traced process: attach, stop exactly, step, resume, and learn how it ended.
 
-Every thread and child of the process is traced, so that none outlives the tracer; the *target*
-thread is the one that is stopped and corrupted, the others keep running. There is no sleep and
-no polling: each step waits for the kernel's report. All methods must be called from the thread
-that attached.
+Every thread and child of the process is traced, so that none outlives the tracer. The *target*
+thread is stopped and corrupted; the others keep running. There is no sleep and no polling: each
+step waits for the kernel's report. Call all methods from the thread that attached.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from dataclasses import dataclass, field
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.alarm import Alarm
+from mavfi_cli.fi.tracer.alarm import ProcessTimer
 from mavfi_cli.fi.tracer.arch import DebugBreakpoint, Registers
 from mavfi_cli.fi.tracer.breakpoints import (
     SI_KERNEL,
@@ -36,7 +35,7 @@ _ANY_CHILD = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """How a process ended: exactly one of the two is set."""
+    """How a process ended; exactly one of the two fields is set."""
 
     exit_code: int | None
     signal: int | None
@@ -44,7 +43,7 @@ class Ended:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trap:
-    """The target thread stopped by a trap of ours."""
+    """A stop of the target thread by our own trap."""
 
     code: int  # si_code: TRAP_TRACE, TRAP_PERF, ...
 
@@ -55,7 +54,7 @@ class Tracee:
 
     pid: int
     tid: int
-    group: int  # what waitpid waits for: -process group, or any child of this thread
+    group: int  # argument of waitpid: -process group, or any child of this thread
     mechanism: Mechanism = Mechanism.PERF
     ended: Ended | None = None
     signals: list[int] = field(default_factory=list)  # delivered to the process, in order
@@ -74,12 +73,12 @@ class Tracee:
     ) -> Tracee:
         """Attach to every thread of a running process and stop its target thread.
 
-        The attaching thread must have no other children that somebody else waits for.
+        The attaching thread must have no other children that other code waits for.
 
         Args:
             pid: the process.
-            tid: the target thread; default the main thread.
-            mechanism: how executions are counted; default the best that is allowed.
+            tid: the target thread; by default the main thread.
+            mechanism: how executions are counted; by default the best that is allowed.
 
         Raises:
             TracingForbidden: the operating system refuses.
@@ -110,11 +109,11 @@ class Tracee:
         return self._go(linux.SINGLESTEP)
 
     def resume(self) -> Trap | Ended:
-        """Run until a trap of ours stops the target thread, or to the end."""
+        """Run until our own trap stops the target thread, or to the end."""
         return self._go(linux.CONT)
 
-    def resume_until_alarm(self, alarm: Alarm) -> Trap | Ended:
-        """Run until `alarm` sends its SIGTRAP; that signal is not delivered to the program."""
+    def resume_until_alarm(self, alarm: ProcessTimer) -> Trap | Ended:
+        """Run until `alarm` sends its SIGTRAP, which is not delivered to the program."""
         self._expecting_alarm = True
         try:
             with alarm:
@@ -130,10 +129,10 @@ class Tracee:
     def run_to(self, address: int, count: int = 1) -> bool:
         """Run until the target thread is about to execute `address` for the `count`-th time.
 
-        An execution that the thread is stopped in front of counts as the first.
+        If the thread is stopped in front of an execution, that one counts as the first.
 
         Returns:
-            False if the process ended before.
+            False if the process ended first.
         """
         self.registers.rearm()
         if self.mechanism is Mechanism.PERF:
@@ -175,7 +174,7 @@ class Tracee:
         return os.pread(self._memory_file(), size, address)
 
     def write_memory(self, address: int, data: bytes) -> None:
-        """Write the process's memory; a private copy of a file's page is made by the kernel.
+        """Write the process's memory; the kernel makes a private copy of a file's page.
 
         Raises:
             OSError: nothing is mapped there.
@@ -201,7 +200,7 @@ class Tracee:
         linux.request(linux.DETACH, self.tid, 0, self._take_signal())
 
     def kill(self) -> Ended:
-        """End the process now, with what it started itself, and wait until all is gone."""
+        """End the process and what it started, and wait until all of it is gone."""
         if self.ended is None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
@@ -212,7 +211,7 @@ class Tracee:
         return self.ended
 
     def _kill_descendants(self) -> None:
-        """A program that was started by us has a process group of its own."""
+        """Kill the process group of a program that we started."""
         try:
             os.killpg(-self.group, signal.SIGKILL)
             while True:
@@ -238,11 +237,11 @@ class Tracee:
         return self.handle(self._wait(), how)
 
     def handle(self, status: linux.Status, how: int) -> Trap | Ended:
-        """Act on a report, and on all that follow, until the target stops for us or it ends.
+        """Handle a report and all that follow, until the target stops for us or ends.
 
         Args:
             status: the first report.
-            how: the request that the target goes on with after a passing stop.
+            how: the request that resumes the target after a passing stop.
         """
         while True:
             if status.ended:
@@ -285,7 +284,7 @@ class Tracee:
                 self._continue(status, linux.CONT)
 
     def _target_stopped(self, status: linux.Status) -> Trap | None:
-        """The trap that the caller waits for, or None if this stop is only passing."""
+        """The trap that the caller waits for; None for a passing stop."""
         if status.event == linux.EVENT_STOP:
             return Trap(code=TRAP_BRKPT) if self._interrupting else None
         if status.trapped:
@@ -302,7 +301,7 @@ class Tracee:
         return None
 
     def _continue(self, status: linux.Status, how: int) -> None:
-        """Let a thread go on from a stop that concerns nobody; signals are delivered."""
+        """Resume a thread from a passing stop; signals are delivered."""
         if status.event == linux.EVENT_STOP and status.signal != signal.SIGTRAP:
             how, number = linux.LISTEN, 0  # group-stop: stay stopped until SIGCONT
         else:

@@ -1,8 +1,8 @@
-"""Which instructions execute, in order: the basis of sampling uniformly over executed ones.
+"""Records executed instructions in order, so that sampling can be uniform over them.
 
-A window of the fault-free run is single-stepped and the address of each instruction in scope is
-recorded. Code out of scope runs natively: meanwhile every byte of the code in scope is a
-breakpoint instruction, so that no way back in (return, callback, exception) is missed.
+A window of the golden run is single-stepped and the address of each instruction in scope is
+recorded. Code out of scope runs natively. Meanwhile every byte of the code in scope is a breakpoint
+instruction, so that no way back in (return, callback, exception) is missed.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _CHUNK = 16384
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segment:
-    """One stepped window: how to reach its start, and what executed in it."""
+    """One stepped window: its start, and the instructions that executed in it."""
 
     start: tuple[Stage, ...]  # empty: the program's entry point
-    trace: NDArray[np.int64]  # (n,) addresses in order; a repeated string instruction is one
+    trace: NDArray[np.int64]  # (n,) addresses in order; a repeated string instruction is one entry
 
     @functools.cached_property
     def ranks(self) -> NDArray[np.int64]:
-        """(n,) which execution of its instruction each position is, from 1."""
+        """(n,) number of the execution of its instruction at each position, from 1."""
         order = np.argsort(self.trace, kind="stable")
         ordered = self.trace[order]
         fresh = np.r_[True, ordered[1:] != ordered[:-1]]
@@ -47,25 +47,25 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stratum:
-    """Windows that begin at the same instruction, and those of them that were stepped."""
+    """Windows that begin at the same instruction, with those that were stepped."""
 
     segments: tuple[Segment, ...]
-    windows_in_run: int  # how many windows the run has; more than stepped means a sample of them
+    windows_in_run: int  # windows of the run; if more than were stepped, they are a sample
     marker: Location | None = None  # None: the start of the run
 
     @property
     def instructions(self) -> float:
-        """Executed instructions of all windows, estimated from the stepped ones."""
+        """Number of executed instructions of all windows, estimated from the stepped ones."""
         return self.executed / len(self.segments) * self.windows_in_run
 
     @property
     def executed(self) -> int:
-        """Executed instructions in scope, over the stepped windows."""
+        """Number of executed instructions in scope, over the stepped windows."""
         return sum(len(segment.trace) for segment in self.segments)
 
     @property
     def complete(self) -> bool:
-        """Every window of the run was stepped."""
+        """True if every window of the run was stepped."""
         return len(self.segments) == self.windows_in_run
 
     def at(self, position: int) -> tuple[Segment, int]:
@@ -78,7 +78,7 @@ class Stratum:
 
 
 class WindowTooLong(TargetError):
-    """More instructions than the user allows to step."""
+    """A window has more instructions than the user allows to step."""
 
     def __init__(self, program: str, limit: int) -> None:
         super().__init__(
@@ -101,14 +101,14 @@ def record_window(
     """Step from the present stop to the end of the program, of the function, or to a marker.
 
     Args:
-        tracee: stopped at the start of the window.
-        scope: whose instructions are recorded.
-        limit: refuse longer windows.
-        program: its name, for the error.
+        tracee: the process, stopped at the start of the window.
+        scope: the code whose instructions are recorded.
+        limit: the most instructions in scope.
+        program: name of the program, for the error.
         until_return: the target is at a function's entry; the window ends when it returns.
-        markers: addresses in scope; the window ends in front of the next execution of one. The
-            instruction that the target is stopped in front of is in the window in any case.
-        watch: called now and then with the number of instructions recorded since the last call.
+        markers: addresses in scope; the window ends in front of the next execution of one. It
+            always contains the instruction that the target is stopped in front of.
+        watch: called regularly with the number of instructions recorded since the last call.
 
     Raises:
         WindowTooLong: more than `limit` instructions in scope.
@@ -161,7 +161,7 @@ class _Blanket:
         self._scope = scope
 
     def run_native(self, stop: NDArray[np.int64]) -> bool:
-        """Run foreign code; False where the program ended or the window's function returned."""
+        """Run foreign code; False if the program ended or the window's function returned."""
         tracee = self._tracee
         guard = tracee.breakpoint_at(int(stop[0])) if self._guarded(stop) else None
         try:
@@ -193,18 +193,18 @@ class _Blanket:
 def plan_trigger(
     segment: Segment, index: int, locate: Callable[[int], Location]
 ) -> tuple[tuple[Stage, ...], int]:
-    """The cheapest exact trigger of one executed instruction of a segment.
+    """Plan the cheapest exact trigger of one executed instruction of a segment.
 
-    Counting a hit costs the same whatever the instruction, so a rarely executed instruction
-    shortly before the target is reached first, and the target's executions counted from there.
+    Each counted hit costs the same. So a rarely executed instruction shortly before the target is
+    reached first, and the target's executions are counted from there.
 
     Args:
-        segment: with the instruction.
-        index: of the instruction in the segment's trace.
+        segment: the segment with the instruction.
+        index: index of the instruction in the segment's trace.
         locate: function from an address to a `Location`.
 
     Returns:
-        The trigger, and k: which execution of its instruction in the segment it is.
+        The trigger, and k, the number of the execution of its instruction in the segment.
     """
     trace = segment.trace[: index + 1]
     target = trace[index]
@@ -223,5 +223,5 @@ def plan_trigger(
     return (*segment.start, anchor, Stage(locate(int(target)), int(after[best]))), k
 
 
-_STAGE_COST = 12  # one more stop costs about as much as this many counted hits
+_STAGE_COST = 12  # one more stop costs about as much as 12 counted hits
 _HORIZON = 1 << 20

@@ -1,1 +1,1 @@
-"""An instruction-level fault in a mission: scope, profile, plan, the node that is attacked."""
+"""Instruction-level faults in a mission: plan, profile, injection, and the attacked node."""

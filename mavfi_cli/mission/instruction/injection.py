@@ -1,4 +1,4 @@
-"""An instruction-level fault's way through a mission: the tracer's thread beside the flight."""
+"""Injects an instruction-level fault into a mission from a tracer thread beside the flight."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _TIMING = ("stop_s",)
 
 
 class InstructionInjection(NoInjection):
-    """One instruction-level fault in one mission; messages pass as they are.
+    """One instruction-level fault in one mission; messages pass unchanged.
 
     Args:
-        planned: the fault.
+        planned: the planned fault.
         spawned: the process that will be the attacked node.
-        for_debugger: leave the node stopped at the injected instruction, and say so here.
+        for_debugger: called when the node waits for a debugger at the injected instruction.
     """
 
     def __init__(
@@ -55,14 +55,14 @@ class InstructionInjection(NoInjection):
         return self._planned.node
 
     def begin(self, path: Path) -> None:
-        """Where the record goes."""
+        """Set the path of the record."""
         self._path = path
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """Have the attacked node work in its process, the fault armed there.
+        """Move the attacked node into its own process and arm the fault there.
 
         Raises:
-            BuildMismatch: the record that is repeated is of another build.
+            BuildMismatch: the repeated record is of another build.
             TracingForbidden: the operating system refuses.
         """
         scope = self._spawned.begin(
@@ -101,7 +101,7 @@ class InstructionInjection(NoInjection):
         return done
 
     def _ending(self) -> str | None:
-        """How the node ended, where the tracer heard of it."""
+        """How the node ended, if the tracer was told."""
         if self._tracer is None:
             return None
         ended = self._tracer.result().ended
@@ -112,7 +112,7 @@ class InstructionInjection(NoInjection):
         return f"ended with code {ended.exit_code}"
 
     def news(self) -> list[str]:
-        """The fault, once the invocation that it struck is over."""
+        """The fault as text, once the struck invocation is over."""
         if self._told or self._tracer is None or self._finished() < self._planned.order:
             return []
         self._told = True
@@ -122,14 +122,14 @@ class InstructionInjection(NoInjection):
         return [attack_text(done.record)]
 
     def finish(self) -> dict[str, Any] | None:
-        """The record at the end of the mission, without what a clock measured."""
+        """The record at the end of the mission, without measured times."""
         if self._tracer is None:
             self._spawned.kill()
             return None
         return in_result(self._tracer.result().record)
 
     def close(self) -> None:
-        """End the node's process where no executor has it."""
+        """End the node's process if no executor owns it."""
         if self._tracer is None:
             self._spawned.kill()
 
@@ -145,7 +145,7 @@ def in_result(written: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def attack_text(written: Mapping[str, Any]) -> str:
-    """What was hit, in one line."""
+    """One line that says what was hit."""
     place = written["symbol"] or f"{written['object']}+{written['offset']:#x}"
     where = f"{written['kernel']}, {written['instruction']} at {place}"
     if not written["injection"]["applied"]:
@@ -166,18 +166,18 @@ def injection_of(
     repeat: Mapping[str, Any] | None = None,
     for_debugger: Callable[[int], None] | None = None,
 ) -> InstructionInjection:
-    """The instruction-level fault of a mission, its node's process already starting.
+    """Plan the instruction-level fault of a mission, and start its node's process.
 
     Args:
         config: the mission.
-        out: the folder below which golden flight and profiles are kept.
-        versions: of the libraries.
-        fly_golden: flies a mission into a folder and records it.
-        repeat: the record of a fault to repeat, instead of drawing one.
+        out: the folder below which golden runs and profiles are kept.
+        versions: versions of the libraries.
+        fly_golden: function that flies a mission into a folder and records it.
+        repeat: the record of a fault to repeat; None draws one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
 
     Raises:
-        FaultError: the flight does not repeat, or nothing can be hit in it.
+        FaultError: the flight is not repeatable, or nothing can be hit in it.
     """
     assert config.instruction is not None
     if config.link is not None:

@@ -1,7 +1,7 @@
-"""From what a user asks for to one exact instruction-level fault of a mission.
+"""Plans one exact instruction-level fault of a mission from the user's request.
 
-What the golden flight asked of each node, how often each kernel was entered, and each profile
-are kept below the output folder, by everything that they depend on.
+The orders that the golden run gave to each node, the number of entries of each kernel, and each
+profile are kept below the output folder, under a hash of everything that they depend on.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ CACHE = ".profiles"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedFault:
-    """One exact fault.
+    """One exact instruction-level fault of a mission.
 
     Attributes:
         node: the attacked node.
-        order: in which of its invocations the fault strikes, from 1.
-        context: what else the record says: kernel, invocation, simulated time, sampling.
-        recorded: the record that is repeated; None for a fault that was drawn.
+        order: number of the node's order in which the fault strikes, from 1.
+        context: further entries of the record: kernel, invocation, simulated time, sampling.
+        recorded: the repeated record; None for a drawn fault.
     """
 
     fault: InstructionFault
@@ -60,14 +60,14 @@ def plan_fault(
     versions: Mapping[str, str],
     fly_golden: Callable[[MissionConfig, Path, Recorder], object],
 ) -> PlannedFault:
-    """Draw the fault that a mission and a seed stand for.
+    """Draw the fault of a mission and a seed.
 
     Args:
         config: the mission.
-        asked: what is to be injected.
-        out: the folder below which golden flight and profiles are kept.
-        versions: of the libraries.
-        fly_golden: flies a mission into a folder and records it.
+        asked: the requested fault.
+        out: the folder below which golden runs and profiles are kept.
+        versions: versions of the libraries.
+        fly_golden: function that flies a mission into a folder and records it.
 
     Raises:
         FaultError: the kernel is never entered, or cannot be attacked here.
@@ -78,7 +78,7 @@ def plan_fault(
     folder = out / CACHE / _key(golden, versions)
 
     def fly() -> tuple[Briefing, dict[str, list[Order]]]:
-        """The briefing of the golden flight, and what it asked of its nodes, by node."""
+        """The briefing of the golden run, and the orders that it gave, by node."""
         recorder = Recorder()
         fly_golden(golden, folder, recorder)
         assert recorder.briefing is not None
@@ -121,26 +121,26 @@ def plan_fault(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Invocation:
-    """One invocation of a kernel, and how it is reached."""
+class KernelInvocation:
+    """One invocation of a kernel, and the entry with which it begins."""
 
-    number: int  # of the kernel, from 1
+    number: int  # number of the kernel's invocation, from 1
     of: int
-    order: int  # of the node, from 1, in which it happens
-    entry: int  # of the kernel, from 1, with which it begins
-    earlier: int  # entries in the orders before
+    order: int  # number of the node's order that contains it, from 1
+    entry: int  # number of the kernel's entry with which it begins, from 1
+    earlier: int  # entries in the earlier orders
 
 
-def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> Invocation:
-    """One invocation of a kernel, uniformly, from how often it was entered up to each order.
+def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> KernelInvocation:
+    """Draw one invocation of a kernel uniformly from the entries up to each order.
 
-    Each entry is an invocation. A planner node is entered once or more in a request (each time it
-    builds an obstacle grid), and the request is the invocation.
+    Each entry is an invocation, except for a planner node. It is entered each time it builds an
+    obstacle grid, once or more in a request, and the request is the invocation.
 
     Args:
-        node: whose kernel it is.
-        counts: entries up to each order of the golden flight, ascending; some.
-        rng: draws.
+        node: the node that runs the kernel.
+        counts: entries up to each order of the golden run, ascending; not empty.
+        rng: the random generator.
     """
     before = np.array([0, *counts[:-1]])
     if node != "planner":
@@ -151,13 +151,13 @@ def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) 
         which, of = int(rng.integers(len(orders))), len(orders)
         order, number = int(orders[which]), which + 1
         entry = int(before[order]) + 1
-    return Invocation(
+    return KernelInvocation(
         number=number, of=of, order=order + 1, entry=entry, earlier=int(before[order])
     )
 
 
 def planned_of(recorded: Mapping[str, Any]) -> PlannedFault:
-    """The fault of a record, to repeat it.
+    """Read the fault of a record, to repeat it.
 
     Raises:
         RecordError: not the record of an instruction-level fault in a mission.
@@ -183,7 +183,7 @@ _CONTEXT = (
 
 
 def _kept(path: Path, make: Callable[[], T]) -> T:
-    """A value from its file, or made and kept there."""
+    """Read a value from its file, or make it and keep it there."""
     if path.is_file():
         kept: T = pickle.loads(path.read_bytes())
         return kept
@@ -197,7 +197,7 @@ def _kept(path: Path, make: Callable[[], T]) -> T:
 
 
 def _key(golden: MissionConfig, versions: Mapping[str, str]) -> str:
-    """A name for all that the golden flight depends on."""
+    """A hash of everything that the golden run depends on."""
     values = golden.to_dict()
     files = [Path(name) for name in golden.files]
     parts = [

@@ -1,8 +1,8 @@
-"""A node of a mission as a target: one of its orders, again and again, without flying.
+"""A node of a mission as a target: it repeats one of its orders without a flight.
 
-A node is a function of its orders. The orders of the golden flight are given again to a node of its
-own, at the speed of the machine. For the last of them it forks, as often as it is asked: a fork
-works on the order and ends instead of answering.
+A node is a function of its orders. A separate node gets the orders of the golden run again, at the
+speed of the machine. It forks for the last of them as often as it is asked: each fork works on the
+order and ends instead of answering.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 
 Order = tuple[Any, float]  # input, start stamp
 WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
-WINDOWS, ENOUGH = 4, 50_000  # of a planner's request with a search: see `profile_run`
-_CALLS = {"octomap": 16}  # sampled: how many calls of one inner function, of some 300 instructions
+WINDOWS, ENOUGH = 4, 50_000  # for a planner's request with a search: see `profile_run`
+_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
 
 
 class Rehearsal:
-    """The `AttackPlace` where one invocation of a node's kernel runs.
+    """The `AttackPlace` in which one invocation of a node's kernel runs.
 
     Args:
-        setup: of the node.
-        orders: input and start stamp, up to the one with the invocation.
-        entry: which entry of the kernel in that order begins it, from 1.
+        setup: setup of the node.
+        orders: inputs and start stamps, up to the order with the invocation.
+        entry: number of the kernel's entry in that order with which it begins, from 1.
     """
 
     kind = "node"
@@ -62,7 +62,7 @@ class Rehearsal:
         return self.scope_of_node.kernel
 
     def start(self) -> Tracee:
-        """A fork of the node, stopped where it begins the invocation."""
+        """Start a fork of the node, stopped where it begins the invocation."""
         tracee = Tracee.attach(self._process.rehearse())
         self._process.order(self._setup.node, *self._last)
         if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
@@ -70,7 +70,7 @@ class Rehearsal:
         return tracee
 
     def image(self, _: Tracee) -> Image:
-        """What the node has in its memory, and each of its forks."""
+        """The memory image of the node and of each fork."""
         return self._image
 
     def scope(self, image: Image) -> Scope:
@@ -80,7 +80,7 @@ class Rehearsal:
     def profile(self, rng: np.random.Generator) -> TargetProfile:
         """Step the invocation, or a sample of it.
 
-        Works on the node's own processor: handing over between two would cost as much again.
+        It runs on the node's own processor: switching between two doubles the time.
         """
         linux.share_processor(self._spawned.pid)
         node, inner = self._setup.node, self.scope_of_node.inner
@@ -91,15 +91,15 @@ class Rehearsal:
         return profile_call(self, limit=WHOLE_LIMIT)
 
     def _profile_request(self, rng: np.random.Generator) -> TargetProfile:
-        """Step a request that is answered without a search whole, one with a search by sample.
+        """Step a whole request if it needs no search, else a sample of it.
 
-        A request has no native function round it: it is a row of calls of compiled functions from
-        Python, with a search among them or without. So it goes on to the end of the run.
+        No native function encloses a request: Python calls several compiled functions, with or
+        without a search. So the request ends with the run.
         """
         if not self._searches():
             try:
                 return profile_run(self, rng, limit=WHOLE_LIMIT)
-            except WindowTooLong:  # smoothing tries again and again
+            except WindowTooLong:  # smoothing repeats its attempts
                 pass
         return profile_run(
             self,
@@ -126,18 +126,18 @@ class Rehearsal:
 def profile_invocation(
     setup: Setup, orders: Sequence[Order], entry: int, earlier: int, rng: np.random.Generator
 ) -> TargetProfile:
-    """Profile one invocation of a node's kernel, which happens in the last of the orders.
+    """Profile one invocation of a node's kernel in the last of the orders.
 
     Args:
-        setup: of the node.
-        orders: up to the one with the invocation.
-        entry: how many entries of the kernel there have been when it begins, itself included.
-        earlier: how many of them are in the orders before.
-        rng: draws what is stepped, where that is a sample.
+        setup: setup of the node.
+        orders: the orders up to the one with the invocation.
+        entry: number of the kernel's entries when it begins, itself included.
+        earlier: number of them in the earlier orders.
+        rng: draws the sample, if only a sample is stepped.
 
     Raises:
         TracingForbidden: the operating system refuses.
-        WindowTooLong: too long to be stepped.
+        WindowTooLong: the invocation is too long to be stepped.
         TargetError: nothing in scope executes.
     """
     place = Rehearsal(setup, orders, entry - earlier)
@@ -149,7 +149,7 @@ def profile_invocation(
 
 
 def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
-    """How often the kernel had been entered after each order.
+    """Count the kernel's entries up to the end of each order.
 
     Raises:
         TracingForbidden: the operating system neither counts nor lets us trace.

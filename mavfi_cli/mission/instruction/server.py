@@ -1,4 +1,4 @@
-"""A node as a program of its own: the one process of a mission that is attacked."""
+"""A node as a separate program: the only attacked process of a mission."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PROGRAM = "mavfi_cli.mission.instruction.server"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """The message to the program; it answers with its `KernelScope`."""
+    """The message to the program, which answers with its `KernelScope`."""
 
     config: MissionConfig
     briefing: Briefing
@@ -30,7 +30,7 @@ class Setup:
 
 
 def main() -> None:
-    """Load every kernel, hear which node to be, and work until the connection closes."""
+    """Load every kernel, receive the node's setup, and work until the connection closes."""
     connection = channel()
     warm_up()
     try:

@@ -5,9 +5,9 @@ import signal
 import pytest
 
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import Corruption, Role, Site, explicit_corruption
+from mavfi_cli.fi.tracer.fault import InstructionCorruption, Role, Site, explicit_corruption
 from mavfi_cli.fi.tracer.image import Image
-from mavfi_cli.fi.tracer.inject import Activation, apply, follow, instruction_at
+from mavfi_cli.fi.tracer.inject import BitActivation, apply, follow, instruction_at
 from mavfi_cli.fi.tracer.tracee import Ended
 
 
@@ -52,7 +52,7 @@ def test_the_stack_pointer_after_a_call(start):
 def test_the_return_address_that_a_call_wrote(start):
     tracee, instruction = stop_at(start, "at_call")
     stack = tracee.registers.sp
-    corruption = Corruption(
+    corruption = InstructionCorruption(
         site=Site.MEMORY, role=Role.DESTINATION, register="", operand="", bits=(2,)
     )
     done = apply(tracee, instruction, corruption)
@@ -73,7 +73,7 @@ def test_a_repeated_string_instruction_completes_first(start, tmp_path):
 
 def test_a_stored_value_is_corrupted_in_memory(start, tmp_path):
     tracee, instruction = stop_at(start, "at_store")
-    corruption = Corruption(
+    corruption = InstructionCorruption(
         site=Site.MEMORY, role=Role.DESTINATION, register="", operand="", bits=(4,)
     )
     assert apply(tracee, instruction, corruption).applied
@@ -87,12 +87,12 @@ def test_a_discarded_flag_is_not_injected(start):
     assert not done.applied
     assert done.reason == "discarded by the operating system: bits [9]"
     followed = follow(tracee, instruction, explicit_corruption("rflags", 9), done, window=10)
-    assert followed.activation is Activation.NOT_INJECTED
+    assert followed.activation is BitActivation.NOT_INJECTED
 
 
 def test_a_refused_segment_base_is_not_injected(start):
     tracee, instruction = stop_at(start, "at_add")
-    corruption = Corruption(
+    corruption = InstructionCorruption(
         site=Site.GENERAL, role=Role.SOURCE, register="fs_base", operand="fs_base", bits=(60,)
     )
     done = apply(tracee, instruction, corruption)
@@ -103,7 +103,7 @@ def test_a_refused_segment_base_is_not_injected(start):
 def test_opcode_bytes_execute_once_and_are_whole_again(start, tmp_path):
     tracee, instruction = stop_at(start, "at_mov")  # mov $5, %rax: bit 24 is bit 0 of the 5
     bit = 8 * instruction.raw.index(5)
-    corruption = Corruption(
+    corruption = InstructionCorruption(
         site=Site.OPCODE, role=Role.SOURCE, register="", operand="opcode", bits=(bit,)
     )
     assert apply(tracee, instruction, corruption).applied
@@ -123,7 +123,7 @@ def test_overwritten_before_it_is_read(start):
     corruption = destination("rdi", 3)  # lea into(%rip), %rdi comes
     done = apply(tracee, instruction, corruption)
     followed = follow(tracee, instruction, corruption, done, window=10)
-    assert followed.activation is Activation.OVERWRITTEN
+    assert followed.activation is BitActivation.OVERWRITTEN
     assert followed.instruction.startswith("lea rdi")
 
 
@@ -132,7 +132,7 @@ def test_read_by_the_next_instruction(start):
     corruption = destination("rax", 3)
     done = apply(tracee, instruction, corruption)
     followed = follow(tracee, instruction, corruption, done, window=10)
-    assert (followed.activation, followed.after_instructions) == (Activation.READ, 1)
+    assert (followed.activation, followed.after_instructions) == (BitActivation.READ, 1)
     assert followed.instruction.startswith("add rax")
 
 
@@ -141,7 +141,10 @@ def test_not_read_within_the_window(start):
     corruption = destination("r14", 3)
     done = apply(tracee, instruction, corruption)
     followed = follow(tracee, instruction, corruption, done, window=4)
-    assert (followed.activation, followed.after_instructions) == (Activation.NOT_READ_IN_WINDOW, 4)
+    assert (followed.activation, followed.after_instructions) == (
+        BitActivation.NOT_READ_IN_WINDOW,
+        4,
+    )
 
 
 def test_corrupted_memory_is_followed_to_its_reader(start):
@@ -150,9 +153,9 @@ def test_corrupted_memory_is_followed_to_its_reader(start):
     load = decode(bytes.fromhex("48890424").ljust(16, b"\x90"), 0)  # mov [rsp], rax
     assert load.memory[0].writes
     tracee2, push = stop_at(start, "at_pushf")
-    corruption = Corruption(
+    corruption = InstructionCorruption(
         site=Site.MEMORY, role=Role.DESTINATION, register="", operand="", bits=(0,)
     )
     done = apply(tracee2, push, corruption)
     followed = follow(tracee2, push, corruption, done, window=3)
-    assert (followed.activation, followed.instruction) == (Activation.READ, "popfq")
+    assert (followed.activation, followed.instruction) == (BitActivation.READ, "popfq")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.alarm import Alarm
+from mavfi_cli.fi.tracer.alarm import ProcessTimer
 from mavfi_cli.fi.tracer.breakpoints import ExecutionCounter, Mechanism
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
@@ -68,7 +68,7 @@ def test_the_execution_in_front_of_us_counts(start, mechanism):
 def test_a_stop_inside_a_blocking_system_call_resumes_correctly(start, tmp_path):
     tracee = start("sleeper")
     begin = time.monotonic()
-    alarm = Alarm(tracee.pid, signal.SIGTRAP, cpu_s=None, wall_s=0.05)
+    alarm = ProcessTimer(tracee.pid, signal.SIGTRAP, cpu_s=None, wall_s=0.05)
     stopped = tracee.resume_until_alarm(alarm)
     assert not isinstance(stopped, Ended)
     assert tracee.registers.system_call in (35, 230)  # nanosleep, clock_nanosleep

@@ -1,9 +1,9 @@
-"""What differs between processors, behind one boundary.
+"""The parts of the injector that differ between processors.
 
-Everything outside this package works with register *names*, Python integers and the types of
-`arch.instruction`, and imports from here only; import-linter holds that. A package for another
-processor supplies the names below with the same meaning; see docs/injection.md for what is known
-about aarch64.
+Code outside this package works with register *names*, Python integers and the types of
+`arch.instruction`, and imports from here only; import-linter enforces that. A package for another
+processor supplies the names below with the same meaning. docs/injection.md says what is known about
+aarch64.
 """
 
 from __future__ import annotations

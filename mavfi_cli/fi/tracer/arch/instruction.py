@@ -1,6 +1,6 @@
-"""What one instruction reads and writes, as bits of full registers and bytes of memory.
+"""Operands of one instruction, as bits of full registers and bytes of memory.
 
-The same on every processor; a decoder of `arch` fills it in.
+The types are the same on every processor; a decoder of `arch` fills them in.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class MemoryUse:
 
     @property
     def operand(self) -> str:
-        """The operand in words, for a record."""
+        """The operand as text, for a record."""
         parts = [part for part in (self.segment, self.base, self.index) if part]
         return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
 
@@ -51,10 +51,10 @@ class Instruction:
     writes: tuple[RegisterUse, ...]
     memory: tuple[MemoryUse, ...]
     element: str | None  # float64 or float32 where the instruction computes with them
-    scalar: bool  # of the elements of its registers it computes with the lowest only
-    run_over: bool  # one single step does not execute it whole and without a trace: run past it
+    scalar: bool  # it computes with the lowest element of its registers only
+    run_over: bool  # one single step is not enough or leaves a trace: run past it
 
     @property
     def next_address(self) -> int:
-        """Where the following instruction starts."""
+        """Address of the following instruction."""
         return self.address + len(self.raw)

@@ -1,6 +1,6 @@
-"""In place of a processor that the injector does not know: what it supplies refuses when used.
+"""Stand-ins for an unsupported processor; each raises when it is used.
 
-So everything can be imported, and missions without instruction-level faults need nothing of it.
+Everything can still be imported, and missions without instruction-level faults need none of it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from mavfi_cli.core.errors import TracingForbidden
 
 
 def refuse(*_arguments: Any, **_named: Any) -> NoReturn:
-    """Say what is missing.
+    """Raise an error that names what is missing.
 
     Raises:
         TracingForbidden: always.
@@ -25,7 +25,7 @@ def refuse(*_arguments: Any, **_named: Any) -> NoReturn:
 
 
 class _Refusing:
-    """An object without attributes that says why."""
+    """An object whose attributes raise when they are read."""
 
     def __getattr__(self, name: str) -> NoReturn:
         refuse()

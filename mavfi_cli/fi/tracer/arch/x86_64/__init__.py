@@ -1,4 +1,4 @@
-"""x86-64: its registers, its instructions, and what single steps leave behind on it."""
+"""x86-64: registers, instructions, and the traces that single steps leave."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """CPUID of this machine, through a few bytes of machine code in an executable page.
 
-The layout of the extended state differs between processors and must be asked for: Intel SDM
-volume 1, section 13.5 (leaf 0xD enumerates size and offset of each XSAVE component).
+The layout of the extended state differs between processors. Leaf 0xD gives size and offset of each
+XSAVE component: Intel SDM volume 1, section 13.5.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CODE = bytes.fromhex(
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """Place of one XSAVE component in the standard (not compacted) format, in bytes."""
+    """Offset and size of one XSAVE component in the standard (not compacted) format, bytes."""
 
     offset: int
     size: int

@@ -1,6 +1,6 @@
-"""What one x86-64 instruction reads and writes, as bits of full registers and bytes of memory.
+"""Decoder of x86-64 instructions to the register bits and memory bytes that they read and write.
 
-Capstone names the explicit and implicit registers; added here is what it does not say: which
+Capstone names the explicit and implicit registers. This module adds what it does not say: which
 bits of the full register an operand covers (a 32-bit write clears the upper half, a VEX-encoded
 one the whole rest; Intel SDM volume 1, sections 3.4.1.1 and 14.1.1), the stack slots of push,
 pop, call and ret, the x87 stack top, and the registers of a Linux system call.
@@ -67,7 +67,7 @@ _engine.detail = True
 
 
 def decode(code: bytes, address: int) -> Instruction | None:
-    """Decode one instruction; give it 16 bytes. None where the bytes are no instruction."""
+    """Decode one instruction from 16 bytes; None if the bytes are not an instruction."""
     return _decode(bytes(code[:16]), address)
 
 
@@ -102,10 +102,10 @@ def _decode(code: bytes, address: int) -> Instruction | None:
 
 
 def _run_over(mnemonic: str) -> bool:
-    """Whether one single step is not enough, or leaves a trace.
+    """True if one single step is not enough, or leaves a trace.
 
-    Of a repeated string instruction it is one iteration only. After one of a pop of the flags
-    Linux takes the trap flag for the program's own (`enable_single_step` in
+    A step executes one iteration of a repeated string instruction. After a step over a pop of the
+    flags, Linux takes the trap flag for the program's own (`enable_single_step` in
     arch/x86/kernel/step.c), and would leave it set.
     """
     return mnemonic.startswith("rep") or mnemonic in ("popfq", "popf")
@@ -134,7 +134,7 @@ def _use(found: Any, name: str, explicit: set[str], vex: bool) -> RegisterUse | 
         register, mask = name, _FULL
         clears = mask
     else:
-        return None  # flags are named bit by bit; segments and control words are no targets
+        return None  # flags are named bit by bit; segments and control words are not targets
     if found.mnemonic.startswith("cmov"):
         clears = 0  # it may not write
     return RegisterUse(
@@ -196,7 +196,7 @@ def _memory(found: Any) -> list[MemoryUse]:
         return []
 
     def name(number: int) -> str | None:
-        """Of a register by capstone's number; None for none."""
+        """Name of a register by capstone's number; None for no register."""
         return str(found.reg_name(number)) if number else None
 
     return [
@@ -238,12 +238,12 @@ def _stack(found: Any) -> list[MemoryUse]:
 
 
 def address_of(use: MemoryUse, instruction: Instruction, read: Any) -> int:
-    """The address of a memory operand, before the instruction executes.
+    """Address of a memory operand before the instruction executes.
 
     Args:
         use: the operand.
-        instruction: it belongs to.
-        read: function that gives the value of a full register.
+        instruction: the instruction that the operand belongs to.
+        read: function that returns the value of a full register.
     """
     total = use.displacement
     if use.base == "rip":

@@ -46,7 +46,7 @@ TRAITS = Traits(
 
 @dataclass(frozen=True, slots=True)
 class _Span:
-    """Bytes of the extended state that hold part of a register, and the component's number."""
+    """Bytes of the extended state that hold part of a register, with the component's number."""
 
     component: int
     offset: int
@@ -69,7 +69,7 @@ def width_of(name: str) -> int:
 
 
 def register_kind(name: str) -> str:
-    """The class of a full register: the value of its `Site`."""
+    """The class of a full register, as the value of its `Site`."""
     if name == "rflags":
         return "flags"
     if name == "rip":
@@ -106,7 +106,7 @@ class Registers:
         self._extended: bytes | None = None
 
     def forget(self) -> None:
-        """Drop what was read; call after the thread has run."""
+        """Drop cached values; call after the thread has run."""
         self._general = None
         self._extended = None
 
@@ -140,7 +140,7 @@ class Registers:
         return int.from_bytes(b"".join(parts), "little")
 
     def write(self, name: str, value: int) -> None:
-        """Write a full register. What the kernel made of it is seen by reading again.
+        """Write a full register; read it again to see what the kernel stored.
 
         Raises:
             OSError: the kernel refuses the value.
@@ -200,7 +200,7 @@ class Registers:
 
     @property
     def system_call(self) -> int | None:
-        """Number of the system call that this stop interrupted, or None outside of one."""
+        """Number of the system call that this stop interrupted, or None outside a system call."""
         number = self.read("orig_rax")
         return None if number >> 63 else number
 

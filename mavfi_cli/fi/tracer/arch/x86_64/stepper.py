@@ -1,8 +1,7 @@
-"""The single-step loop, compiled: one instruction costs what the operating system takes for it.
+"""The compiled single-step loop: a step costs little more than its system calls.
 
-The loop returns to Python whenever something needs thought: code out of scope, a system call, a
-push of the flags, a signal. `ptrace` and `wait4` are resolved by name in the running process, so
-the compiled loop can be cached.
+The loop returns to Python for code out of scope, a system call, a push of the flags or a signal.
+`ptrace` and `wait4` are resolved by name at run time, so the compiled loop can be cached.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _wait4: Any = types.ExternalFunction(
 
 
 def _is_repeated(word: int) -> bool:
-    """F2 or F3, an optional REX prefix, and a string opcode (Intel SDM volume 2, REP)."""
+    """True for F2 or F3, an optional REX prefix and a string opcode (Intel SDM volume 2, REP)."""
     first = word & 0xFF
     if first != 0xF2 and first != 0xF3:
         return False
@@ -38,7 +37,7 @@ def _is_repeated(word: int) -> bool:
 
 
 def _needs_care(word: int) -> bool:
-    """A push or a pop of the flags, or a system call."""
+    """True for a push or a pop of the flags, or a system call."""
     first = word & 0xFF
     second = (word >> 8) & 0xFF
     code = second if first == 0x66 or 0x40 <= first <= 0x4F else first
@@ -65,11 +64,11 @@ def _run(
         trace: (m,) filled from the start.
         stop: (2 + m,) the window ends at the first address once the stack pointer is above the
             second number, and at each of the other addresses.
-        offsets: (2,) of instruction and stack pointer in `struct user`.
-        status: (1,) the last wait status, where it is not a plain step.
+        offsets: (2,) offsets of instruction and stack pointer in `struct user`.
+        status: (1,) the last wait status, if it is not a plain step.
 
     Returns:
-        How many addresses were recorded, and why the loop ended.
+        The number of recorded addresses, and why the loop ended.
     """
     recorded = 0
     repeating = np.int64(-1)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mavfi_cli.fi.tracer.tracee import Tracee
 
 _USER_OFFSETS = (128, 152)  # of rip and rsp in `struct user`
-_DEBUG_REGISTERS = 848  # offset of debug register 0 in it
+_DEBUG_REGISTERS = 848  # offset of debug register 0 in `struct user`
 
 
 def record_steps(
@@ -40,7 +40,7 @@ def record_steps(
 
 
 def erase_trap(tracee: Tracee, instruction: Instruction) -> None:
-    """After a single step of `instruction`: the target must not see that it was stepped.
+    """Remove the trap flag that a single step of `instruction` left in the target.
 
     `pushf` has pushed the trap flag, and a system call has saved it in r11.
     """
@@ -56,7 +56,7 @@ def erase_trap(tracee: Tracee, instruction: Instruction) -> None:
 
 
 def return_address(tracee: Tracee) -> int:
-    """Where the function returns to at whose first instruction the target is stopped."""
+    """Return address of the function; the target is stopped at its first instruction."""
     return int.from_bytes(tracee.read_memory(tracee.registers.sp, 8), "little")
 
 
@@ -67,8 +67,8 @@ class DebugBreakpoint:
 
     Args:
         tid: the thread.
-        address: of the instruction.
-        slot: which register, 0 to 3.
+        address: address of the instruction.
+        slot: number of the register, 0 to 3.
     """
 
     def __init__(self, tid: int, address: int, slot: int = 0) -> None:
@@ -80,7 +80,7 @@ class DebugBreakpoint:
         self._enable(self._enabled)
 
     def close(self) -> None:
-        """Take the breakpoint away; the thread must be stopped, or gone."""
+        """Remove the breakpoint; the thread must be stopped or gone."""
         with contextlib.suppress(ProcessLookupError):
             self._enable(0)
 
