@@ -1,7 +1,8 @@
 """Campaigns: planned lists of missions with a ledger of their results.
 
-Calling the package reads a campaign. The library's function `mavfi_cli.campaign` and this package share one name. Python binds the name
-to the package as soon as one of its modules is imported, so the package itself can be called.
+Calling the package reads a campaign. The library's function `mavfi_cli.campaign` and this package
+share one name. Python binds the name to the package as soon as one of its modules is imported, so
+the package itself can be called.
 """
 
 import sys
