@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.vehicle import EmbeddedVehicle
+from mavfi_cli.mission.vehicle import VehicleInProcess
 
 
 def ask_vehicle(config: MissionConfig) -> None:
@@ -18,6 +18,6 @@ def ask_vehicle(config: MissionConfig) -> None:
     """
     with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
         try:
-            EmbeddedVehicle(config, Path(folder)).end()
+            VehicleInProcess(config, Path(folder)).end()
         except MavfiError as error:
             raise VehicleProcessError(str(error)) from None

@@ -35,7 +35,7 @@ class Vehicle(Protocol):
         """Close the link and wait until the truth is saved; why the vehicle ended before that."""
 
 
-class EmbeddedVehicle:
+class VehicleInProcess:
     """The vehicle in this process; it flies while the companion waits for it.
 
     Args:
@@ -177,7 +177,7 @@ StartVehicle = Callable[[MissionConfig, Path], Vehicle]
 
 def start_vehicle(config: MissionConfig, truth_folder: Path) -> Vehicle:
     """In this process, but by the wall clock, where companion and vehicle compute side by side."""
-    start = VehicleProcess if config.realtime else EmbeddedVehicle
+    start = VehicleProcess if config.realtime else VehicleInProcess
     return start(config, truth_folder)
 
 
