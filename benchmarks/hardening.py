@@ -9,16 +9,12 @@ not end in success. All arms flew the same faults, so their counts pair. Interva
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import pyarrow.parquet as pq
-from lost_missions import share
-from scipy.stats import binomtest
+from exported import Key, against, arguments, flown, key, lost, share
 
-Row = Mapping[str, Any]
+from mavfi_cli.stats.shares import wilson
+
 ARMS = {  # stack and detector -> what the picture calls it
     ("mavbench", None): "unprotected",
     ("mavbench:refuses_far_waypoints=true", None): "far waypoints refused",
@@ -37,26 +33,24 @@ SITES = {
     "plan_future_collision_seq": "future_collision_seq",
 }
 FAULT = ("world", "seed", "label_site")
-Cells = dict[str, dict[tuple[Any, ...], bool]]  # whether each fault lost the mission, by arm
+Cells = dict[str, dict[Key, bool]]  # whether each fault lost the mission, by arm
 
 
 def read(parts: list[str]) -> Cells:
     """The faults that the unprotected flight has read, by arm."""
-    rows = [row for part in parts for row in pq.read_table(part).to_pylist()]
+    rows = [row for row in flown(parts) if row["injected"] != "golden"]
     cells: Cells = {arm: {} for arm in ARMS.values()}
     for row in rows:
-        if row["state"] == "flown" and row["injected"] != "golden":
-            arm = ARMS[row["label_stack"], row["label_detector"] or None]
-            cells[arm][tuple(row[key] for key in FAULT)] = row["outcome"] != "success"
-    flown = set.intersection(*(set(faults) for faults in cells.values()))
-    read_faults = {
-        tuple(row[key] for key in FAULT)
+        arm = ARMS[row["label_stack"], row["label_detector"] or None]
+        cells[arm][key(row, FAULT)] = lost(row)
+    active = {
+        key(row, FAULT)
         for row in rows
         if row["label_stack"] == "mavbench" and not row["label_detector"]
         if row["activation"] == "read"
     }
-    kept = flown & read_faults
-    return {arm: {f: lost for f, lost in x.items() if f in kept} for arm, x in cells.items()}
+    kept = active.intersection(*(set(faults) for faults in cells.values()))
+    return {arm: {f: faults[f] for f in faults if f in kept} for arm, faults in cells.items()}
 
 
 def lines(cells: Cells) -> list[str]:
@@ -67,11 +61,8 @@ def lines(cells: Cells) -> list[str]:
         "|---" * (len(SITES) + 3) + "|",
     ]
     for arm, faults in cells.items():
-        by_site = [[lost for f, lost in faults.items() if f[2] == site] for site in SITES]
-        saved = sum(plain[f] and not faults[f] for f in plain)
-        broken = sum(faults[f] and not plain[f] for f in plain)
-        apart = saved + broken
-        p = f"{binomtest(saved, apart).pvalue:.2g}" if apart else "1"
+        by_site = [[bad for f, bad in faults.items() if f[2] == site] for site in SITES]
+        p = f"{against(plain, faults).p_value:.2g}"
         counts = " | ".join(f"{sum(each)} of {len(each)}" for each in by_site)
         printed.append(f"| {arm} | {counts} | {share(sum(faults.values()), len(faults))} | {p} |")
     return printed
@@ -88,15 +79,15 @@ def draw(cells: Cells, path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7.0, 3.4), layout="constrained")
     for place, (arm, faults) in enumerate(reversed(cells.items())):
         count, total = sum(faults.values()), len(faults)
-        ci = binomtest(count, total).proportion_ci(method="wilson")
-        value = 100.0 * count / total
+        whole = wilson(count, total)
+        value = 100.0 * whole.share
         colour = "#b2182b" if arm == "unprotected" else "#2166ac" if "AD" in arm else "#7f8c8d"
         axes.barh(place, value, color=colour, height=0.6)
         axes.errorbar(
-            value, place, xerr=[[value - 100.0 * ci.low], [100.0 * ci.high - value]],
+            value, place, xerr=[[value - 100.0 * whole.low], [100.0 * whole.high - value]],
             color="black", capsize=3, linewidth=1,
         )  # fmt: skip
-        axes.text(100.0 * ci.high + 1.0, place, f"{count} of {total}", va="center", fontsize=9)
+        axes.text(100.0 * whole.high + 1.0, place, f"{count} of {total}", va="center", fontsize=9)
     axes.set_yticks(range(len(cells)), list(reversed(cells)))
     axes.set_xlabel("missions lost, % (95 % interval)")
     axes.margins(x=0.15)
@@ -107,8 +98,7 @@ def draw(cells: Cells, path: Path) -> None:
 
 def main() -> None:
     """Read, print, draw."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="+", help="exports of the campaign, as Parquet")
+    parser = arguments(__doc__)
     parser.add_argument("--picture", type=Path, help="where to draw, as SVG")
     given = parser.parse_args()
     cells = read(given.parts)

@@ -14,24 +14,13 @@ that both flew by McNemar's exact test.
 
 from __future__ import annotations
 
-import argparse
 import collections
 import itertools
-from collections.abc import Mapping
-from typing import Any
 
-import pyarrow.parquet as pq
-from lost_missions import LONGER, share
-from scipy.stats import binomtest
+from exported import LONGER, Key, Row, against, arguments, flown, key, lost, share
 
-Row = Mapping[str, Any]
 MISSION = ("world", "world_seed", "seed", "platform")
 FAULT = ("fault_target", "fault_field", "fault_seed")
-
-
-def key(row: Row, names: tuple[str, ...]) -> tuple[Any, ...]:
-    """The values of some columns."""
-    return tuple(row[name] for name in names)
 
 
 def arm_of(row: Row, columns: list[str]) -> str:
@@ -49,9 +38,9 @@ class Faults:
     """
 
     def __init__(self, rows: list[Row], columns: list[str], unprotected: str) -> None:
-        self.golden_s: dict[tuple[Any, ...], float] = {}
-        self.flights: dict[tuple[Any, ...], dict[str, Row]] = collections.defaultdict(dict)
-        golden = [r for r in rows if r["injected"] == "golden" and r["outcome"] == "success"]
+        self.golden_s: dict[Key, float] = {}
+        self.flights: dict[Key, dict[str, Row]] = collections.defaultdict(dict)
+        golden = [row for row in rows if row["injected"] == "golden" and not lost(row)]
         for row in golden:
             if arm_of(row, columns) == unprotected:
                 self.golden_s[key(row, MISSION)] = row["flight_time_s"]
@@ -73,7 +62,7 @@ class Faults:
 
     def harms(self, row: Row) -> bool:
         """Whether the mission is lost, or longer by more than 5 %."""
-        return row["outcome"] != "success" or self.excess(row) > LONGER - 1.0
+        return lost(row) or self.excess(row) > LONGER - 1.0
 
 
 def report(faults: Faults, unprotected: str) -> list[str]:
@@ -85,43 +74,37 @@ def report(faults: Faults, unprotected: str) -> list[str]:
         "| arm | recovered | undone | broken | worst successful flight |",
         "|---|---|---|---|---|",
     ]
-    undone: dict[str, dict[tuple[Any, ...], bool]] = {}
+    undone: dict[str, dict[Key, bool]] = {}
     for arm in [unprotected, *arms]:
-        flown = {f: x[arm] for f, x in faults.active.items() if arm in x}
-        lost = [f for f in flown if faults.active[f][unprotected]["outcome"] != "success"]
-        harmful = [f for f in flown if f in faults.harmful]
-        undone[arm] = {f: not faults.harms(flown[f]) for f in harmful}
-        broken = [f for f in flown if f not in faults.harmful and faults.harms(flown[f])]
-        ok = [faults.excess(row) for row in flown.values() if row["outcome"] == "success"]
+        rows = {f: x[arm] for f, x in faults.active.items() if arm in x}
+        failed = [f for f in rows if lost(faults.active[f][unprotected])]
+        harmful = [f for f in rows if f in faults.harmful]
+        undone[arm] = {f: not faults.harms(rows[f]) for f in harmful}
+        broken = [f for f in rows if f not in faults.harmful and faults.harms(rows[f])]
+        ok = [faults.excess(row) for row in rows.values() if not lost(row)]
         lines.append(
             f"| {arm or 'none'} "
-            f"| {share(sum(flown[f]['outcome'] == 'success' for f in lost), len(lost))} "
+            f"| {share(sum(not lost(rows[f]) for f in failed), len(failed))} "
             f"| {share(sum(undone[arm].values()), len(harmful))} "
-            f"| {share(len(broken), len(flown) - len(harmful))} | {max(ok, default=0.0):+.1%} |"
+            f"| {share(len(broken), len(rows) - len(harmful))} | {max(ok, default=0.0):+.1%} |"
         )
     for one, other in itertools.combinations(arms, 2):
-        both = undone[one].keys() & undone[other].keys()
-        only_one = sum(undone[one][f] and not undone[other][f] for f in both)
-        only_other = sum(undone[other][f] and not undone[one][f] for f in both)
-        apart = only_one + only_other
-        p = binomtest(only_one, apart).pvalue if apart else 1.0
+        test = against(undone[one], undone[other])
         lines.append(
-            f"\n{one} against {other}, harm undone: {only_one} faults by {one} only, {only_other} "
-            f"by {other} only, of {len(both)}; McNemar p = {p:.2g}"
+            f"\n{one} against {other}, harm undone: {test.only_first} faults by {one} only, "
+            f"{test.only_second} by {other} only, of {test.pairs}; McNemar p = {test.p_value:.2g}"
         )
     return lines
 
 
 def main() -> None:
     """Read, pair, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="+", help="exports of campaigns, as Parquet")
+    parser = arguments(__doc__)
     parser.add_argument("--arms", nargs="+", required=True, help="columns that name an arm")
     parser.add_argument("--unprotected", default="", help="name of the arm without protection")
     parser.add_argument("--where", nargs="*", default=[], metavar="COLUMN=VALUE")
     given = parser.parse_args()
-    rows = [row for part in given.parts for row in pq.read_table(part).to_pylist()]
-    kept = [row for row in rows if row["state"] == "flown"]
+    kept = flown(given.parts)
     for column, _, value in (each.partition("=") for each in given.where):
         kept = [r for r in kept if r["injected"] == "golden" or str(r.get(column)) == value]
     print("\n".join(report(Faults(kept, given.arms, given.unprotected), given.unprotected)))

@@ -121,6 +121,7 @@ def steps_told(stage: Callable[[str], None]) -> Watch:
     total = 0
 
     def watch(steps: int) -> None:
+        """Add these steps and tell the sum."""
         nonlocal total
         total += steps
         stage(f"profile, {total} instructions stepped")

@@ -125,6 +125,7 @@ def _scored(scores: Scores, error_free: pa.Table, faults: pa.Table, view: Specta
     scores.score_all(wanted, view.on_note)
 
     def of(detector: str) -> tuple[pa.Table, list[float]]:
+        """Scores of the harmful faults, and of the golden flights."""
         positive = pa.array([scores.of(path, detector) for path in struck], pa.float64())
         table = harmful.select(["stage", "field"]).append_column("score", positive)
         negative = (scores.of(path, detector) for path in golden)
