@@ -50,10 +50,6 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
            help="World; may be repeated  [sparse, dense, factory, farm].")  # fmt: skip
 @_missions("--flights", default=25, show_default=True, type=click.IntRange(min=0),
            help="Faulty missions per world. Each is flown once per kind of fault.")  # fmt: skip
-@_missions("--harmless-flights", default=5, show_default=True, type=click.IntRange(min=0),
-           help="Number of these missions, the first ones, that the detectors fly with every "
-                "fault. They fly the others only with faults that do harm without "
-                "detector.")  # fmt: skip
 @_missions("--golden-flights", default=100, show_default=True, type=click.IntRange(min=1),
            help="Error-free missions per world, at least --flights.")  # fmt: skip
 @_missions("--first-seed", default=500_000, show_default=True, type=click.IntRange(min=0),
@@ -125,7 +121,6 @@ def _plan(options: dict[str, Any]) -> Any:
         worlds=options["worlds"] or WORLDS,
         detectors=DETECTORS if named is None else _names(named),
         flights=options["flights"],
-        harmless_flights=options["harmless_flights"],
         golden_flights=max(options["golden_flights"], options["flights"]),
         first_seed=options["first_seed"],
         protect=_names(options["protect"]),

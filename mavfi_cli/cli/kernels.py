@@ -54,9 +54,6 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_native("--function", help="Attack only code that executes during calls of this function.")
 @_fault("--sampling", default="instruction-uniform", show_default=True,
         help="instruction-uniform, cpu-time or wall-clock.")  # fmt: skip
-@_fault("--windows", default=16, show_default=True,
-        help="Number of windows to single-step if the whole execution is too long. A window of a "
-             "program is a call of --function.")  # fmt: skip
 @_fault("--site", multiple=True,
         help="general, flags, vector, x87, mask, instruction-pointer, opcode, memory. May be "
              "repeated  [the first five: registers].")  # fmt: skip
@@ -133,7 +130,6 @@ def _plan(options: dict[str, Any]) -> Plan:
             field=options["field"],
             bits=options["bits"],
         ),
-        windows=options["windows"],
         null=options["null"],
     )
     plan.strategy()  # reports errors before any run

@@ -100,10 +100,10 @@ COMMANDS = {
         ],
     ),
     "evaluate": (
-        "0f143c6526f0a965",
+        "11f2481b14b57c40",
         [
             *("detect", "evaluate", "--world", "farm", "--detector", "none,gad", "--flights", "1"),
-            *("--harmless-flights", "0", "--golden-flights", "1", "--field", "exponent"),
+            *("--golden-flights", "1", "--field", "exponent"),
             *("--quiet", "--json"),
         ],
     ),
