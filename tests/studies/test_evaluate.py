@@ -129,7 +129,8 @@ def test_an_evaluation_without_harm_has_no_curve():
 def test_real_flights_end_to_end(mavfi, tmp_path):
     """Two missions; called again nothing is flown, with more detectors the rest is."""
     line = [
-        "detect", "evaluate", "--world", "farm", "--flights", 1, "--golden-flights", 2, "--out", tmp_path / "out", "--quiet", "--json",
+        "detect", "evaluate", "--world", "farm", "--flights", 1, "--golden-flights", 2,
+        "--out", tmp_path / "out", "--quiet", "--json",
     ]  # fmt: skip
     first = mavfi(*line, "--detector", "range", timeout=600)
     assert first.returncode == 0, first.stderr
