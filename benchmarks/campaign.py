@@ -19,9 +19,9 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 STACK = "hardened"  # of the figures in docs/campaign.md
 STAGES = ("perception", "planning", "control")

@@ -26,7 +26,7 @@ from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.campaign.progress import Progress, Spectator
 from mavfi_cli.campaign.run import Options, run_campaign, store_plan
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 CELLS = 40
 DISPATCH_LIMIT_S, LEDGER_LIMIT_S = 0.005, 10.0

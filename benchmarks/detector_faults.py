@@ -17,9 +17,9 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.detector_config import DetectorConfig
-from mavfi_cli.mission.fault_config import DETECTOR, FaultConfig
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import DETECTOR, FaultConfig
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import wilson
 
 FIRST_SEED = 600_000

@@ -24,7 +24,7 @@ from mavfi_cli.detect import registry
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.offline import replay
 from mavfi_cli.detect.preprocess import DETECTED, NAMES
-from mavfi_cli.mission.detector_config import DetectorConfig, detector_of
+from mavfi_cli.spec.detector import DetectorConfig, detector_of
 
 STACK = "hardened"  # that the runs were flown on
 

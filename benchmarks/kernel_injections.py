@@ -27,8 +27,8 @@ from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.workers import one_processor
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def starts(place: KernelPlace, runs: int = 20) -> tuple[float, float]:

@@ -36,8 +36,8 @@ from mavfi_cli.attack.workers import one_processor
 from mavfi_cli.fi.tracer.breakpoints import PerfBreakpoint
 from mavfi_cli.fi.tracer.inject import instruction_at
 from mavfi_cli.fi.tracer.tracee import Tracee
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+from mavfi_cli.spec.mission import MissionConfig
 
 WAYS = ("free", "ended", "armed", "counted", "stopped", "after")
 PAIRS = (("ended", "free"), ("armed", "free"), ("after", "stopped"))

@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from mavfi_cli.core.errors import MavfiError
     from mavfi_cli.fi.value import inject
     from mavfi_cli.library import campaign, fly
-    from mavfi_cli.mission.config import MissionConfig
-    from mavfi_cli.mission.detector_config import DetectorConfig
-    from mavfi_cli.mission.fault_config import FaultConfig
     from mavfi_cli.mission.golden import paired_golden
-    from mavfi_cli.mission.instruction_config import InstructionConfig
     from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.spec.detector import DetectorConfig
+    from mavfi_cli.spec.fault import FaultConfig
+    from mavfi_cli.spec.instruction import InstructionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
 try:
     __version__ = version("mavfi")
@@ -43,11 +43,11 @@ __all__ = [
 ]
 
 _MODULES = {  # name -> module that defines it; `campaign` is the package, which can be called
-    "DetectorConfig": "mavfi_cli.mission.detector_config",
-    "FaultConfig": "mavfi_cli.mission.fault_config",
-    "InstructionConfig": "mavfi_cli.mission.instruction_config",
+    "DetectorConfig": "mavfi_cli.spec.detector",
+    "FaultConfig": "mavfi_cli.spec.fault",
+    "InstructionConfig": "mavfi_cli.spec.instruction",
     "MavfiError": "mavfi_cli.core.errors",
-    "MissionConfig": "mavfi_cli.mission.config",
+    "MissionConfig": "mavfi_cli.spec.mission",
     "PlannedMission": "mavfi_cli.campaign.missions",
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.value",

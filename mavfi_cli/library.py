@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from mavfi_cli.mission.config import MissionConfig
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.record.run_folder import Run
+    from mavfi_cli.spec.mission import MissionConfig
 
 
 def fly(
@@ -49,7 +49,7 @@ def fly(
 def _mission(config: MissionConfig | None, settings: dict[str, Any]) -> MissionConfig:
     """Return the mission with the settings in place."""
     from mavfi_cli.core.config import structure
-    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
     base = config or MissionConfig()
     if not settings:

@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.link.codec import Codec
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.vehicle import start_vehicle
+from mavfi_cli.spec.mission import MissionConfig
 
 for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
     sys.path.insert(0, str(Path(__file__).parent / _folder))

@@ -20,7 +20,7 @@ from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import canonical
 from mavfi_cli.campaign.outcome import COUNTED, Injected
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.layers import cross_layer, failures_per_hour
 from mavfi_cli.stats.shares import rate
 

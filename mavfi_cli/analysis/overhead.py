@@ -20,9 +20,9 @@ from mavfi_cli.analysis.groups import Group
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, detection_cost
 from mavfi_cli.mission.record.run_folder import RESULT, load_run
+from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval
 
 MEASURED = "measured"  # first word of the source of a measured overhead

@@ -20,7 +20,7 @@ from mavfi_cli.analysis.costs import MISSION, cost_difference, cost_row, struck,
 from mavfi_cli.analysis.flights import chosen, flags, flown, known, numbers
 from mavfi_cli.analysis.pairs import both_succeed, difference, paired, ratio, success_test
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, mean, median
 from mavfi_cli.stats.shares import rate
 

@@ -20,9 +20,9 @@ from mavfi_cli.core.types import Stage, Trajectory
 from mavfi_cli.detect.model import preprocessing
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.fi import bits
-from mavfi_cli.mission.detector_config import DetectorConfig, detector_of, model_path
 from mavfi_cli.mission.record.plan_file import read_plans
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
 
 SCORES = "scores.json"
 _WAY = "looks ahead"  # scoring method; scores of other methods are not mixed with these

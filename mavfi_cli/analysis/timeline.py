@@ -14,9 +14,9 @@ from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.companion.companion import SAME_TICK_S
 from mavfi_cli.mission.companion.executor import Invocation
 from mavfi_cli.mission.companion.response import Reaction
-from mavfi_cli.mission.platform import KERNELS
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.record.timetable import read_timetable
+from mavfi_cli.spec.platform import KERNELS
 
 CHAIN = (
     "point_cloud",

@@ -32,7 +32,7 @@ from mavfi_cli.campaign.unchanged import require_unchanged
 from mavfi_cli.campaign.world_search import with_worlds
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.files import write_text
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
 _APPEND = "--append adds what is new"

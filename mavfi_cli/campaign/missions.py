@@ -11,7 +11,7 @@ from typing import Any
 
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, MavfiError
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None
 _FIRST = ("setting", "world")  # labels that come before the others

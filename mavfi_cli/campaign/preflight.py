@@ -6,8 +6,8 @@ import tempfile
 from pathlib import Path
 
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.vehicle import VehicleInProcess
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def ask_vehicle(config: MissionConfig) -> None:

@@ -17,8 +17,8 @@ from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.campaign.specification.fixed_world import FixedWorld, Flown
 from mavfi_cli.campaign.specification.spec import Spec
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.record.measures import fields_of
+from mavfi_cli.spec.mission import MissionConfig
 
 SEARCH = "world-search"  # the folder
 _AT_ONCE = 4  # candidates that are flown at the same time

@@ -14,10 +14,10 @@ from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, 
 from mavfi_cli.core.errors import ConfigError, FaultSpecError
 
 if TYPE_CHECKING:
-    from mavfi_cli.mission.config import MissionConfig
-    from mavfi_cli.mission.detector_config import DetectorConfig
-    from mavfi_cli.mission.fault_config import FaultConfig
-    from mavfi_cli.mission.instruction_config import InstructionConfig
+    from mavfi_cli.spec.detector import DetectorConfig
+    from mavfi_cli.spec.fault import FaultConfig
+    from mavfi_cli.spec.instruction import InstructionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
 _SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together"}
 _EITHER = {"bits", "field", "fault_seed"}
@@ -193,7 +193,7 @@ def _mission_of(path: Path | None) -> MissionConfig:
         UsageError: an option is not valid; the message names it.
     """
     from mavfi_cli.core.config import load_toml
-    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
     base = MissionConfig() if path is None else load_toml(path, MissionConfig)
     try:
@@ -208,9 +208,9 @@ def _mission_of(path: Path | None) -> MissionConfig:
 
 def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     """The mission with the given options in place."""
-    from mavfi_cli.mission.config import stack_of
-    from mavfi_cli.mission.detector_config import detector_of
-    from mavfi_cli.mission.platform import measured_factor
+    from mavfi_cli.spec.detector import detector_of
+    from mavfi_cli.spec.mission import stack_of
+    from mavfi_cli.spec.platform import measured_factor
 
     fault, instruction = _faults(base, given)
     link = given.get("link", base.link)
@@ -241,8 +241,8 @@ def _faults(
     base: MissionConfig, given: dict[str, Any]
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
     """The mission's fault at source or instruction level, checked."""
-    from mavfi_cli.mission.fault_config import FaultConfig
-    from mavfi_cli.mission.instruction_config import InstructionConfig
+    from mavfi_cli.spec.fault import FaultConfig
+    from mavfi_cli.spec.instruction import InstructionConfig
 
     in_file = "source" if base.instruction is None else "instruction"
     level = given.get("level", in_file)
@@ -274,7 +274,7 @@ def _faults(
 
 def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig | None:
     """The mission's detector."""
-    from mavfi_cli.mission.detector_config import DetectorConfig
+    from mavfi_cli.spec.detector import DetectorConfig
 
     name = given.get("detector", None if base.detector is None else base.detector.name)
     if name is None or name == "none":

@@ -157,9 +157,9 @@ def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.kernels.catalogue import select
     from mavfi_cli.attack.kernels.target import KernelTarget
     from mavfi_cli.attack.summary import KERNEL_COLUMNS, summarise, table
-    from mavfi_cli.mission.config import MissionConfig
     from mavfi_cli.mission.kernel_inputs import inputs_of_flight
     from mavfi_cli.report.kernel_plot import write_kernel_plot
+    from mavfi_cli.spec.mission import MissionConfig
 
     plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
     # Collision check, planner and control have the parameters of `hardened`.

@@ -15,7 +15,7 @@ from mavfi_cli.mission.record.events import Event
 if TYPE_CHECKING:
     from rich.live import Live
 
-    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
 _PLAIN_EVERY_S = 10.0
 _TOLD = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")

@@ -41,7 +41,7 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
     NAME:KEY=VALUE,KEY=VALUE names a variant: that stack with other values of some keys, such as
     mavbench:guards_tracking=true. FILE:KEY=VALUE works in the same way.
     """
-    from mavfi_cli.mission.stack import load_stack, stack_names
+    from mavfi_cli.spec.stack import load_stack, stack_names
 
     found = [load_stack(name) for name in names or stack_names()]
     if as_json:

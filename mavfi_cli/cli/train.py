@@ -54,8 +54,8 @@ def train(
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.detect.fit import KINDS
-    from mavfi_cli.mission.config import MissionConfig
     from mavfi_cli.report.training_plot import write_loss_curve
+    from mavfi_cli.spec.mission import MissionConfig
     from mavfi_cli.studies.train import WORLDS, TrainingPlan
     from mavfi_cli.studies.train import train as run
 

@@ -207,7 +207,7 @@ def _flown(
 
 
 def _choices(options: dict[str, Any]) -> Any:
-    from mavfi_cli.mission.platform import load_platform
+    from mavfi_cli.spec.platform import load_platform
     from mavfi_cli.vpm.board import load_board
     from mavfi_cli.vpm.report import Choices
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from mavfi_cli.core.errors import ConfigError, VehicleProcessError
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 FILE = "briefing.json"
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home

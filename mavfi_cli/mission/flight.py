@@ -29,7 +29,6 @@ from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission.briefing import Briefing, require_flyable
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.protection import gate_of, protection_of
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.flight_logger import FlightLogger
 from mavfi_cli.mission.injection import (
     DetectorInjection,
@@ -38,12 +37,13 @@ from mavfi_cli.mission.injection import (
     SourceInjection,
 )
 from mavfi_cli.mission.orders import Recorder
-from mavfi_cli.mission.platform import PlatformProfile
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.events import EventLog
 from mavfi_cli.mission.record.trace import Trace
-from mavfi_cli.mission.stack import Stack
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import PlatformProfile
+from mavfi_cli.spec.stack import Stack
 
 SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts as lost
 IDLE_S = 0.1  # period of messages to a silent foreign autopilot

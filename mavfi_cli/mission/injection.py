@@ -17,12 +17,12 @@ from mavfi_cli.fi.source.fault import SourceFault, Trigger
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
 from mavfi_cli.fi.source.memory import MemoryInjector
 from mavfi_cli.fi.source.schedule import Moment, Schedule
-from mavfi_cli.mission.fault_config import PROCESS, FaultConfig
+from mavfi_cli.spec.fault import PROCESS, FaultConfig
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.briefing import Briefing
     from mavfi_cli.mission.companion.executor import Executor
-    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
 M = TypeVar("M", CollisionReport, Trajectory, Command)
 

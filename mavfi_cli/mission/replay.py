@@ -12,9 +12,9 @@ import numpy as np
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.platform import measured_factor
 from mavfi_cli.mission.record.run_folder import Run
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import measured_factor
 
 HOST_SECTION = "host"
 

@@ -27,11 +27,9 @@ from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.companion.response import response_times
-from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.orders import Recorder
-from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.plan_file import write_plans
@@ -40,6 +38,8 @@ from mavfi_cli.mission.record.statistics import mission_statistics, plan_lines
 from mavfi_cli.mission.record.timetable import timetable_of, write_timetable
 from mavfi_cli.mission.record.trace import write_trace
 from mavfi_cli.mission.vehicle import OtherEnd, StartVehicle, other_end, start_vehicle
+from mavfi_cli.spec.mission import MissionConfig, stack_of
+from mavfi_cli.spec.platform import load_platform
 
 COMPILING = "compiling the kernels, once on this machine: this takes a while"
 _VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")

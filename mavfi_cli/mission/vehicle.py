@@ -21,7 +21,7 @@ from typing import Protocol
 
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.link.transport import Transport, open_transport
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 
 class Vehicle(Protocol):

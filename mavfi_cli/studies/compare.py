@@ -20,9 +20,9 @@ from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import installed_versions
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.studies.compare_plan import ComparePlan
 
 SCHEMA = 2  # version 1 listed the costs of faults with the worst cases

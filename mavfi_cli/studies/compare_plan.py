@@ -12,7 +12,7 @@ from mavfi_cli.campaign.specification.spec import Setting, Spec
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.stack import DEFAULT
+from mavfi_cli.spec.stack import DEFAULT
 
 FAULTY = "FI"  # names of settings, as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings

@@ -20,10 +20,10 @@ from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.listing import training_flights
 from mavfi_cli.detect.registry import names
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.detector_config import STAGES, DetectorConfig, detector_of, model_path
-from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.spec.detector import STAGES, DetectorConfig, detector_of, model_path
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 WORLDS = ("sparse", "dense", "factory", "farm")
 DETECTORS = (NONE, "range", "l2", "gad", "aad")

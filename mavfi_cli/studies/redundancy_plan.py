@@ -14,10 +14,10 @@ from mavfi_cli.campaign.run import Options
 from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.detector_config import detector_of
-from mavfi_cli.mission.platform import load_platform
-from mavfi_cli.mission.stack import DEFAULT
+from mavfi_cli.spec.detector import detector_of
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.studies.beside_model import BASE, Key
 from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan, write_files
 from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS

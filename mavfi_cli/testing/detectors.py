@@ -16,7 +16,7 @@ from mavfi_cli.detect import registry
 from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.fitted import FittedDetector
 from mavfi_cli.detect.preprocess import COUNT, DETECTED, LIMIT, NAN_CODE
-from mavfi_cli.mission.detector_config import DetectorConfig, detector_of
+from mavfi_cli.spec.detector import DetectorConfig, detector_of
 
 Deltas = NDArray[np.int16]
 _STAGES = list(Stage)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mavfi_cli.core.config import load_shipped, shipped_names
-from mavfi_cli.mission.platform import HARDWARE, PlatformProfile, check_hardware
+from mavfi_cli.spec.platform import HARDWARE, PlatformProfile, check_hardware
 
 _FOLDER = Path(__file__).parent / "boards"
 

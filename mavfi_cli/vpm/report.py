@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.mission.platform import PlatformProfile
+from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.vpm.board import Board, load_board
 from mavfi_cli.vpm.calibrate import Calibrated, calibrated
 from mavfi_cli.vpm.model import KNEE_SHARE, safe_velocity_mps

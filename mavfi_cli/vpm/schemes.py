@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
-from mavfi_cli.mission.platform import LARGEST
+from mavfi_cli.spec.platform import LARGEST
 
 REFERENCE = "aad"  # the paper's Fig. 15 compares redundancy with it
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mavfi_cli.core.config import load_shipped, shipped_names
-from mavfi_cli.mission.platform import LARGEST
+from mavfi_cli.spec.platform import LARGEST
 
 CALIBRATED = ("rotor_pull_n", "response_s")  # the parameters that a calibration may set
 SMALLEST = 1.0e-6  # in any unit; a smaller value is probably in the wrong unit

@@ -17,9 +17,9 @@ from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.report.tables.campaign import failure_lines, quality_lines, summary_lines
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 ACTIVE, GOLDEN = Injected.ACTIVE, Injected.GOLDEN
 FI = {"setting": "FI", "stage": "control"}

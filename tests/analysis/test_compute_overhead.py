@@ -107,7 +107,7 @@ def test_a_platform_scaled_for_a_detector_s_share_is_the_platform(tmp_path, name
 
 @pytest.fixture(scope="module")
 def guarded(fly_short):
-    from mavfi_cli.mission.detector_config import DetectorConfig
+    from mavfi_cli.spec.detector import DetectorConfig
 
     return fly_short(detector=DetectorConfig(name="gad"))
 

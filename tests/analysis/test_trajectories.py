@@ -9,9 +9,9 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.detector_config import DetectorConfig
-from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def pair(*arguments):

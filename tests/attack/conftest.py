@@ -10,8 +10,8 @@ from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.kernels.inputs import load_inputs, save_inputs
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.plan import Plan
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.kernel_inputs import record_inputs
+from mavfi_cli.spec.mission import MissionConfig
 
 
 @pytest.fixture(scope="session")

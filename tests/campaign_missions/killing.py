@@ -104,7 +104,7 @@ if __name__ == "__main__":  # the runner of the tests: a list of missions withou
     from mavfi_cli.campaign.missions import PlannedMission
     from mavfi_cli.campaign.run import Options, run_campaign
     from mavfi_cli.campaign.workers.verdict import CampaignStopped
-    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
     folder, count, task = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     missions = [

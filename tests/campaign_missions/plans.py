@@ -1,7 +1,7 @@
 """Lists of missions, for tests and for the programs that they start."""
 
 from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.mission.config import MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def planned(*worlds, **config):

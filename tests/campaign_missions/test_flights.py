@@ -9,10 +9,10 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.outcome import Injected
 from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.mission.detector_config import DetectorConfig
-from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.record.run_folder import RunFolder
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
 
 pytestmark = pytest.mark.slow
 FAULT = FaultConfig(target="waypoint_position", at="time=1", together=True, field="mantissa")

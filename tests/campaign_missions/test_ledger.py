@@ -16,9 +16,9 @@ from mavfi_cli.campaign.missions import (
 )
 from mavfi_cli.campaign.outcome import Injected, ResultState, injected_of
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 ROW = {
     "state": ResultState.FLOWN,

@@ -11,7 +11,7 @@ from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.specification.spec import Stop, load_spec, parse_spec, presets
 from mavfi_cli.campaign.specification.text import to_toml
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey, UnknownName
-from mavfi_cli.mission.stack import load_stack
+from mavfi_cli.spec.stack import load_stack
 
 
 def spec_of(text):

@@ -9,11 +9,11 @@ from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission import run as run_module
-from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.golden import paired_golden
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"

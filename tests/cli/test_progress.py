@@ -5,9 +5,9 @@ import sys
 import pytest
 
 from mavfi_cli.cli.progress import progress_view
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.progress import FlightProgress
 from mavfi_cli.mission.record.events import Event
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def tell(config, events=(), quiet=False):

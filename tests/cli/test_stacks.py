@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mavfi_cli.cli.stacks import _GROUPS
-from mavfi_cli.mission.stack import KEYS, load_stack, stack_names
+from mavfi_cli.spec.stack import KEYS, load_stack, stack_names
 
 
 def test_every_key_is_told_once():

@@ -64,7 +64,7 @@ def test_other_packages_plug_in_by_entry_point(monkeypatch):
 @pytest.mark.parametrize("spelling", ["rrt-star", "RRT*", "rrt_star", "RRTstar", "rrtstar"])
 def test_a_mission_keeps_the_one_name_of_a_planner(spelling):
     """So that flights are grouped together, and paired, whatever was typed."""
-    from mavfi_cli.mission.config import MissionConfig
+    from mavfi_cli.spec.mission import MissionConfig
 
     assert MissionConfig(planner=spelling).to_dict()["planner"] == "rrtstar"
     assert MissionConfig(planner="Straight-Up").planner == "Straight-Up"  # a plug-in's own

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from mavfi_cli.mission.detector_config import DetectorConfig
 from mavfi_cli.mission.record.detection_cost import detection_cost
+from mavfi_cli.spec.detector import DetectorConfig
 
 RECORD = {
     "detection": {

@@ -7,10 +7,10 @@ from record_digest import record_digest
 
 from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.core.errors import UnknownName, VehicleProcessError, WorldError
-from mavfi_cli.mission.detector_config import DetectorConfig
-from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.vehicle import VehicleProcess, start_vehicle
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
 from sitl.server.simulation import Simulation
 
 FAULT = FaultConfig(target="command_velocity", at="time=1", together=True, field="exponent", seed=2)

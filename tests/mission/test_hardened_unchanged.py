@@ -7,12 +7,12 @@ The hashes were written by the version before stacks (commit e23d777), with the 
 import pytest
 from record_digest import record_digest
 
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.detector_config import DetectorConfig
-from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 pytestmark = pytest.mark.slow
 

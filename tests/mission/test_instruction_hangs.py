@@ -13,11 +13,11 @@ from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.fault import InstructionFault, Role, Stage, explicit_corruption
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.mission.companion import node_process
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 SEGMENT = "numba:segment_free"
 EXECUTION = 150  # in a segment whose prolongation misses the box

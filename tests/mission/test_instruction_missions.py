@@ -20,11 +20,11 @@ from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.spec.instruction import InstructionConfig
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"

@@ -7,11 +7,12 @@ import pytest
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.companion.executor import Executor
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.platform import KERNELS, latency_model, load_platform
+from mavfi_cli.mission.latency import latency_model
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.report.summary import measured_lines
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import KERNELS, load_platform
 
 
 def test_the_profile():

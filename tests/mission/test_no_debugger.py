@@ -6,8 +6,8 @@ import sys
 FLIGHT = """
 import sys
 from pathlib import Path
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.fault_config import FaultConfig
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 
@@ -27,3 +27,12 @@ def test_a_source_level_flight_loads_no_debugger(tmp_path):
     )
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
     assert len(list(tmp_path.glob("farm-5-*/result.json"))) == 1
+
+
+def test_what_a_user_asks_for_loads_no_debugger_and_no_planner():
+    names = ("mission", "detector", "fault", "instruction", "platform", "stack")
+    load = ";".join(f"import mavfi_cli.spec.{name}" for name in names)
+    heavy = ("capstone", "mavfi_cli.fi.tracer", "mavfi_cli.link", "ompl")
+    code = f"import sys;{load};print([n for n in sys.modules if n.startswith({heavy})])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -14,15 +14,15 @@ from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.companion.node_process import NodeProcess
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.instruction.plan import draw_invocation
 from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"

@@ -15,13 +15,13 @@ from mavfi_cli.detect import model
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission.companion import protection as protection_module
 from mavfi_cli.mission.companion.protection import Protection, Response
-from mavfi_cli.mission.detector_config import DetectorConfig, detector_of, model_path
-from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of, differing_results, same_file
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.stack import load_stack
+from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.stack import load_stack
 
 LIMIT = 8.0
 TRAJECTORY = Trajectory(

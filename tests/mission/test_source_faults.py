@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.autonomy.orders import PilotMode
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.fault_config import FaultConfig
 from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of, differing_results, first_difference, same_file
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.report.summary import difference_lines
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 pytestmark = pytest.mark.slow
 

@@ -9,10 +9,10 @@ import pytest
 
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
-from mavfi_cli.mission.platform import load_platform
 from mavfi_cli.mission.record.measures import measures_of
 from mavfi_cli.report.flight_plot import draw_flight_plot, write_flight_plot
 from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
+from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.beside_model import Beside, side_by_side
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.report import Choices, report, setting_of

@@ -15,7 +15,7 @@ from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.listing import training_flights
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.watch import EXTENDED
-from mavfi_cli.mission.stack import load_stack
+from mavfi_cli.spec.stack import load_stack
 from mavfi_cli.studies.evaluation_plan import INTEGER, EvaluationPlan, require_held_out
 
 PLAN = EvaluationPlan(

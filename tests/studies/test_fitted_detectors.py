@@ -4,7 +4,7 @@ import pytest
 
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
-from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies import redundancy_plan
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.report import Choices, setting_of

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.core.errors import CannotLift
-from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.flight_plan import flight_plan, write_files
 from mavfi_cli.studies.redundancy_plan import RedundancyPlan
 from mavfi_cli.vpm.board import load_board

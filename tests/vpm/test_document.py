@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.mission.platform import load_platform, platform_names
+from mavfi_cli.spec.platform import load_platform, platform_names
 from mavfi_cli.vpm.report import Choices, report
 from mavfi_cli.vpm.schemes import SCHEMES
 from mavfi_cli.vpm.vehicle import load_vehicle

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
-from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.board import Board, board_names, load_board
 from mavfi_cli.vpm.calibrate import calibrated
 from mavfi_cli.vpm.model import GRAVITY_MPS2

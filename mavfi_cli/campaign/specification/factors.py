@@ -13,10 +13,10 @@ from typing import Any
 
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, nearest
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.detector_config import DetectorConfig
-from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 
 class Level(Enum):
@@ -130,9 +130,9 @@ def check_names(config: MissionConfig, simulator: Callable[[MissionConfig], None
             for another stack; values make no fault; or the start is blocked.
     """
     from mavfi_cli.autonomy import planners
-    from mavfi_cli.mission.detector_config import detector_of
-    from mavfi_cli.mission.platform import load_platform
-    from mavfi_cli.mission.stack import load_stack
+    from mavfi_cli.spec.detector import detector_of
+    from mavfi_cli.spec.platform import load_platform
+    from mavfi_cli.spec.stack import load_stack
 
     planners.find(config.planner)
     load_platform(config.platform)

@@ -41,10 +41,11 @@ from mavfi_cli.mission.companion.kernels import CheckInput, ControlInput, Kernel
 from mavfi_cli.mission.companion.protection import NoProtection
 from mavfi_cli.mission.companion.recovery import Recovery, Retry, Setpoint
 from mavfi_cli.mission.companion.response import Reaction
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.platform import PlatformProfile, latency_model
-from mavfi_cli.mission.stack import Stack
+from mavfi_cli.mission.latency import latency_model
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import PlatformProfile
+from mavfi_cli.spec.stack import Stack
 
 # A command computed within one physics step of the vehicle is sent in the tick of its state,
 # because

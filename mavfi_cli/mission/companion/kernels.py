@@ -22,8 +22,8 @@ from mavfi_cli.core.types import (
     VehicleState,
 )
 from mavfi_cli.mission.briefing import Briefing
-from mavfi_cli.mission.config import MissionConfig
-from mavfi_cli.mission.stack import Stack
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.stack import Stack
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

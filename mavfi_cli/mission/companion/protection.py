@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
-from mavfi_cli.mission.detector_config import DetectorConfig, detector_of, watch_of
+from mavfi_cli.spec.detector import DetectorConfig, detector_of, watch_of
 
 MAX_LISTED_ALARMS = 100
 TOLD_EVERY_S = 1.0  # minimum time between two announced alarms of one stage

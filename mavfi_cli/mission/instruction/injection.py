@@ -17,11 +17,11 @@ from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion.executor import Executor
 from mavfi_cli.mission.companion.node_process import NodeProcess
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.injection import SCHEMA, NoInjection
 from mavfi_cli.mission.instruction.plan import PlannedFault, plan_fault, planned_of
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.orders import Recorder
+from mavfi_cli.spec.mission import MissionConfig
 
 _TIMING = ("stop_s",)
 

@@ -25,11 +25,11 @@ from mavfi_cli.core.sources import own_digest
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.mission.briefing import Briefing
-from mavfi_cli.mission.config import MissionConfig
 from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
-from mavfi_cli.mission.instruction_config import InstructionConfig
 from mavfi_cli.mission.orders import Recorder
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 T = TypeVar("T")
 CACHE = ".profiles"

@@ -13,9 +13,9 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.node_process import serve
 from mavfi_cli.mission.companion.protection import NoProtection
-from mavfi_cli.mission.config import MissionConfig, stack_of
 from mavfi_cli.mission.injection import NoInjection
-from mavfi_cli.mission.platform import load_platform
+from mavfi_cli.spec.mission import MissionConfig, stack_of
+from mavfi_cli.spec.platform import load_platform
 
 PROGRAM = "mavfi_cli.mission.instruction.server"
 

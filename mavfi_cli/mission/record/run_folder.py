@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.mission.record.trace import read_trace
-from mavfi_cli.mission.stack import FIRST
+from mavfi_cli.spec.stack import FIRST
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -9,9 +9,9 @@ from typing import Any
 
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, QUANTITIES
 from mavfi_cli.core.columns import columns
-from mavfi_cli.mission.stack import DEFAULT
 from mavfi_cli.report.tables.cells import number, p_value, percent, rate, spread
 from mavfi_cli.report.tables.rows import csv_text
+from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.stats.bootstrap import FEW
 
 Row = Mapping[str, Any]

@@ -13,7 +13,7 @@ from mavfi_cli.detect.fitted import FittedDetector
 from mavfi_cli.detect.model import shipped, shipped_stacks
 from mavfi_cli.detect.registry import find
 from mavfi_cli.detect.watch import ExtendedWatch
-from mavfi_cli.mission.stack import lineage, load_stack
+from mavfi_cli.spec.stack import lineage, load_stack
 
 STAGES = tuple(stage.value for stage in Stage)
 PAPER, EXTENDED = "paper", "extended"  # sets of watched states

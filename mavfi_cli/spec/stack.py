@@ -19,7 +19,7 @@ from typing import Any
 from mavfi_cli.core.config import read_toml, shipped_names, shipped_path, structure
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 from mavfi_cli.detect.base import StackMark
-from mavfi_cli.mission.platform import KERNELS
+from mavfi_cli.spec.platform import KERNELS
 
 DEFAULT = "mavbench"
 FIRST = "hardened"  # stack of records without a stack

@@ -18,7 +18,7 @@ from mavfi_cli.fi.source.fault import (
     Trigger,
     When,
 )
-from mavfi_cli.mission.platform import KERNELS
+from mavfi_cli.spec.platform import KERNELS
 
 _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector

@@ -8,11 +8,11 @@ from typing import Any
 
 from mavfi_cli.autonomy.planner_names import canonical
 from mavfi_cli.core.errors import ConfigError, UnknownName
-from mavfi_cli.mission.detector_config import DetectorConfig
-from mavfi_cli.mission.fault_config import FaultConfig
-from mavfi_cli.mission.instruction_config import InstructionConfig
-from mavfi_cli.mission.platform import measured_factor
-from mavfi_cli.mission.stack import DEFAULT, Stack, load_stack, with_tolerance
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.platform import measured_factor
+from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack, with_tolerance
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 Vector3 = tuple[float, float, float]
