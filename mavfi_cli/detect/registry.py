@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+from functools import cache
+from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
 from mavfi_cli.core.errors import UnknownName
@@ -11,9 +12,15 @@ from mavfi_cli.detect.base import Detector, Factory
 ENTRY_POINT_GROUP = "mavfi.detectors"
 
 
+@cache
+def _installed() -> EntryPoints:
+    """Return the entry points of detectors. To find them reads the metadata of all packages."""
+    return entry_points(group=ENTRY_POINT_GROUP)
+
+
 def names() -> list[str]:
     """Return the names of all installed detectors, sorted."""
-    return sorted({entry.name for entry in entry_points(group=ENTRY_POINT_GROUP)})
+    return sorted(_installed().names)
 
 
 def find(name: str, *, model: Path | None = None, threshold: float | None = None) -> Detector:
@@ -28,7 +35,7 @@ def find(name: str, *, model: Path | None = None, threshold: float | None = None
         ModelError: The model file cannot be used.
         ConfigError: The threshold is out of range.
     """
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
+    for entry in _installed():
         if entry.name == name:
             factory: Factory = entry.load()
             return factory(model=model, threshold=threshold)
