@@ -8,12 +8,15 @@ import select
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
+from mavfi_cli import cli
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
@@ -66,16 +69,45 @@ def troubled_flight(tmp_path_factory):
     )
 
 
+@contextlib.contextmanager
+def _collected(descriptor, redirect):
+    """Collect what this process and its children write to a standard stream, as one text."""
+    kept, texts = os.dup(descriptor), []
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as file:
+        try:
+            os.dup2(file.fileno(), descriptor)
+            with redirect(file):
+                yield texts
+        finally:
+            os.dup2(kept, descriptor)
+            os.close(kept)
+            file.seek(0)
+            texts.append(file.read())
+
+
+def _become(_path, line):
+    """Run the program as a child: the test's own process must stay."""
+    sys.exit(subprocess.call(line))
+
+
 @pytest.fixture(scope="session")
 def mavfi():
-    """Run the command line in a process of its own, as a user does."""
+    """Run the command line in this process; exit code, stdout and stderr as of a process."""
 
-    def run(*arguments, timeout=120.0, **options):
-        return subprocess.run(
-            [sys.executable, "-m", "mavfi_cli", *map(str, arguments)],
-            capture_output=True, text=True, timeout=timeout, check=False,
-            env={**os.environ, "PYTHONWARNINGS": "error"}, **options,
-        )  # fmt: skip
+    def run(*arguments, cwd="."):
+        line = ["mavfi", *map(str, arguments)]
+        with (
+            contextlib.chdir(cwd),
+            mock.patch.multiple(sys, argv=line),
+            mock.patch("os.execv", _become),
+            _collected(1, contextlib.redirect_stdout) as out,
+            _collected(2, contextlib.redirect_stderr) as err,
+        ):
+            try:
+                cli.main()
+            except SystemExit as left:
+                code = left.code
+        return subprocess.CompletedProcess(line, code, *out, *err)
 
     return run
 

@@ -181,21 +181,25 @@ def test_an_autopilot_that_refuses_to_arm_in_its_own_words(command_line, autopil
 # The disk ------------------------------------------------------------------------------------
 
 
-def full_disk_at(size):
-    """The system refuses to let any file grow beyond a size."""
-    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+@pytest.fixture
+def full_disk():
+    """The system refuses to let any file grow beyond 256 KiB."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 18, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 SHORT = ("fly", "--world", "farm", "--seed=5", "--start=2,2,0", "--goal=10,6,5", "--quiet")
 
 
-def test_a_full_disk_in_flight(mavfi, tmp_path):
-    done = mavfi(*SHORT, cwd=tmp_path, preexec_fn=full_disk_at(1 << 18))
-    assert (done.returncode, done.stdout) == (1, "")
-    (line,) = done.stderr.splitlines()
+@pytest.mark.usefixtures("full_disk")
+def test_a_full_disk_in_flight(command_line):
+    code, out, err = command_line(*SHORT)
+    assert (code, out) == (1, "")
+    (line,) = err.splitlines()
     assert line.startswith("error: runs/farm-5-001/flight.tlog: cannot write: File too large")
-    shown = mavfi("show", "runs/farm-5-001", cwd=tmp_path)
-    assert "cut off before its end" in shown.stderr
+    assert "cut off before its end" in command_line("show", "runs/farm-5-001")[2]
 
 
 def test_a_folder_that_cannot_be_made(refused, tmp_path):

@@ -72,7 +72,7 @@ def report(mavfi, tmp_path):
     (tmp_path / "hashed.toml").write_text(CAMPAIGN)
 
     def run(arguments):
-        done = mavfi(*arguments, cwd=tmp_path, timeout=600.0)
+        done = mavfi(*arguments, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         if done.stdout.startswith(("{", "[")):
             return json.loads(done.stdout)

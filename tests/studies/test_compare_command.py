@@ -36,7 +36,7 @@ def home(tmp_path_factory):
 @pytest.fixture(scope="module")
 def flown(home, mavfi):
     """The run of the small comparison; its folder is home / "out"."""
-    run = mavfi("compare", "--world", "posts.toml", *FEW, "--json", cwd=home, timeout=600.0)
+    run = mavfi("compare", "--world", "posts.toml", *FEW, "--json", cwd=home)
     assert run.returncode == 0, run.stderr
     return run
 

@@ -132,7 +132,7 @@ def test_real_flights_end_to_end(mavfi, tmp_path):
         "detect", "evaluate", "--world", "farm", "--flights", 1, "--golden-flights", 2,
         "--out", tmp_path / "out", "--quiet", "--json",
     ]  # fmt: skip
-    first = mavfi(*line, "--detector", "range", timeout=600)
+    first = mavfi(*line, "--detector", "range")
     assert first.returncode == 0, first.stderr
     found = json.loads(first.stdout)
     everything = row(found, "all", "all", "range")

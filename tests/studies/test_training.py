@@ -20,7 +20,6 @@ def folder(mavfi, tmp_path_factory):
     done = mavfi(
         "train", "--world", WORLD, "--first-seed", FIRST_SEED, "--flights", FLIGHTS,
         *(word for kind in KINDS for word in ("--kind", kind)), "--out", out, "--quiet",
-        timeout=900.0,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return out
