@@ -76,7 +76,7 @@ def world_to_search(tmp_path):
         "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
     )
     config = MissionConfig(
-        world=str(world), seed=2, planner="rrtconnect", node_watchdog_s=1.0,
+        world=str(world), seed=2, planner="rrtconnect", node_watchdog_s=1.0, time_limit_s=12.0,
         instruction=InstructionConfig(target="planner"),
     )  # fmt: skip
     return config, 2
