@@ -17,8 +17,7 @@ import numpy as np
 
 from mavfi_cli.analysis.groups import Group
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import canonical
-from mavfi_cli.campaign.outcome import COUNTED, Injected
+from mavfi_cli.campaign.missions import COUNTED, Injected, canonical
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.layers import cross_layer, failures_per_hour

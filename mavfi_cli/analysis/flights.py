@@ -18,8 +18,14 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
-from mavfi_cli.campaign.outcome import COUNTED, MissionResult, ResultState
+from mavfi_cli.campaign.missions import (
+    COUNTED,
+    MissionResult,
+    PlannedMission,
+    ResultState,
+    canonical,
+    changes_of,
+)
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import FloatArray, Outcome

@@ -17,8 +17,7 @@ import pyarrow.compute as pc
 from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers
 from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import canonical, label_text
-from mavfi_cli.campaign.outcome import COUNTED, Injected
+from mavfi_cli.campaign.missions import COUNTED, Injected, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 

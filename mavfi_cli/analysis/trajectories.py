@@ -9,8 +9,7 @@ from typing import Any
 
 from mavfi_cli.analysis.groups import TREATMENT, untreated
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import label_text
-from mavfi_cli.campaign.outcome import COUNTED, Injected, MissionResult, ResultState
+from mavfi_cli.campaign.missions import COUNTED, Injected, MissionResult, ResultState, label_text
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.record.measures import fields_of
 from mavfi_cli.mission.record.run_folder import RESULT

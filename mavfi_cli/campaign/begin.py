@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
 from mavfi_cli.campaign.missions import (
     PlannedMission,
@@ -18,20 +20,15 @@ from mavfi_cli.campaign.missions import (
     label_text,
     naming,
 )
-from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, store_plan
-from mavfi_cli.campaign.specification.changes import replaced
-from mavfi_cli.campaign.specification.difference import differences
-from mavfi_cli.campaign.specification.factors import check_names
-from mavfi_cli.campaign.specification.fixed_world import FixedWorld
-from mavfi_cli.campaign.specification.spec import Spec, load_spec, parse_spec, presets
-from mavfi_cli.campaign.specification.text import to_toml
+from mavfi_cli.campaign.run import Options, require_unchanged, store_plan
+from mavfi_cli.campaign.specification import FixedWorld, Spec, differences
+from mavfi_cli.campaign.specification_file import load_spec, parse_spec, presets, replaced, to_toml
 from mavfi_cli.campaign.stopping import BatchLimiter
-from mavfi_cli.campaign.unchanged import require_unchanged
 from mavfi_cli.campaign.world_search import with_worlds
-from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName, VehicleProcessError
 from mavfi_cli.core.files import write_text
+from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.mission import MissionConfig
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
@@ -298,3 +295,16 @@ def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:
         if kind.get(name) is not None:
             kind[name] = {**kind[name], "seed": 0}
     return kind
+
+
+def ask_vehicle(config: MissionConfig) -> None:
+    """Start the vehicle of a mission and end it at once.
+
+    Raises:
+        VehicleProcessError: it refuses the world, the vehicle, the start or the goal.
+    """
+    with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
+        try:
+            VehicleInProcess(config, Path(folder)).end()
+        except MavfiError as error:
+            raise VehicleProcessError(str(error)) from None

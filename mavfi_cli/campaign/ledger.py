@@ -21,8 +21,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
-from mavfi_cli.campaign.outcome import Injected, MissionResult, ResultState
+from mavfi_cli.campaign.missions import (
+    Injected,
+    MissionResult,
+    PlannedMission,
+    ResultState,
+    canonical,
+    changes_of,
+    config_from,
+)
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.record.measures import fields_of

@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.keep import Keep, put_away
 from mavfi_cli.campaign.ledger import RUNS, Ledger
-from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of, config_from
-from mavfi_cli.campaign.outcome import ResultState, injected_of
+from mavfi_cli.campaign.missions import (
+    PlannedMission,
+    ResultState,
+    canonical,
+    changes_of,
+    config_from,
+    injected_of,
+)
 from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.specification.spec import Stop
+from mavfi_cli.campaign.specification import Keep, Stop
 from mavfi_cli.campaign.stopping import BatchLimiter, Entry, Queue
-from mavfi_cli.campaign.unchanged import note_files, require_unchanged
-from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd, Workers
-from mavfi_cli.campaign.workers.local import TASK, LocalWorkers
-from mavfi_cli.campaign.workers.verdict import CampaignStopped, Verdict, judge
+from mavfi_cli.campaign.workers import (
+    TASK,
+    Assignment,
+    AttemptEnd,
+    CampaignStopped,
+    LocalWorkers,
+    Verdict,
+    Workers,
+    judge,
+)
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
-from mavfi_cli.mission.run import interruptible
+from mavfi_cli.mission.record.run_folder import RESULT
+from mavfi_cli.mission.replay import version_differences
+from mavfi_cli.mission.run import installed_versions, interruptible
 
 WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # most attempts at a mission that something outside ends
@@ -127,7 +142,7 @@ def store_plan(
         raise ConfigError(
             f"holds another campaign: {'; '.join([*found, remedy])}", path=ledger.folder
         )
-    note_files(ledger, new)
+    _note_files(ledger, new)
     ledger.plan(new)
 
 
@@ -226,7 +241,7 @@ class _Run:
         options = self._options
         if options.cluster is None:
             return LocalWorkers(self._jobs, options.task)
-        from mavfi_cli.campaign.workers.cluster import Cluster
+        from mavfi_cli.campaign.cluster import Cluster
 
         return Cluster(options.cluster, options.keep, options.task)
 
@@ -279,7 +294,7 @@ class _Run:
         number, result = ended.number, verdict.result
         path = None
         if verdict.run is not None and self._options.keep.wants(number, result.get("outcome")):
-            place = put_away(verdict.run, self._folder / RUNS, number)
+            place = _put_away(verdict.run, self._folder / RUNS, number)
             path = str(place.relative_to(self._folder))
         flown = verdict.state is ResultState.FLOWN
         asked = bool(config.get("fault") or config.get("instruction"))
@@ -324,3 +339,68 @@ def _settings(ledger: Ledger) -> tuple[list[str], dict[str, Counter[str]]]:
     """The setting of each mission by its number, and a count of outcomes for each setting."""
     names = [str(labels.get("setting", "")) for labels in ledger.cells()]
     return [names[cell] for cell in ledger.cell_of_each()], {name: Counter() for name in names}
+
+
+def _put_away(run: Path, runs: Path, number: int) -> Path:
+    """Move a run folder to the kept ones; return its new path.
+
+    Raises:
+        RecordError: it cannot be moved.
+    """
+    stem = run.name.rpartition("-")[0] if (run / RESULT).is_file() else "cut-off"
+    place = runs / f"{number:06d}-{stem}"
+    try:
+        runs.mkdir(exist_ok=True)
+        for old in runs.glob(f"{number:06d}-*"):  # of an attempt whose row was never written
+            shutil.rmtree(old)
+        run.replace(place)
+    except OSError as error:
+        raise RecordError(f"{place}: {error.strerror or error}") from None
+    return place
+
+
+_VERSIONS, _FILES = "versions", "files"  # keys of the ledger's `meta`
+
+
+def require_unchanged(ledger: Ledger) -> None:
+    """Require that versions and files are those with which the campaign was begun.
+
+    Raises:
+        ConfigError: the campaign was begun with others; names them.
+    """
+    versions = installed_versions()
+    stored = ledger.meta(_VERSIONS)
+    if stored is None:
+        ledger.set_meta({_VERSIONS: canonical(versions)})
+    elif stored != canonical(versions):
+        differing = version_differences(json.loads(stored), versions)
+        raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
+    changed = [name for name, digest in _noted(ledger).items() if digest != _digest(name)]
+    if changed:
+        raise ConfigError(
+            f"{', '.join(changed)}: not as it was when the campaign was begun; "
+            "another folder starts anew",
+            path=ledger.folder,
+        )
+
+
+def _note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
+    """Store hashes of the files that missions name, for `require_unchanged`."""
+    noted = _noted(ledger)
+    named = {name for mission in missions for name in mission.config.files}
+    new = {name: _digest(name) for name in sorted(named - noted.keys())}
+    if new:
+        ledger.set_meta({_FILES: canonical({**noted, **new})})
+
+
+def _noted(ledger: Ledger) -> dict[str, str]:
+    found: dict[str, str] = json.loads(ledger.meta(_FILES) or "{}")
+    return found
+
+
+def _digest(name: str) -> str:
+    """Hash of a file's bytes; empty if there is no file."""
+    try:
+        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
+    except OSError:
+        return ""

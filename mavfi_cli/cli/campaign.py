@@ -14,7 +14,7 @@ from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
 
 if TYPE_CHECKING:
     from mavfi_cli.campaign.ledger import Ledger
-    from mavfi_cli.campaign.specification.spec import Spec
+    from mavfi_cli.campaign.specification import Spec
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _what = partial(click.option, cls=GroupedOption, group="Missions")
@@ -66,8 +66,8 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     campaign in either case.
     """
     from mavfi_cli.campaign.begin import begin, chosen
-    from mavfi_cli.campaign.keep import Keep
     from mavfi_cli.campaign.run import Options, fly_missing
+    from mavfi_cli.campaign.specification import Keep
     from mavfi_cli.cli.missions_view import missions_view
 
     spec, folder = chosen(what, options["out"], options["scale"], options["changes"])

@@ -40,7 +40,7 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
     Raises:
         ConfigError: The file cannot be read or parsed. Names file and line.
     """
-    text = _read(path)
+    text = read_text(path)
     try:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
@@ -100,7 +100,12 @@ def structure(
         raise ConfigError(problem, path=path, line=_line_of(text, key), key=key) from None
 
 
-def _read(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Read a text file in UTF-8.
+
+    Raises:
+        ConfigError: The file cannot be read.
+    """
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:

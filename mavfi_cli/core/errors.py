@@ -31,7 +31,11 @@ from __future__ import annotations
 import difflib
 import shlex
 from collections.abc import Iterable
+from enum import Enum
 from pathlib import Path
+from typing import TypeVar
+
+E = TypeVar("E", bound=Enum)
 
 
 class MavfiError(Exception):
@@ -60,6 +64,23 @@ class UnknownName(MavfiError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         super().__init__(f"unknown {kind} {name!r}: {_suggestion(name, known)}")
+
+
+def named_member(kind: type[E], what: str, name: str | E) -> E:
+    """Return the member of an enumeration with this value.
+
+    Args:
+        kind: Enumeration.
+        what: Word for its members, for the error.
+        name: Value of the member.
+
+    Raises:
+        UnknownName: No member has this value. Suggests the nearest.
+    """
+    try:
+        return kind(name)
+    except ValueError:
+        raise UnknownName(what, str(name), [str(member.value) for member in kind]) from None
 
 
 class ConfigError(MavfiError):

@@ -8,7 +8,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import FaultSpecError, UnknownName
+from mavfi_cli.core.errors import FaultSpecError, named_member
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field, Scalar, draw_bits, flip
 
@@ -53,15 +53,8 @@ def inject(
     element = int(rng.integers(corrupted.size))
     chosen = exact_bits
     if chosen is None:
-        chosen = draw_bits(rng, kind, field=_field(field), count=bits)
+        chosen = draw_bits(rng, kind, field=named_member(Field, "field", field), count=bits)
     corrupted.flat[element] = flip(corrupted.flat[element].item(), chosen, kind)
     if isinstance(value, np.ndarray):
         return cast(Value, corrupted)
     return cast(Value, corrupted[()] if isinstance(value, np.generic) else corrupted.item())
-
-
-def _field(name: str | Field) -> Field:
-    try:
-        return Field(name)
-    except ValueError:
-        raise UnknownName("field", str(name), [field.value for field in Field]) from None

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from mavfi_cli.core.errors import FaultSpecError, UnknownName
+from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.states import BY_NAME
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.source.draw import GROUPS, draw_fault
@@ -117,10 +117,10 @@ class FaultConfig:
     def corruption(self) -> Corruption:
         """Return the corruption of the value. Raises UnknownName and FaultSpecError."""
         return Corruption(
-            effect=_member(Effect, "effect", self.effect),
+            effect=named_member(Effect, "effect", self.effect),
             bits=self.bits,
-            field=_member(Field, "field", self.field),
-            persistence=_member(Persistence, "persistence", self.persistence),
+            field=named_member(Field, "field", self.field),
+            persistence=named_member(Persistence, "persistence", self.persistence),
             duration_s=math.inf if self.duration_s is None else self.duration_s,
             period_s=self.period_s,
         )
@@ -161,19 +161,12 @@ def parse_trigger(text: str) -> Trigger:
     kind, _, value = text.partition("=")
     if not value and kind.replace(".", "", 1).isdigit():
         raise FaultSpecError(f"at {text}: a number needs its kind, as in time={text} (s)")
-    when: When = _member(When, "trigger", kind)
+    when = named_member(When, "trigger", kind)
     if when in (When.RANDOM, When.FORESEEN):
         return Trigger(when=when)
     if when is When.PHASE:
-        return Trigger(when=when, phase=_member(PilotMode, "phase", value).value)
+        return Trigger(when=when, phase=named_member(PilotMode, "phase", value).value)
     try:
         return Trigger(when=when, number=float(value))
     except ValueError:
         raise FaultSpecError(f"{text!r}: {kind} needs a number, as in {kind}=12") from None
-
-
-def _member(kind: Any, what: str, name: str) -> Any:
-    try:
-        return kind(name)
-    except ValueError:
-        raise UnknownName(what, name, [member.value for member in kind]) from None

@@ -15,11 +15,10 @@ from mavfi_cli.analysis.flights import flights, rows_of
 from mavfi_cli.analysis.platforms import compared, figures
 from mavfi_cli.analysis.timeline import timeline_seed, timelines
 from mavfi_cli.campaign.begin import begin, resumed
-from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import ResultState
+from mavfi_cli.campaign.missions import PlannedMission, ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
+from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import installed_versions
 from mavfi_cli.spec.mission import MissionConfig

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, platforms_told
-from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.specification.spec import Setting, Spec
+from mavfi_cli.campaign.specification import Keep, Setting, Spec
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage

@@ -20,13 +20,13 @@ from mavfi_cli.analysis.detector_pairs import NONE, Harm, pairs_of
 from mavfi_cli.analysis.detectors import Scored, found
 from mavfi_cli.analysis.flights import chosen, flights, flown, rows_of
 from mavfi_cli.analysis.scores import Scores, model_digest
-from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.begin import ask_vehicle
+from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.outcome import ResultState
-from mavfi_cli.campaign.preflight import ask_vehicle
+from mavfi_cli.campaign.missions import ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
-from mavfi_cli.campaign.specification.factors import check_names
+from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.run import installed_versions
 from mavfi_cli.studies.evaluation_plan import EvaluationPlan, Fault, require_held_out

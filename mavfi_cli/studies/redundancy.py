@@ -8,10 +8,10 @@ from typing import Any
 
 from mavfi_cli.analysis.flights import chosen, flights
 from mavfi_cli.analysis.overhead import compute_overheads
-from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.outcome import ResultState
+from mavfi_cli.campaign.missions import ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.studies.beside_model import Beside, side_by_side
 from mavfi_cli.studies.flight_plan import FlightPlan
 from mavfi_cli.studies.redundancy_plan import RedundancyPlan, make_plans

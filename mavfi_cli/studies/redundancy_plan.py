@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mavfi_cli.campaign.begin import ask_vehicle
+from mavfi_cli.campaign.factors import check_names
 from mavfi_cli.campaign.missions import PlannedMission, canonical, changes_of
-from mavfi_cli.campaign.preflight import ask_vehicle
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
-from mavfi_cli.campaign.specification.factors import check_names
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of

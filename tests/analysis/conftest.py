@@ -4,8 +4,7 @@ import pytest
 from flown_twice import whole  # noqa: F401
 
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import Injected, ResultState
+from mavfi_cli.campaign.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 

@@ -10,7 +10,7 @@ from plain_values import named
 
 from mavfi_cli.analysis.groups import groups
 from mavfi_cli.analysis.overhead import flight_overheads
-from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.campaign.missions import Injected
 from mavfi_cli.cli.campaign import campaign as command
 from mavfi_cli.report.tables.campaign import overhead_lines
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.campaign.specification import Keep
 
 
 @pytest.fixture(autouse=True)

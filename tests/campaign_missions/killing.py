@@ -103,7 +103,7 @@ def start_fake(folder, count):
 if __name__ == "__main__":  # the runner of the tests: a list of missions without flights
     from mavfi_cli.campaign.missions import PlannedMission
     from mavfi_cli.campaign.run import Options, run_campaign
-    from mavfi_cli.campaign.workers.verdict import CampaignStopped
+    from mavfi_cli.campaign.workers import CampaignStopped
     from mavfi_cli.spec.mission import MissionConfig
 
     folder, count, task = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]

@@ -14,9 +14,9 @@ import pytest
 from killing import results_of
 from plans import planned
 
-from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.cluster import Cluster, ClusterError
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.workers.cluster import Cluster, ClusterError
+from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.core.errors import ConfigError, RecordError
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
@@ -25,7 +25,7 @@ RUNNER = """
 import sys
 from pathlib import Path
 from plans import planned
-from mavfi_cli.campaign.keep import Keep
+from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.campaign.run import Options, run_campaign
 
 folder, address, *worlds = sys.argv[1:]

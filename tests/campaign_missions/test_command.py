@@ -204,7 +204,7 @@ def refused(mavfi, tmp_path):
         ('world = "farm"', 'world = "fram"', "unknown world 'fram': did you mean 'farm'?"),
         ('world = "farm"', 'wrold = "farm"', "factors.wrold: unknown key; did you mean 'world'?"),
         ('world = "farm"', "world = []", "factors.world: an empty list of values"),
-        ("repetitions = 2", "repetitions = 0", "repetitions: expected a whole number from 1"),
+        ("repetitions = 2", "repetitions = 0", "repetitions: must be at least 1, is 0"),
         ("waypoint_position", "waypoint_postion", "did you mean 'waypoint_position'?"),
         ('field = "mantissa"', 'field = "mantisa"', "did you mean 'mantissa'?"),
         ('world = "farm"', 'planner = "rtt"', "unknown planner 'rtt': did you mean 'rrt'?"),
@@ -235,7 +235,7 @@ def test_what_does_not_exist_gets_one_line(refused, tmp_path):
         assert "did you mean 'table3'?" in refused(name, "table33", *rest, code=2)
     assert "campaigns/table3: no campaign there" in refused("status", "table3")
     assert "no campaign there" in refused("run", "./table3")
-    assert "No such file" in refused("run", "none.toml")
+    assert "no such file" in refused("run", "none.toml")
     assert "no campaign there" in refused("status", tmp_path / "nowhere")
     assert "no campaign there" in refused("draw", tmp_path / "nowhere", "--output", "pair.svg")
     assert "no campaign was begun there" in refused(
@@ -351,7 +351,7 @@ def test_wrong_usage_is_exit_code_2(mavfi, arguments):
 
 
 def test_every_preset_is_named_in_the_help():
-    from mavfi_cli.campaign.specification.spec import presets
+    from mavfi_cli.campaign.specification_file import presets
 
     for name in presets():
         assert name in command.campaign.help

@@ -7,10 +7,8 @@ import pytest
 from mavfi_cli.campaign import begin as beginning
 from mavfi_cli.campaign.begin import begin, fixed_world
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.specification.changes import replaced
-from mavfi_cli.campaign.specification.fixed_world import FixedWorld
-from mavfi_cli.campaign.specification.spec import parse_spec
-from mavfi_cli.campaign.specification.text import to_toml
+from mavfi_cli.campaign.specification import FixedWorld
+from mavfi_cli.campaign.specification_file import parse_spec, replaced, to_toml
 from mavfi_cli.campaign.world_search import SEARCH
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.outcome import Injected
+from mavfi_cli.campaign.missions import Injected, PlannedMission
 from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.mission.record.run_folder import RunFolder
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 from killing import VEHICLE, processes, results_of
 
-from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.core.processes import GUARD, WORKER
 
 pytestmark = pytest.mark.slow

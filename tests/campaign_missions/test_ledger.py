@@ -8,13 +8,15 @@ from plans import planned
 
 from mavfi_cli.campaign.ledger import LEDGER, Ledger
 from mavfi_cli.campaign.missions import (
+    Injected,
     PlannedMission,
+    ResultState,
     changes_of,
     config_from,
     golden_of,
+    injected_of,
     pair_of,
 )
-from mavfi_cli.campaign.outcome import Injected, ResultState, injected_of
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig

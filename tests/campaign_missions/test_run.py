@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from plans import planned
 
-from mavfi_cli.campaign.keep import Keep
 from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.outcome import Injected, ResultState
+from mavfi_cli.campaign.missions import Injected, ResultState
 from mavfi_cli.campaign.run import ATTEMPTS
-from mavfi_cli.campaign.workers.verdict import CampaignStopped
+from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaign.workers import CampaignStopped
 from mavfi_cli.core.errors import ConfigError, Interrupted
 
 

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.specification.changes import replaced
-from mavfi_cli.campaign.specification.spec import load_spec, parse_spec
+from mavfi_cli.campaign.specification_file import load_spec, parse_spec, replaced
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey
 
 SPEC = """

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plans import planned
 
-from mavfi_cli.campaign.outcome import Injected
-from mavfi_cli.campaign.specification.spec import Stop
+from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaign.specification import Stop
 from mavfi_cli.campaign.stopping import BatchLimiter, Queue
 from mavfi_cli.stats.shares import half_width, rate
 

@@ -1,7 +1,6 @@
 """What the end of a mission's process means."""
 
-from mavfi_cli.campaign.workers.base import AttemptEnd
-from mavfi_cli.campaign.workers.verdict import judge
+from mavfi_cli.campaign.workers import AttemptEnd, judge
 from mavfi_cli.core.errors import Interrupted
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavfi_cli.campaign.specification.spec import load_spec
+from mavfi_cli.campaign.specification_file import load_spec
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, OtherStack, UnknownName
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock

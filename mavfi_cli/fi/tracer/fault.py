@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import BitOutsideWidth, FaultError, UnknownName
+from mavfi_cli.core.errors import BitOutsideWidth, FaultError, named_member
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, RegisterUse, register_kind, width_of
 from mavfi_cli.fi.tracer.image import Location
-
-E = TypeVar("E", bound=Enum)
 
 
 class Site(Enum):
@@ -98,9 +96,9 @@ class FaultModel:
         """
         default = cls()
         return cls(
-            sites=frozenset(_member(Site, "site", name) for name in sites) or default.sites,
-            roles=frozenset(_member(Role, "role", name) for name in roles) or default.roles,
-            field=_member(Field, "field", field),
+            sites=frozenset(named_member(Site, "site", name) for name in sites) or default.sites,
+            roles=frozenset(named_member(Role, "role", name) for name in roles) or default.roles,
+            field=named_member(Field, "field", field),
             count=bits,
         )
 
@@ -112,13 +110,6 @@ class FaultModel:
             "field": self.field.value,
             "bits": self.count,
         }
-
-
-def _member(kind: type[E], what: str, name: str) -> E:
-    try:
-        return kind(name)
-    except ValueError:
-        raise UnknownName(what, name, [member.value for member in kind]) from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.core.errors import FaultError, UnknownName
+from mavfi_cli.core.errors import FaultError, UnknownName, named_member
 from mavfi_cli.fi.tracer.arch import Instruction, decode
 from mavfi_cli.fi.tracer.fault import (
     FaultModel,
@@ -91,10 +91,7 @@ def strategy(name: str, model: FaultModel | None = None, *, compat: str | None =
             in_system_calls=True,
             bit_of=_rosfi_bit,
         )
-    try:
-        rule = Rule(name)
-    except ValueError:
-        raise UnknownName("sampling rule", name, [rule.value for rule in Rule]) from None
+    rule = named_member(Rule, "sampling rule", name)
     return Strategy(name=rule.value, rule=rule, model=model or FaultModel())
 
 

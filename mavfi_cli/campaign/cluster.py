@@ -1,21 +1,32 @@
-"""Workers of a campaign on dask.distributed: the threads of a cluster."""
+"""Workers of a campaign on dask.distributed, and the code that runs on their side.
+
+Dask's workers import this module. Each thread of a dask worker keeps a worker of ours, so a dask
+worker with n threads flies n missions at a time.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import queue
+import shutil
+import tempfile
+import threading
 import time
 import uuid
+import zlib
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from mavfi_cli.campaign.keep import Keep
-from mavfi_cli.campaign.workers.base import Assignment, AttemptEnd, Workers
-from mavfi_cli.campaign.workers.local import TASK
-from mavfi_cli.campaign.workers.remote import Answer, Order, fly, unpack, worker_versions
+from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaign.workers import TASK, Assignment, AttemptEnd, LocalWorkers, Workers
 from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.fork_server import SCRATCH
+from mavfi_cli.mission.record.run_folder import FAULT, RESULT
 from mavfi_cli.mission.replay import version_differences
 from mavfi_cli.mission.run import installed_versions
 
@@ -69,7 +80,7 @@ class Cluster(Workers):
     def start(self, mission: Assignment, limit_s: float) -> None:
         """Send a mission to the cluster."""
         number = mission.number
-        order = Order(
+        order = _Order(
             number=number,
             changes=mission.changes,
             limit_s=limit_s,
@@ -97,10 +108,10 @@ class Cluster(Workers):
         future, out = self._futures.pop(number)
         if future.status != "finished":
             return AttemptEnd(number=number, lost=f"lost by the cluster: {future.exception()}")
-        answer: Answer = future.result()
+        answer: _Answer = future.result()
         if answer.ended is None:
             raise ClusterError(f"a worker has other versions: {answer.refused}")
-        unpack(answer.files, out)
+        _unpack(answer.files, out)
         return AttemptEnd(**answer.ended)
 
     def close(self) -> None:
@@ -145,3 +156,99 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
         differing = version_differences(ours, versions)
         if differing:
             raise ClusterError(f"worker {worker} has other versions: {'; '.join(differing)}")
+
+
+_SMALL = (RESULT, FAULT)  # files that the runner reads of a run folder that is not kept
+_thread = threading.local()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Order:
+    """One mission for a worker."""
+
+    number: int
+    changes: Mapping[str, Any]
+    limit_s: float
+    keep: str
+    task: str
+    versions: Mapping[str, str]  # versions of the runner
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Answer:
+    """A worker's answer to an order.
+
+    Attributes:
+        refused: how this worker's versions differ from the runner's; it then does not fly.
+        ended: how the mission ended; None if it was refused.
+        files: its files, compressed, by path in its folder.
+    """
+
+    refused: str = ""
+    ended: Mapping[str, Any] | None = None
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+@cache
+def worker_versions() -> dict[str, str]:
+    """Versions on this worker that results depend on."""
+    return installed_versions()
+
+
+def fly(order: _Order) -> _Answer:
+    """Fly a mission; run folders that the campaign does not keep are sent without their traces."""
+    differing = version_differences(order.versions, worker_versions())
+    if differing:
+        return _Answer(refused="; ".join(differing))
+    place = _scratch() / f"{order.number}-{threading.get_ident()}"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    (place / ".profiles").symlink_to(_scratch() / "profiles")
+    try:
+        workers = _workers(order.task)
+        mission = Assignment(number=order.number, changes=order.changes, out=str(place))
+        workers.start(mission, order.limit_s)
+        ended: list[AttemptEnd] = []
+        while not ended:
+            ended = workers.wait(60.0)
+        return _Answer(ended=asdict(ended[0]), files=_packed(place, order))
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _workers(task: str) -> LocalWorkers:
+    """The workers of this thread, one mission at a time."""
+    kept: dict[str, LocalWorkers] = _thread.__dict__.setdefault("workers", {})
+    if task not in kept:
+        kept[task] = LocalWorkers(1, task)
+    return kept[task]
+
+
+@cache
+def _scratch() -> Path:
+    """A folder of this worker; profiles of instruction-level faults stay in it."""
+    folder = Path(tempfile.mkdtemp(prefix="mavfi-worker-"))
+    (folder / "profiles").mkdir()
+    return folder
+
+
+def _packed(place: Path, order: _Order) -> dict[str, bytes]:
+    outcome = None
+    for result in place.glob(f"[!.]*/{RESULT}"):
+        outcome = json.loads(result.read_text(encoding="utf-8")).get("outcome")
+    whole = Keep(order.keep).wants(order.number, outcome)
+    return {
+        str(path.relative_to(place)): zlib.compress(path.read_bytes(), 1)
+        for path in sorted(place.glob("[!.]*/*")) + sorted(place.glob("[!.]*"))
+        if path.is_file()
+        and path.parent.name != SCRATCH
+        and (whole or path.name in _SMALL or path.parent == place)
+    }
+
+
+def _unpack(files: Mapping[str, bytes], out: Path) -> None:
+    """Write a worker's files where the mission would have written them."""
+    for name, data in files.items():
+        path = out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(zlib.decompress(data))

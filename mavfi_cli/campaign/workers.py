@@ -1,21 +1,169 @@
-"""Judges the end of a mission's process: a result, an error, or an attempt that does not count."""
+"""The worker processes that fly missions on this machine, and the meaning of their ends."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import selectors
 import shutil
 import signal
+import socket
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from mavfi_cli.campaign.outcome import ResultState
-from mavfi_cli.campaign.workers.base import AttemptEnd
+from mavfi_cli.campaign.missions import ResultState
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
-from mavfi_cli.core.fork_server import ERRORS, SCRATCH
+from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import RunFolder
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttemptEnd:
+    """How one attempt at a mission ended.
+
+    Attributes:
+        exit: exit code of the mission's process; None if it was killed.
+        signal: signal that killed it; None if its guard was killed too, or the time ran out.
+        timeout: true if the limit of wall time passed.
+        report: the mission's last message: folder, or error and text, or traceback.
+        lost: why its end is unknown.
+        wall_s: wall time of the whole attempt, the guard's work included, s.
+    """
+
+    number: int
+    exit: int | None = None
+    signal: int | None = None
+    timeout: bool = False
+    report: Mapping[str, Any] | None = None
+    lost: str = "its guard was killed"
+    wall_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Assignment:
+    """One mission to be flown.
+
+    Attributes:
+        number: number of the mission.
+        changes: its values that differ from the defaults.
+        out: the folder for its run folder.
+    """
+
+    number: int
+    changes: Mapping[str, Any]
+    out: str
+
+
+class Workers(ABC):
+    """Keeps missions flying. A context manager that ends them."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    @abstractmethod
+    def free(self) -> int:
+        """Number of missions that may be started now."""
+
+    @abstractmethod
+    def start(self, mission: Assignment, limit_s: float) -> None:
+        """Start a mission with a limit of wall time, s."""
+
+    @abstractmethod
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
+        """Wait for news or the time-out; return the missions that ended."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End all missions that still run."""
+
+
+TASK = "mavfi_cli.campaign.task"
+_STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
+
+
+class LocalWorkers(Workers):
+    """Keeps up to `jobs` missions flying.
+
+    Args:
+        jobs: missions at the same time.
+        module: the module that does the work.
+
+    Attributes:
+        running: process id by mission number; 0 until the worker's guard has sent it.
+    """
+
+    def __init__(self, jobs: int, module: str = TASK) -> None:
+        self._jobs = jobs
+        self._server = ForkServer(module)
+        self._selector = selectors.DefaultSelector()
+        self._number: dict[socket.socket, int] = {}  # mission number by channel
+        self.running: dict[int, int] = {}
+
+    @property
+    def free(self) -> int:
+        """Number of missions that may be started now."""
+        return self._jobs - len(self._number)
+
+    def start(self, mission: Assignment, limit_s: float) -> None:
+        """Start a mission.
+
+        Raises:
+            ForkServerFailed: the processes cannot be started.
+        """
+        channel = self._server.start(mission.changes, Path(mission.out), limit_s)
+        self._selector.register(channel, selectors.EVENT_READ)
+        self._number[channel] = mission.number
+        self.running[mission.number] = 0
+
+    def wait(self, timeout_s: float) -> list[AttemptEnd]:
+        """Wait for a guard's message or the time-out; return the missions that ended."""
+        ended = []
+        for key, _ in self._selector.select(timeout_s):
+            channel = key.fileobj
+            assert isinstance(channel, socket.socket)
+            number = self._number[channel]
+            said = _heard(channel)
+            if said is not None and "pid" in said:
+                self.running[number] = said["pid"]
+                continue
+            ended.append(AttemptEnd(number=number, **(said or {})))
+            self._release(channel)
+        return ended
+
+    def _release(self, channel: socket.socket) -> None:
+        self._selector.unregister(channel)
+        del self.running[self._number.pop(channel)]
+        channel.close()
+
+    def close(self) -> None:
+        """Kill all running missions and wait until they have ended."""
+        for channel in self._number:
+            channel.shutdown(socket.SHUT_WR)  # the guard ends its worker, and then itself
+        for channel in list(self._number):
+            channel.settimeout(_STOP_S)
+            while _heard(channel) is not None:
+                pass
+            self._release(channel)
+        self._server.close()
+        self._selector.close()
+
+
+def _heard(channel: socket.socket) -> Mapping[str, Any] | None:
+    """Read a guard's next message; None if it is gone or sends nothing in time."""
+    with contextlib.suppress(OSError):
+        if packet := channel.recv(PACKET):
+            said: dict[str, Any] = json.loads(packet)
+            return said
+    return None
+
 
 FULL_BYTES = 16 << 20  # with less free space a disk counts as full
 # A fault can make a process kill itself by other signals than these; these come from outside.

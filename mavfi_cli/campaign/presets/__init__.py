@@ -1,1 +1,0 @@
-"""The campaigns of the paper, one TOML file each."""

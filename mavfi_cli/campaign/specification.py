@@ -1,0 +1,341 @@
+"""The specification of a campaign: factors, settings, repetitions, stopping rule, worlds."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any
+
+from mavfi_cli.campaign.factors import Point
+from mavfi_cli.campaign.missions import Label, PlannedMission, naming
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.seeds import Stream, derive
+
+SAMPLE = 20  # `sampled` keeps about one success in 20
+_WORD = 1 << 32
+
+
+class Keep(Enum):
+    """Which run folders are kept. Every outcome but success is a failure."""
+
+    NONE = "none"
+    FAILURES = "failures"
+    SAMPLED = "sampled"  # all failures, and one success in SAMPLE
+    ALL = "all"
+
+    def wants(self, number: int, outcome: str | None) -> bool:
+        """True if the run folder of this mission is kept."""
+        if self is Keep.ALL or self is Keep.NONE:
+            return self is Keep.ALL
+        return outcome != "success" or (self is Keep.SAMPLED and _sampled(number))
+
+
+def _sampled(number: int) -> bool:
+    """True if this success is in the sample, which covers every setting however they alternate."""
+    mixed = number
+    for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
+        mixed = mixed * factor % _WORD
+        mixed ^= mixed >> 15
+    return mixed < _WORD // SAMPLE
+
+
+Flown = tuple[tuple[int, ...], ...]  # for each candidate, the replans of its golden runs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixedWorld:
+    """The table `[fixed_world]` of a specification.
+
+    Attributes:
+        replans: least and most replans, for the median over golden runs.
+        flights: golden runs of each candidate, with seeds from the campaign's first on.
+        candidates: world seeds 1 to this number are tried, and the first that fits is taken.
+        worlds: the worlds that the rule is for; empty: all worlds of the campaign.
+        world_seed: seed of each world, named by the user or found by the rule.
+        flown: replans of the golden runs of candidates 1, 2, 3, ...; fewer than `flights` values
+            for a candidate whose flights could not begin.
+    """
+
+    replans: tuple[int, int]
+    flights: int = 5
+    candidates: int = 60
+    worlds: tuple[str, ...] = ()
+    world_seed: Mapping[str, int] = field(default_factory=dict)
+    flown: Mapping[str, Flown] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        least, most = self.replans
+        if not 0 <= least <= most:
+            raise ValueError(f"replans: expected [LEAST, MOST], got [{least}, {most}]")
+        if self.flights < 1 or self.candidates < 1:
+            raise ValueError("flights and candidates: must be at least 1")
+        for world, seed in self.world_seed.items():
+            if seed < 0:
+                raise ValueError(f"world_seed.{world}: must not be negative, is {seed}")
+
+    def rules(self, world: str) -> bool:
+        """True if missions in this world share one; a user's own boxes already are one world."""
+        named = world in self.worlds or world in self.world_seed
+        return named or (not self.worlds and not world.endswith(".toml"))
+
+    def fits(self, replans: Sequence[int]) -> bool:
+        """True if a candidate fits the rule by the replans of its golden runs."""
+        least, most = self.replans
+        return len(replans) == self.flights and least <= statistics.median(replans) <= most
+
+    def told(self) -> str:
+        """The rule and the worlds that it has found, in one line."""
+        found = [
+            f"{world} {seed}{self._median(world)}" for world, seed in self.world_seed.items()
+        ] or ["none yet"]
+        return f"world seeds: {', '.join(found)}; {self.rule()}"
+
+    def rule(self) -> str:
+        """The rule in words."""
+        least, most = self.replans
+        often = f"{least} to {most} times" if most > least else f"{least} times"
+        often = "once" if often == "1 times" else often
+        return f"the first from 1 on whose golden flights replan {often} (median of {self.flights})"
+
+    def _median(self, world: str) -> str:
+        """Median replans of the found candidate; empty if the user has named the seed."""
+        if world not in self.flown:
+            return " (named)"
+        return f" (median {statistics.median(self.flown[world][-1]):g})"
+
+
+Axes = Mapping[str, tuple[Any, ...]]
+MOST = 1_000_000  # missions of one campaign
+# Factors whose value is a list already: a list of lists crosses several.
+LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """Missions that are listed together: their own factors, crossed with the common ones."""
+
+    name: str = ""
+    axes: Axes = field(default_factory=dict)
+    repetitions: int | None = None  # None: as many as the campaign has
+
+    def __post_init__(self) -> None:
+        if self.repetitions is not None and self.repetitions < 1:
+            raise ValueError(f"repetitions: must be at least 1, is {self.repetitions}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stop:
+    """When a setting has been flown often enough.
+
+    Attributes:
+        margin: largest half-width of the Wilson interval of the success rate.
+        confidence: confidence of that interval.
+        batch: the interval is checked after every batch of this many missions of a setting.
+    """
+
+    margin: float
+    confidence: float = 0.95
+    batch: int = 20
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.margin < 0.5 and 0.0 < self.confidence < 1.0 and self.batch >= 1):
+            raise ValueError(
+                "needs a margin between 0 and 0.5, a confidence between 0 and 1, a batch from 1"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spec:
+    """One campaign.
+
+    Attributes:
+        seed: root of the seeds of all faults.
+        first_seed: first seed of the missions; repetition r flies with first_seed + r.
+        repetitions: missions for each combination of factors.
+        fixed: factors that all missions share.
+        axes: factors that are crossed, each with its values.
+        settings: lists of missions, each crossed with `axes`.
+        stop: ends settings early; None flies everything.
+        fixed_world: has missions in a world share one; None: the world changes with the seed.
+    """
+
+    name: str
+    about: str = ""
+    seed: int = 1
+    first_seed: int = 1
+    repetitions: int = 1
+    keep: Keep = Keep.FAILURES
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    axes: Axes = field(default_factory=dict)
+    settings: tuple[Setting, ...] = (Setting(),)
+    stop: Stop | None = None
+    fixed_world: FixedWorld | None = None
+
+    def __post_init__(self) -> None:
+        for name, least in (("seed", 0), ("first_seed", 0), ("repetitions", 1)):
+            if (value := getattr(self, name)) < least:
+                raise ValueError(f"{name}: must be at least {least}, is {value}")
+
+    def scaled(self, scale: float) -> Spec:
+        """Return the same campaign with a fraction of its repetitions, at least one each.
+
+        Raises:
+            ConfigError: the scale leaves nothing.
+        """
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
+
+        def share(count: int) -> int:
+            """Scale a number of repetitions, to at least one."""
+            return max(1, round(count * scale))
+
+        settings = tuple(
+            setting
+            if setting.repetitions is None
+            else replace(setting, repetitions=share(setting.repetitions))
+            for setting in self.settings
+        )
+        return replace(self, repetitions=share(self.repetitions), settings=settings)
+
+    def missions(self) -> list[PlannedMission]:
+        """List the missions repetition by repetition, so that pairs and settings grow together.
+
+        Raises:
+            ConfigError: there is nothing to fly, more than MOST, or a combination makes no mission.
+        """
+        points = self._points()
+        return [
+            self._mission(point, labels, repetition)
+            for repetition in range(max(count for *_, count in points))
+            for point, labels, count in points
+            if repetition < count
+        ]
+
+    def kinds(self) -> list[PlannedMission]:
+        """The first missions of the list, one for each combination; the others differ in seeds.
+
+        Raises:
+            ConfigError: as `missions`.
+        """
+        return [self._mission(point, labels, 0) for point, labels, _ in self._points()]
+
+    def _points(self) -> list[tuple[Point, dict[str, Label], int]]:
+        """Combine the factors; return each combination with its labels and repetitions."""
+        if (planned := sum(self._size(setting) for setting in self.settings)) > MOST:
+            raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
+        points = [
+            (Point(values={**self.fixed, **values}), labels, self._count(setting))
+            for setting in self.settings
+            for values, labels in self._combinations(setting)
+        ]
+        if not points:
+            raise ConfigError(f"campaign {self.name!r} has no mission: an empty list of values")
+        return points
+
+    def _count(self, setting: Setting) -> int:
+        return self.repetitions if setting.repetitions is None else setting.repetitions
+
+    def _size(self, setting: Setting) -> int:
+        """Number of missions of a setting, without making them."""
+        return self._count(setting) * math.prod(map(len, {**self.axes, **setting.axes}.values()))
+
+    def _combinations(self, setting: Setting) -> Iterator[tuple[dict[str, Any], dict[str, Label]]]:
+        axes = {**self.axes, **setting.axes}
+        named = {"setting": setting.name} if setting.name else {}
+        for values in itertools.product(*axes.values()):
+            chosen = dict(zip(axes, values, strict=True))
+            varied = {name: value for name, value in chosen.items() if name != "seed"}
+            yield chosen, {**named, **{name: _label(value) for name, value in varied.items()}}
+
+    def _mission(
+        self, point: Point, labels: Mapping[str, Label], repetition: int
+    ) -> PlannedMission:
+        seed = point.values.get("seed", self.first_seed + repetition)
+        # The target is part of it, or the faults of all states would share one draw. Nothing else
+        # is: the same target gets the same fault under every detector and platform.
+        fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition, point.target)
+        with naming(labels):
+            config = point.mission(seed, fault_seed)
+            if self.fixed_world is not None and config.world_seed is None:
+                config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
+            return PlannedMission(config=config, labels=labels)
+
+
+def _label(value: Any) -> Label:
+    return "+".join(map(str, value)) if isinstance(value, list | tuple) else value
+
+
+_Choices = Mapping[str, Sequence[Any]]
+
+
+def differences(stored: Spec, asked: Spec, repetitions: str = "repetitions") -> list[str]:
+    """Return a phrase for each factor or number that differs; names and stops do not count.
+
+    Args:
+        repetitions: the word for repetitions.
+    """
+    found = list(_phrases(_choices(stored, repetitions), _choices(asked, repetitions)))
+    return found or list(_between_settings(stored, asked))
+
+
+def _phrases(there: _Choices, here: _Choices) -> Iterator[str]:
+    for key in dict.fromkeys((*there, *here)):
+        old, new = there.get(key, ()), here.get(key, ())
+        if old == new:
+            continue
+        gone = [value for value in old if value not in new]
+        added = [value for value in new if value not in old]
+        if len(gone) < len(old) and (gone or added):  # they share values: name only the others
+            parts = [f"{_told(gone)} only there"] if gone else []
+            parts += [f"{_told(added)} only here"] if added else []
+            yield f"{key} {', '.join(parts)}"
+        else:
+            yield f"{key} {_told(old)} there, {_told(new)} here"
+
+
+def _choices(spec: Spec, repetitions: str) -> _Choices:
+    """Factors with all their values, and the numbers."""
+    found: dict[str, list[Any]] = {}
+    for axes in (spec.axes, *(setting.axes for setting in spec.settings)):
+        for name, values in axes.items():
+            known = found.setdefault(name, [])
+            known += [value for value in values if value not in known]
+    found |= {f"mission.{name}": [value] for name, value in spec.fixed.items()}
+    if spec.fixed_world is not None:
+        found["rule of fixed worlds"] = [spec.fixed_world.rule()]
+        seeds = spec.fixed_world.world_seed.items()
+        found["fixed worlds"] = [f"{world} {seed}" for world, seed in seeds]
+    return {
+        **found,
+        repetitions: [spec.repetitions],
+        "first seed": [spec.first_seed],
+        "fault seed": [spec.seed],
+        "settings": [setting.name for setting in spec.settings],
+    }
+
+
+def _between_settings(stored: Spec, asked: Spec) -> Iterator[str]:
+    """Phrases for equal values in other settings."""
+    for there, here in zip(stored.settings, asked.settings, strict=True):
+        name = f" of setting {here.name}" if here.name else ""
+        for phrase in _phrases(_of_setting(there), _of_setting(here)):
+            factor, _, rest = phrase.partition(" ")
+            yield f"{factor}{name} {rest}"
+    yield from _phrases(_listed(stored.axes), _listed(asked.axes))
+
+
+def _of_setting(setting: Setting) -> _Choices:
+    own = () if setting.repetitions is None else (setting.repetitions,)
+    return {**_listed(setting.axes), "repetitions": own}
+
+
+def _listed(axes: Axes) -> _Choices:
+    return {name: list(values) for name, values in axes.items()}
+
+
+def _told(values: Sequence[Any]) -> str:
+    return ", ".join(map(str, values)) if values else "none"

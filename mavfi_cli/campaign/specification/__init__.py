@@ -1,1 +1,0 @@
-"""Specifications of campaigns: campaign.toml, presets and factors."""
