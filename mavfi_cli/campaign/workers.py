@@ -19,6 +19,7 @@ from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import RunFolder
+from mavfi_cli.spec.fault import PROCESS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,9 +255,10 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
         if result.get("referee", {}) is None:
             reason = "the vehicle died before it had saved the truth"
             return Verdict(state=None, result={}, reason=reason)
-    doubts = [how for how in crashes if how.endswith(_OUTSIDE_WORDS)]
+    by_fault = (result.get("fault") or {}).get("stage") == PROCESS  # it kills a node itself
+    doubtful = not by_fault and any(how.endswith(_OUTSIDE_WORDS) for how in crashes)
     return Verdict(
-        state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=bool(doubts)
+        state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=doubtful
     )
 
 

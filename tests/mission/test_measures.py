@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.mission.record.measures import STRUCK, struck
+from mavfi_cli.mission.record.measures import STRUCK, measures_of, struck
 
 STRIKE = {
     "changes": [
@@ -78,6 +78,14 @@ def test_a_fault_in_an_instruction():
         "struck_execution": 3, "struck_role": "destination", "struck_register": "rbx",
         "reading_instruction": "add ebx, r8d", "node_ended": "killed by SIGSEGV;hang",
     }  # fmt: skip
+
+
+def test_a_killed_process_changes_no_bit():
+    strike = {"changes": [], "invocation": 3, "phase": "flying", "stamp_s": 9.0, "tick": 5}
+    killed = {**SOURCE, "states": ["process.planner"], "strikes": [strike]}
+    found = measures_of({"fault": killed})
+    assert (found["struck_s"], found["first_bits"]) == (9.0, [])
+    assert (found["strikes"], found["struck_bits"]) == (1, "")
 
 
 def test_a_fault_that_did_not_act_has_no_strike():

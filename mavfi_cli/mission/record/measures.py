@@ -103,10 +103,11 @@ def _applied(fault: Record) -> dict[str, Any]:
     applied = fault.get("state") == "applied"
     if fault.get("level") == "source":
         strikes = fault.get("strikes") or []
+        changes = strikes[0]["changes"] if strikes else []  # none where a process was killed
         return {
             "struck_s": strikes[0]["stamp_s"] if applied and strikes else None,
             "struck_sites": list(fault.get("states", ())),
-            "first_bits": list(strikes[0]["changes"][0]["bits"]) if strikes else [],
+            "first_bits": list(changes[0]["bits"]) if changes else [],
         }
     return {
         "struck_s": fault.get("stamp_s") if applied else None,
