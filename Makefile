@@ -1,15 +1,19 @@
-# Two commands do everything: `make fly` and `make test`.
+# Two commands do everything: `make fly` and `make test`; `make test-all` takes longer.
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 SOURCES := mavfi_cli sitl tests benchmarks examples
 
-.PHONY: fly test install install-dev lint clean
+.PHONY: fly test test-all install install-dev lint clean
 
 fly: install
 	$(BIN)/mavfi fly --world dense --inject planning
 
 test: install-dev lint
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+	@echo "Left out: tests marked slow. 'make test-all' runs them too, and so does CI."
+
+test-all: install-dev lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: install-dev

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "campaign_missions"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "campaign"))
 
 from killing import complete_with_kills, marked, results_of
 from missions import MAVFI

@@ -11,8 +11,6 @@ import json
 
 import pytest
 
-pytestmark = pytest.mark.slow
-
 # Fields of reports that depend on the host, on the clock or on the code's own files; a struck
 # register may hold an address, and where the stack begins depends on the length of paths. A
 # corrupted pointer reads whatever lies there, which moves with every change of a docstring, so the
@@ -121,7 +119,13 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+FLYING = ("campaign", "compare", "evaluate", "vpm --fly", "kernels")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in FLYING)) for name in COMMANDS],
+)
 def test_the_report_is_what_it_was(name, report):
     expected, *commands = COMMANDS[name]
     assert digest([report(arguments) for arguments in commands]) == expected

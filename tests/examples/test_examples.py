@@ -35,13 +35,11 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SAYS)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SAYS)
 def test_an_example_runs(name, run):
     assert SAYS[name] in run(EXAMPLES / f"{name}.py")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", list(EXAMPLES.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_the_code_of_a_notebook_runs(path, run, tmp_path):
     cells = json.loads(path.read_text())["cells"]

@@ -14,8 +14,6 @@ from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
-pytestmark = pytest.mark.slow
-
 _WAYPOINT = FaultConfig(target="planning", seed=25)
 MISSIONS = {
     "golden": ({"world": "dense", "seed": 3}, "3375e55da3193c19"),

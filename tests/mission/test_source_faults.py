@@ -18,8 +18,6 @@ from mavfi_cli.report.summary import difference_lines
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def struck(fly_short):

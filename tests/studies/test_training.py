@@ -29,6 +29,7 @@ def flights_of(told):
     return {flight for part in told["split"].values() for flight in part}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_shipped_and_new_are_of_the_same_version_and_tell_the_same_things(folder, kind):
     new, ours = (
@@ -44,6 +45,7 @@ def test_shipped_and_new_are_of_the_same_version_and_tell_the_same_things(folder
         assert ours["provenance"]["versions"][package]
 
 
+@pytest.mark.slow
 def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_made_of(folder):
     new, ours = (registry.find("range", model=p).memory for p in (folder / "range.json", None))
     assert (new["lowest"] >= ours["lowest"]).all()
@@ -53,6 +55,7 @@ def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_mad
     assert (new["scale"] <= ours["scale"]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*KINDS, "aad"])
 def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
     detector = registry.find(kind)

@@ -49,7 +49,6 @@ def flown(mavfi, tmp_path_factory):
     return home / "campaigns" / "short", run
 
 
-@pytest.mark.slow
 def test_a_campaign_is_flown_and_summed_up(flown):
     folder, run = flown
     summary = json.loads(run.stdout)
@@ -66,7 +65,6 @@ def test_a_campaign_is_flown_and_summed_up(flown):
     assert len(list((folder / "runs").glob("*/result.json"))) == 4
 
 
-@pytest.mark.slow
 def test_a_complete_campaign_flies_nothing_again(flown, mavfi):
     folder, _ = flown
     for what in ([folder], [folder, "--missing-only"]):
@@ -76,7 +74,6 @@ def test_a_complete_campaign_flies_nothing_again(flown, mavfi):
     assert mavfi("campaign", "status", folder).stdout == run.stdout
 
 
-@pytest.mark.slow
 def test_a_campaign_is_read_by_the_name_that_ran_it(flown, mavfi, tmp_path):
     folder, _ = flown
     home = folder.parent.parent
@@ -91,7 +88,6 @@ def test_a_campaign_is_read_by_the_name_that_ran_it(flown, mavfi, tmp_path):
         assert done.stdout
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["table.csv", "table.parquet"])
 def test_export_has_a_row_a_mission(flown, mavfi, tmp_path, name):
     folder, _ = flown
@@ -115,7 +111,6 @@ def test_export_has_a_row_a_mission(flown, mavfi, tmp_path, name):
     assert {row["struck_state"] or None for row in rows[::2]} == {None}  # golden
 
 
-@pytest.mark.slow
 def test_export_to_stdout_is_the_csv_file(flown, mavfi, tmp_path):
     folder, _ = flown
     mavfi("campaign", "export", folder, tmp_path / "table.csv")
@@ -126,7 +121,6 @@ def test_export_to_stdout_is_the_csv_file(flown, mavfi, tmp_path):
     assert "ends in .parquet or .csv, or - for CSV on stdout" in refused.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("chosen", "seed"), [((), 1), (("--pair", "3"), 2)])
 def test_a_pair_is_drawn(flown, mavfi, tmp_path, chosen, seed):
     """Neither of the two faults costs time, so the first pair is the default."""
@@ -144,7 +138,6 @@ def test_a_pair_is_drawn(flown, mavfi, tmp_path, chosen, seed):
     assert {"flight-0-0", "flight-0-1"} <= ids
 
 
-@pytest.mark.slow
 def test_what_was_drawn_in_json(flown, mavfi, tmp_path):
     folder, _ = flown
     run = mavfi("campaign", "draw", folder, "--output", tmp_path / "pair.svg", "--json")
@@ -156,7 +149,6 @@ def test_what_was_drawn_in_json(flown, mavfi, tmp_path):
     assert told["picture"] == str(tmp_path / "pair.svg")
 
 
-@pytest.mark.slow
 def test_a_changed_specification_shows_the_difference(flown, mavfi, tmp_path):
     folder, _ = flown
     changed = written(tmp_path, SPEC.replace("mantissa", "exponent"))
@@ -169,7 +161,6 @@ def test_a_changed_specification_shows_the_difference(flown, mavfi, tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_append_is_recommended_where_it_is_enough(flown, mavfi, tmp_path):
     folder, _ = flown
     more = written(tmp_path, SPEC.replace("repetitions = 2", "repetitions = 3"))

@@ -13,7 +13,6 @@ from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig
 
-pytestmark = pytest.mark.slow
 FAULT = FaultConfig(target="waypoint_position", at="time=1", together=True, field="mantissa")
 DETECTOR = DetectorConfig(name="gad", protect=("planning", "control"))
 INSTRUCTION = InstructionConfig(target="control", seed=4)

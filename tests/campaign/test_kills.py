@@ -5,6 +5,7 @@ import signal
 import time
 from functools import partial
 
+import pytest
 from killing import (
     RUNNER,
     complete_with_kills,
@@ -16,6 +17,8 @@ from killing import (
 from plans import planned
 
 from mavfi_cli.core.processes import GUARD, WORKER
+
+pytestmark = pytest.mark.slow
 
 MISSIONS, KILLS = 40, 8
 
