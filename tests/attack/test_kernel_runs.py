@@ -140,7 +140,7 @@ def test_tolerance_makes_small_corruption_benign(attack, control_campaign):
 
 
 def test_null_injections_are_benign(attack):
-    _, (runs,) = attack("point_cloud", runs=5, null=True)
+    _, (runs,) = attack("control", runs=5, null=True)
     assert {entry["outcome"] for entry in runs.records} == {"benign"}
     assert {entry["injection"]["applied"] for entry in runs.records} == {False}
 

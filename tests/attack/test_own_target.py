@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import pytest
-from own_target import OwnTarget
+from own_target import OwnPlace, OwnTarget
 
 from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
@@ -27,7 +27,9 @@ def own(native_program, tmp_path):
 
 def test_a_target_of_ones_own_gets_the_faults_that_a_program_gets(own):
     command = Command.of([str(own.program), "30"])
-    program = records(ProgramTarget(command=command, comparison=OutputComparison()))
+    program = records(
+        ProgramTarget(command=command, comparison=OutputComparison(), limits=OwnPlace.limits)
+    )
     ours = records(own)
     assert [[e[key] for key in DRAWN] for e in ours] == [[e[key] for key in DRAWN] for e in program]
     ends = {

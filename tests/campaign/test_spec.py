@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -256,9 +257,14 @@ def test_the_specification_of_the_documents_can_be_flown():
     assert spec.stop == Stop(margin=0.05, batch=20)
 
 
+@cache
+def missions_of(name):
+    return load_spec(name).missions()
+
+
 @pytest.mark.parametrize("name", presets())
 def test_every_preset_expands_to_its_numbers(name):
-    missions = load_spec(name).missions()
+    missions = missions_of(name)
     cells = Counter(tuple(sorted(m.labels.items())) for m in missions)
     repetitions = {"fig13": {20}, "speeds": {50}, "ablation": {30, 100}}.get(
         name, {100}
@@ -299,7 +305,7 @@ def test_hardening_has_each_protection_alone_and_all_of_them():
 
 @pytest.mark.parametrize("name", sorted({*presets()} - {"hardening", "ablation"}))
 def test_the_presets_of_the_paper_fly_its_stack(name):
-    assert {m.config.stack for m in load_spec(name).missions()} == {"mavbench"}
+    assert {m.config.stack for m in missions_of(name)} == {"mavbench"}
 
 
 def test_an_unknown_preset_gets_the_nearest():

@@ -128,8 +128,14 @@ def test_an_evaluation_without_harm_has_no_curve():
 @pytest.mark.slow
 def test_real_flights_end_to_end(mavfi, tmp_path):
     """Two missions; called again nothing is flown, with more detectors the rest is."""
+    world = tmp_path / "lawn.toml"
+    world.write_text(
+        'name = "lawn"\nbounds_enu_m = [-10.0, -10.0, 0.0, 30.0, 20.0, 20.0]\n'
+        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [12.0, 6.0, 5.0]\n"
+        "[[box]]\nmin_enu_m = [5.0, 9.0, 0.0]\nmax_enu_m = [8.0, 12.0, 9.0]\n"
+    )
     line = [
-        "detect", "evaluate", "--world", "farm", "--flights", 1, "--golden-flights", 2,
+        "detect", "evaluate", "--world", world, "--flights", 1, "--golden-flights", 2,
         "--out", tmp_path / "out", "--quiet", "--json",
     ]  # fmt: skip
     first = mavfi(*line, "--detector", "range")

@@ -1,18 +1,26 @@
 """Bad beginnings: known errors are one line and 1, misuse is 2."""
 
+import signal
 import socket
 import subprocess
 import sys
 
 import pytest
 
+from sitl.server.main import main
 
-def run(*arguments):
-    done = subprocess.run(
-        [sys.executable, "-m", "sitl", *arguments],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    return done.returncode, done.stdout, done.stderr
+
+@pytest.fixture
+def run(capfd):
+    """Start the vehicle in this process, which keeps its own answer to signals."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def run(*arguments):
+        return main(arguments), *capfd.readouterr()
+
+    yield run
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize(
@@ -26,11 +34,10 @@ def run(*arguments):
         (["--world", "farm", "--link", "carrier:pigeon"], "carrier"),
         (["--world", "farm", "--link", "udpin:0.0.0.0:14777"], "sign"),
         (["--world", "farm", "--camera-rate", "1000"], "camera rate"),
-        (["--world", "farm", "--fd", "1", "--lockstep"], "fd:1"),
         (["--world", "farm", "--key-file", "/nowhere/key"], "/nowhere/key"),
     ],
 )
-def test_known_error_is_one_line_and_exit_1(arguments, words):
+def test_known_error_is_one_line_and_exit_1(run, arguments, words):
     code, out, errors = run(*arguments)
     assert (code, out) == (1, "")
     assert errors.startswith("error: ")
@@ -38,7 +45,19 @@ def test_known_error_is_one_line_and_exit_1(arguments, words):
     assert words in errors
 
 
-def test_port_in_use_is_named():
+def test_a_descriptor_that_is_no_socket_is_named():
+    """In a process of its own, whose descriptor 1 it may close."""
+    done = subprocess.run(
+        [sys.executable, "-m", "sitl", "--world", "farm", "--fd", "1", "--lockstep"],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert "fd:1" in done.stderr
+
+
+def test_port_in_use_is_named(run):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         code, _, errors = run("--world", "farm", "--link", f"tcpin:127.0.0.1:{port}")
