@@ -371,7 +371,7 @@ def test_the_command_writes_a_table_json_and_csv(native_program, tmp_path):
 def test_the_table_names_outcomes_and_signals(native_program, tmp_path):
     from mavfi_cli.cli.kernels import kernels
 
-    arguments = ["--program", str(native_program("counting")), "--args", "30", "--runs", "40"]
+    arguments = ["--program", str(native_program("counting")), "--args", "30", "--runs", "8"]
     result = CliRunner().invoke(kernels, [*arguments, "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     lines = result.stdout.splitlines()

@@ -24,7 +24,7 @@ def perform(changes, out):
     if world == "sleep":
         time.sleep(float(value))
     elif world == "orphan":  # a child in a session of its own, that outlives its parent
-        line = [sys.executable, "-c", "import time; time.sleep(600)"]
+        line = [sys.executable, "-c", "import signal; signal.pause()"]
         child = subprocess.Popen(line, start_new_session=True)
         (out.parent.parent / "orphan.pid").write_text(str(child.pid))
         os.kill(os.getpid(), signal.SIGSEGV)

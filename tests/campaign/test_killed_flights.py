@@ -2,11 +2,12 @@
 
 import os
 import signal
-import time
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from killing import VEHICLE, processes, results_of
+from process_ends import none_left
 
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator
@@ -62,10 +63,7 @@ def test_a_kill_costs_an_attempt_and_no_mission(
     assert killer.notes[0].endswith("begun again")
     assert attempts == [1, 1, 1, 2]
     assert results_of(tmp_path / "campaign") == undisturbed
-    deadline = time.monotonic() + 30.0
-    while processes(mark):
-        assert time.monotonic() < deadline, "a process is left"
-        time.sleep(0.05)
+    assert none_left(partial(processes, mark))
 
 
 def test_a_mission_whose_time_runs_out_leaves_no_vehicle(short_config, tmp_path, monkeypatch):

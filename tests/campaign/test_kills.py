@@ -15,6 +15,7 @@ from killing import (
     start_fake,
 )
 from plans import planned
+from process_ends import none_left
 
 from mavfi_cli.core.processes import GUARD, WORKER
 
@@ -40,10 +41,7 @@ def test_nothing_goes_on_when_the_runner_is_killed(tmp_path):
         time.sleep(0.05)
     assert kill_one(runner, mark, RUNNER)
     runner.wait()
-    deadline = time.monotonic() + 30.0
-    while processes(mark):
-        assert time.monotonic() < deadline, "processes are left of a killed runner"
-        time.sleep(0.05)
+    assert none_left(partial(processes, mark))
 
 
 def test_a_killed_guard_costs_an_attempt_and_no_mission(campaign, monkeypatch):

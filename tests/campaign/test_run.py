@@ -4,8 +4,6 @@ import contextlib
 import json
 import os
 import signal
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from plans import planned
 
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import Injected, ResultState
+from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import ATTEMPTS
 from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.campaign.workers import CampaignStopped
@@ -262,28 +261,27 @@ def test_only_one_process_runs_a_campaign(campaign):
         campaign.run(planned("fly"))
 
 
-def interrupt(times, *, when):
-    """SIGINT for this process, so often, as soon as `when` holds."""
+class Interrupting(Spectator):
+    """Presses Ctrl-C so often, each time that it hears of two missions that fly."""
 
-    def work():
-        for _ in range(times):
-            while not when():
-                time.sleep(0.01)
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.1)
+    def __init__(self, times):
+        self.lines = []
+        self._left = times
 
-    thread = threading.Thread(target=work)
-    thread.start()
-    return thread
+    def on_progress(self, progress):
+        if self._left and progress.running == 2:
+            self._left -= 1
+            signal.raise_signal(signal.SIGINT)
+
+    def on_note(self, text):
+        self.lines.append(text)
 
 
 def test_ctrl_c_once_lets_missions_finish(campaign):
-    notes = campaign.notes
+    campaign.notes = notes = Interrupting(1)
     missions = planned("sleep:1.5", "sleep:1.5", "fly")
-    thread = interrupt(1, when=lambda: notes.last is not None and notes.last.running == 2)
     with pytest.raises(Interrupted, match="run again to go on"):
         campaign.run(missions)
-    thread.join()
     assert notes.lines == ["finishing what flies; Ctrl-C once more ends it"]
     with Ledger(campaign.folder) as ledger:
         assert [result.number for result in ledger.results()] == [0, 1]
@@ -292,13 +290,9 @@ def test_ctrl_c_once_lets_missions_finish(campaign):
 
 
 def test_ctrl_c_twice_kills_them(campaign):
-    notes = campaign.notes
-    thread = interrupt(2, when=lambda: notes.last is not None and notes.last.running == 2)
-    begun = time.monotonic()
+    campaign.notes = Interrupting(2)
     with pytest.raises(Interrupted):
         campaign.run(planned("sleep:600", "sleep:600"))
-    assert time.monotonic() - begun < 60.0
-    thread.join()
     with Ledger(campaign.folder) as ledger:
         assert ledger.over() == 0
     assert not Path(campaign.folder / "work").exists()

@@ -22,7 +22,7 @@ def perform(task, folder):
     if "sleep_s" in task:
         time.sleep(task["sleep_s"])
     if "orphan" in task:  # a child in a session of its own, that outlives its parent
-        line = [sys.executable, "-c", "import time; time.sleep(600)"]
+        line = [sys.executable, "-c", "import signal; signal.pause()"]
         child = subprocess.Popen(line, start_new_session=True)
         (left / "orphan").write_text(str(child.pid))
     if "error" in task:

@@ -3,14 +3,12 @@
 import json
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
+from process_ends import LONG_S, gone
 
 from mavfi_cli.core.fork_server import PACKET, ForkServer, ForkServerFailed
-
-LONG_S = 60.0
 
 
 @pytest.fixture
@@ -30,14 +28,6 @@ def heard(channel):
         while packet := channel.recv(PACKET):
             said.append(json.loads(packet))
     return said
-
-
-def gone(pid):
-    deadline = time.monotonic() + LONG_S
-    while Path(f"/proc/{pid}").exists():
-        assert time.monotonic() < deadline, f"process {pid} is left"
-        time.sleep(0.01)
-    return True
 
 
 @pytest.mark.parametrize(

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from process_ends import LONG_S
 
 from mavfi_cli.mission.progress import Watcher
-
-LONG_S = 60.0
 
 
 def children(pid):
@@ -31,13 +29,6 @@ def vehicle_of(pid):
     """The `python -m sitl` that a mission has started."""
     (found,) = [child for child in children(pid) if b"sitl" in command_line(child)]
     return found
-
-
-def await_end(descriptor):
-    """Wait for the end of a process by its pidfd, no child of ours needed."""
-    poller = select.poll()
-    poller.register(descriptor, select.POLLIN)
-    assert poller.poll(LONG_S * 1e3), "the process did not end"
 
 
 class AtEvent(Watcher):
@@ -114,8 +105,3 @@ def flying(tmp_path):
             return started
 
         yield start
-
-
-@pytest.fixture(name="await_end")
-def await_end_fixture():
-    return await_end

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from process_ends import await_end
 
 from mavfi_cli.autonomy import collision
 from mavfi_cli.mission.record.run_folder import load_run
@@ -64,7 +65,7 @@ def test_ctrl_c_on_the_command_line_exits_with_130(flying):
     }
 
 
-def test_a_killed_mission_by_the_wall_clock_leaves_no_vehicle(flying, await_end):
+def test_a_killed_mission_by_the_wall_clock_leaves_no_vehicle(flying):
     mission = flying("--realtime")
     mission.await_line("waiting until ready")
     with mission.vehicle_descriptor() as vehicle:

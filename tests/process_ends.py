@@ -1,0 +1,37 @@
+"""Await the end of processes that are no children of ours."""
+
+import os
+import select
+
+LONG_S = 60.0
+
+
+def await_end(descriptor):
+    """Wait for the end of a process by its pidfd."""
+    poller = select.poll()
+    poller.register(descriptor, select.POLLIN)
+    assert poller.poll(LONG_S * 1e3), "the process did not end"
+
+
+def gone(pid):
+    """Whether a process is over, once it is; fails if it goes on."""
+    try:
+        descriptor = os.pidfd_open(int(pid))
+    except ProcessLookupError:
+        return True
+    try:
+        await_end(descriptor)
+    finally:
+        os.close(descriptor)
+    return True
+
+
+def none_left(find):
+    """Whether a function finds no process, once those that it finds are over; fails if one goes on.
+
+    Args:
+        find: gives lists of process ids by kind.
+    """
+    while found := find():
+        assert all(gone(pid) for pids in found.values() for pid in pids)
+    return True
