@@ -137,7 +137,7 @@ def test_a_file_that_a_faulty_run_does_not_write_is_no_benign_outcome(place):
     where = place(": > out", "file:out")
     golden = golden_run(where)
     assert golden.output == b""
-    where._renew_folder()
+    where.start().kill()  # in a new folder, before it writes
     assert where.judge(golden, Ended(exit_code=0, signal=None)).outcome is Outcome.SDC
 
 

@@ -1,5 +1,6 @@
 """Fixed worlds: the rule, the search, and that a campaign remembers what it has found."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -69,15 +70,16 @@ def test_all_missions_in_a_world_fly_the_first_candidate_that_fits(begun, campai
     )
 
 
-def test_a_campaign_that_was_begun_searches_no_more(begun, campaign, monkeypatch):
+def test_a_campaign_that_was_begun_searches_no_more(begun, campaign):
     found = begun(spec_of())
     text = (campaign.folder / "campaign.toml").read_text()
     assert parse_spec(text, Path("x.toml")).fixed_world == found[0]
-    monkeypatch.setattr("mavfi_cli.campaign.world_search._search", None)
+    shutil.rmtree(campaign.folder / SEARCH)
     assert begun(spec_of()) == found  # the same command
     assert begun(parse_spec(text, Path("x.toml"))) == found  # the folder, or its file elsewhere
     more, missions = begun(spec_of(SPEC.replace("= 2\n", "= 3\n")), append=True)
     assert (more, len(missions)) == (found[0], 18)
+    assert not (campaign.folder / SEARCH).exists()
 
 
 def test_an_interrupted_search_goes_on(begun, campaign):

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 from killing import VEHICLE, processes, results_of
-from process_ends import none_left
+from live_processes import none_left
 
 from mavfi_cli.campaign.missions import PlannedMission
 from mavfi_cli.campaign.progress import Spectator

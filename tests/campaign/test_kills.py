@@ -14,8 +14,8 @@ from killing import (
     results_of,
     start_fake,
 )
+from live_processes import none_left
 from plans import planned
-from process_ends import none_left
 
 from mavfi_cli.core.processes import GUARD, WORKER
 

@@ -6,9 +6,10 @@ import signal
 from pathlib import Path
 
 import pytest
-from process_ends import LONG_S, gone
+from live_processes import LONG_S, children, gone
 
 from mavfi_cli.core.fork_server import PACKET, ForkServer, ForkServerFailed
+from mavfi_cli.core.processes import SERVER
 
 
 @pytest.fixture
@@ -18,6 +19,10 @@ def server(monkeypatch):
     started = ForkServer("forked_task")
     yield started
     started.close()
+
+
+def name_of(pid):
+    return Path(f"/proc/{pid}/comm").read_text().strip()
 
 
 def heard(channel):
@@ -73,7 +78,7 @@ def test_workers_are_fresh_and_a_killed_server_is_started_again(server, tmp_path
         heard(server.start({}, tmp_path / name, LONG_S)) for name in ("one", "two")
     )
     assert one["pid"] != two["pid"]
-    server_pid = server._process.pid
+    (server_pid,) = (pid for pid in children(os.getpid()) if name_of(pid) == SERVER)
     os.kill(server_pid, signal.SIGKILL)
     os.waitid(os.P_PID, server_pid, os.WEXITED | os.WNOWAIT)
     assert heard(server.start({}, tmp_path / "three", LONG_S))[-1]["exit"] == 0

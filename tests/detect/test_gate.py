@@ -233,9 +233,9 @@ class Plain:
 @pytest.mark.parametrize("name", ["aad", "gad"])
 @pytest.mark.parametrize("accepted", [False, True])
 def test_one_compiled_call_judges_as_single_ones_do(name, accepted):
-    fused, plain = Gate(registry.find(name)), Gate(Plain(registry.find(name)))
-    assert fused._tick_judge is not None
-    assert plain._tick_judge is None
+    detector = registry.find(name)
+    assert detector.tick_judge is not None
+    fused, plain = Gate(detector), Gate(Plain(registry.find(name)))
     rng = np.random.default_rng(4)
     kinds = set()
     for number in range(60):

@@ -10,15 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from process_ends import LONG_S
+from live_processes import LONG_S, children
 
 from mavfi_cli.mission.progress import Watcher
-
-
-def children(pid):
-    """Process ids of the direct children."""
-    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(child) for child in listed.split()]
 
 
 def command_line(pid):

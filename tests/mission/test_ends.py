@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from process_ends import await_end
+from live_processes import await_end
 
 from mavfi_cli.autonomy import collision
 from mavfi_cli.mission.record.run_folder import load_run

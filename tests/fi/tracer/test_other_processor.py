@@ -21,8 +21,8 @@ def elsewhere(code):
 def test_missions_and_source_level_faults_need_no_tracer():
     done = elsewhere(
         "import mavfi_cli.mission.run, mavfi_cli.fi.tracer.sampling, mavfi_cli.attack.campaign\n"
-        "from mavfi_cli.mission.machine import _injection\n"
-        "print([check.verdict.value for check in _injection()])"
+        "from mavfi_cli.mission.machine import check_machine\n"
+        "print([c.verdict.value for c in check_machine() if c.name == 'Tracing'])"
     )
     assert (done.stdout.strip(), done.stderr) == ("['limited']", "")
 

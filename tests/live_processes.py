@@ -1,9 +1,16 @@
-"""Await the end of processes that are no children of ours."""
+"""Find processes, and await their end though they may be no children of ours."""
 
 import os
 import select
+from pathlib import Path
 
 LONG_S = 60.0
+
+
+def children(pid):
+    """Process ids of the direct children."""
+    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(child) for child in listed.split()]
 
 
 def await_end(descriptor):
