@@ -15,6 +15,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from missions import POSTS, SHORT
 
 from mavfi_cli import cli
 from mavfi_cli.link.codec import Codec
@@ -26,14 +27,11 @@ from mavfi_cli.spec.mission import MissionConfig
 for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
     sys.path.insert(0, str(Path(__file__).parent / _folder))
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
-SHORT = MissionConfig(
-    world="farm", seed=5, stack="hardened", start=(2.0, 2.0, 0.0), goal=(10.0, 6.0, 5.0)
-)
 
 
 @pytest.fixture(scope="session")
 def short_config():
-    """A mission of some 20 simulated seconds, take-off included; less than a second of work."""
+    """The short mission."""
     return SHORT
 
 
@@ -59,11 +57,7 @@ def troubled_flight(tmp_path_factory):
     """Run folder of a flight that had to replan: boxes stand in the straight way."""
     folder = tmp_path_factory.mktemp("troubled")
     world = folder / "posts.toml"
-    world.write_text(
-        'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
-        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
-        "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
-    )
+    world.write_text(POSTS)
     return fly_mission(
         MissionConfig(world=str(world), seed=2, stack="hardened"), folder / "runs", Watcher()
     )

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from missions import POSTS
 from native_programs import native_program, start  # noqa: F401
 
 from mavfi_cli.attack.campaign import run_campaign
@@ -33,11 +34,7 @@ def kernel_inputs(tmp_path_factory) -> Path:
     """A file of kernel inputs, from a flight round a row of boxes."""
     folder = tmp_path_factory.mktemp("inputs")
     world = folder / "posts.toml"
-    world.write_text(
-        'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
-        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
-        "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
-    )
+    world.write_text(POSTS)
     path = folder / "inputs.pickle"
     save_inputs(path, record_inputs(MissionConfig(world=str(world), seed=2, stack="hardened")))
     return path

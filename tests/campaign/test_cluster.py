@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from killing import results_of
+from missions import SHORT_WAY
 from plans import planned
 
 from mavfi_cli.campaign.cluster import Cluster, ClusterError
@@ -160,8 +161,7 @@ def test_what_is_no_address_is_refused_at_once(address):
 def test_real_flights_are_the_same_on_a_cluster(cluster, mavfi, tmp_path):
     spec = tmp_path / "short.toml"
     spec.write_text(
-        "[mission]\nstart = [2.0, 2.0, 0.0]\ngoal = [10.0, 6.0, 5.0]\n"
-        "[factors]\nworld = 'farm'\n[[setting]]\n[[setting]]\nstage = 'control'\n"
+        f"{SHORT_WAY}[factors]\nworld = 'farm'\n[[setting]]\n[[setting]]\nstage = 'control'\n"
     )
     cluster.worker()
     for out, options in (("local", ()), ("far", ("--cluster", cluster.address))):

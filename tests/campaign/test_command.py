@@ -11,18 +11,16 @@ import xml.etree.ElementTree as ET
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
+from missions import SHORT_WAY
 
 from mavfi_cli.campaign.ledger import LEDGER
 from mavfi_cli.cli import campaign as command
 
-SPEC = """
+SPEC = f"""
 name = "short"
 repetitions = 2
 keep = "all"
-[mission]
-start = [2.0, 2.0, 0.0]
-goal = [10.0, 6.0, 5.0]
-[factors]
+{SHORT_WAY}[factors]
 world = "farm"
 [[setting]]
 name = "golden"

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 from fake_autopilot import FakePX4
+from missions import SHORT_LINE
 
 from mavfi_cli.link import session
 from mavfi_cli.mission import flight
@@ -190,12 +191,9 @@ def full_disk():
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-SHORT = ("fly", "--world", "farm", "--seed=5", "--start=2,2,0", "--goal=10,6,5", "--quiet")
-
-
 @pytest.mark.usefixtures("full_disk")
 def test_a_full_disk_in_flight(command_line):
-    code, out, err = command_line(*SHORT)
+    code, out, err = command_line(*SHORT_LINE, "--quiet")
     assert (code, out) == (1, "")
     (line,) = err.splitlines()
     assert line.startswith("error: runs/farm-5-001/flight.tlog: cannot write: File too large")
@@ -204,7 +202,7 @@ def test_a_full_disk_in_flight(command_line):
 
 def test_a_folder_that_cannot_be_made(refused, tmp_path):
     (tmp_path / "file").write_text("")
-    line = refused(*SHORT[1:], "--out", "file/runs")
+    line = refused(*SHORT_LINE[1:], "--quiet", "--out", "file/runs")
     assert line.startswith("file/runs: ")
 
 

@@ -3,11 +3,10 @@
 import json
 
 import pytest
+from missions import RECORD, SHORT_LINE
 
 from mavfi_cli.mission import run
 from mavfi_cli.mission.record.run_folder import load_run
-
-SHORT = ("fly", "--world", "farm", "--seed=5", "--start=2,2,0", "--goal=10,6,5")
 
 
 @pytest.fixture
@@ -18,7 +17,7 @@ def compiled(monkeypatch):
 
 def test_the_first_flight_on_a_machine_says_why_it_waits(command_line, monkeypatch):
     monkeypatch.setattr(run, "is_compiled", lambda: False)
-    short = (*SHORT, "--no-picture", "--time-limit=1")
+    short = (*SHORT_LINE, "--no-picture", "--time-limit=1")
     _, _, err = command_line(*short)
     assert err.splitlines()[:2] == [run.COMPILING, "Flying solo in farm, seed 5"]
     assert command_line(*short, "--quiet")[2] == ""
@@ -26,7 +25,7 @@ def test_the_first_flight_on_a_machine_says_why_it_waits(command_line, monkeypat
 
 @pytest.mark.usefixtures("compiled")
 def test_summary_on_stdout_progress_on_stderr_record_in_the_folder(command_line, tmp_path):
-    code, out, err = command_line(*SHORT)
+    code, out, err = command_line(*SHORT_LINE)
     assert code == 0
     assert out.startswith("SUCCESS: reached the goal\n")
     assert "Run folder  runs/farm-5-001  (see flight.svg)" in out
@@ -34,25 +33,18 @@ def test_summary_on_stdout_progress_on_stderr_record_in_the_folder(command_line,
     assert "offboard" in err
     assert "\x1b" not in out + err
     names = {path.name for path in (tmp_path / "runs/farm-5-001").iterdir()}
-    assert names == {
-        "result.json",
-        "trace.parquet",
-        "plans.parquet",
-        "kernels.parquet",
-        "flight.tlog",
-        "flight.svg",
-    }
+    assert names == RECORD | {"flight.svg"}
 
 
 def test_json_is_the_result_and_nothing_else(command_line, tmp_path):
-    code, out, err = command_line(*SHORT, "--json", "--quiet", "--no-picture", "--out", "here")
+    code, out, err = command_line(*SHORT_LINE, "--json", "--quiet", "--no-picture", "--out", "here")
     assert (code, err) == (0, "")
     assert json.loads(out) == load_run(tmp_path / "here/farm-5-001").result
     assert not (tmp_path / "here/farm-5-001/flight.svg").exists()
 
 
 def test_expect(command_line):
-    short = (*SHORT, "--quiet", "--no-picture", "--time-limit=1")
+    short = (*SHORT_LINE, "--quiet", "--no-picture", "--time-limit=1")
     code, _, err = command_line(*short, "--expect", "timeout")
     assert (code, err) == (0, "")
     code, out, err = command_line(*short, "--expect", "success")
@@ -65,7 +57,7 @@ def test_expect(command_line):
 @pytest.mark.parametrize("planner", ["rrt", "rrtconnect"])
 def test_options_arrive_in_the_mission(command_line, planner):
     _, out, _ = command_line(
-        *SHORT, "--json", "--quiet", "--no-picture", "--time-limit=1", "--planner", planner,
+        *SHORT_LINE, "--json", "--quiet", "--no-picture", "--time-limit=1", "--planner", planner,
         "--vehicle=spark", "--v-max=2", "--land",
     )  # fmt: skip
     config = json.loads(out)["config"]

@@ -10,6 +10,7 @@ import io
 import json
 
 import pytest
+from missions import SHORT_WAY
 
 # Fields of reports that depend on the host, on the clock or on the code's own files; a struck
 # register may hold an address, and where the stack begins depends on the length of paths. A
@@ -20,14 +21,11 @@ _PASSING = {
     *("sdc_relative", "sources", "struck_after_hex", "struck_before_hex", "timeline"),
     *("versions", "wall_s"),
 }
-CAMPAIGN = """
+CAMPAIGN = f"""
 name = "hashed"
 repetitions = 1
 keep = "none"
-[mission]
-start = [2.0, 2.0, 0.0]
-goal = [10.0, 6.0, 5.0]
-world = "farm"
+{SHORT_WAY}world = "farm"
 [factors]
 stack = ["mavbench", "hardened"]
 [[setting]]

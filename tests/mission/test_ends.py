@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from live_processes import await_end
+from missions import RECORD
 
 from mavfi_cli.autonomy import collision
 from mavfi_cli.mission.record.run_folder import load_run
@@ -54,15 +55,7 @@ def test_ctrl_c_on_the_command_line_exits_with_130(flying):
     assert code == 130
     assert out.startswith("INTERRUPTED\n")
     assert load_run(folder).result["outcome"] == "interrupted"
-    names = {path.name for path in folder.iterdir()}
-    assert names == {
-        "result.json",
-        "trace.parquet",
-        "plans.parquet",
-        "kernels.parquet",
-        "flight.tlog",
-        "flight.svg",
-    }
+    assert {path.name for path in folder.iterdir()} == RECORD | {"flight.svg"}
 
 
 def test_a_killed_mission_by_the_wall_clock_leaves_no_vehicle(flying):

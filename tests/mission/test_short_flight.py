@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from missions import RECORD
 
 from mavfi_cli.core.states import STATES
 from mavfi_cli.mission.record.plan_file import read_plans
@@ -25,14 +26,7 @@ def truth(run):
 
 
 def test_the_folder_is_complete_and_nothing_else_lies_in_it(short_flight):
-    names = {path.name for path in short_flight.path.iterdir()}
-    assert names == {
-        "result.json",
-        "trace.parquet",
-        "plans.parquet",
-        "kernels.parquet",
-        "flight.tlog",
-    }
+    assert {path.name for path in short_flight.path.iterdir()} == RECORD
 
 
 def test_it_succeeds_and_says_so_once(run):

@@ -7,6 +7,7 @@ import signal
 import xml.etree.ElementTree as ET
 
 import pytest
+from missions import POSTS
 
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.progress import Spectator
@@ -16,11 +17,7 @@ from mavfi_cli.core.files import plain
 from mavfi_cli.studies.compare import compare
 from mavfi_cli.studies.compare_plan import ComparePlan
 
-WORLD = (
-    'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
-    "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [16.0, 0.0, 5.0]\n"
-    "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
-)
+WORLD = POSTS.replace("goal_enu_m = [20.0", "goal_enu_m = [16.0")
 FEW = ("--platform", "x86", "--platform", "tx2", "--inject", "waypoint_position", "--detector",
        "none,gad", "--missions", "2", "--first-seed", "2", "--out", "out")  # fmt: skip
 SETTINGS = ("golden", "none", "gad")
