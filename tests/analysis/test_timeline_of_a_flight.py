@@ -60,7 +60,6 @@ def test_the_typical_reaction_is_near_the_median_and_one_that_did_something():
     assert typical([]) is None
 
 
-@pytest.mark.slow
 def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_flight):
     run = load_run(troubled_flight.path)
     told = timeline_of(run)
@@ -85,7 +84,6 @@ def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_f
     assert again[0]["shown_s"] == again[1]["shown_s"]
 
 
-@pytest.mark.slow
 def test_latencies_of_the_table_are_those_that_the_nodes_were_busy_for(troubled_flight):
     run = load_run(troubled_flight.path)
     table = read_timetable(run.folder.kernels)

@@ -4,6 +4,7 @@ import json
 import os
 
 import pytest
+from missions import POSTS
 
 from mavfi_cli.attack.kernels.scope import kernel_scope
 from mavfi_cli.autonomy import warm_up
@@ -70,11 +71,7 @@ def endless(world_to_search):
 def world_to_search(tmp_path):
     """A world in whose middle a box stands; the order with which the planner first searches."""
     world = tmp_path / "box.toml"
-    world.write_text(
-        'name = "box"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
-        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
-        "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
-    )
+    world.write_text(POSTS)
     config = MissionConfig(
         world=str(world), seed=2, planner="rrtconnect", node_watchdog_s=1.0, time_limit_s=12.0,
         instruction=InstructionConfig(target="planner"),
@@ -82,6 +79,7 @@ def world_to_search(tmp_path):
     return config, 2
 
 
+@pytest.mark.slow
 def test_a_flip_that_hangs_a_node_is_ended_by_the_watchdog(
     endless, world_to_search, monkeypatch, tmp_path
 ):

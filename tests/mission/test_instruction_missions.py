@@ -199,6 +199,7 @@ def without_perf(tmp_path):
     return run
 
 
+@pytest.mark.slow
 @traced
 def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, tmp_path):
     told = json.loads(without_perf("doctor", "--json").stdout)

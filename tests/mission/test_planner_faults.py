@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from missions import POSTS
 
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.fi.tracer import record as records
@@ -73,11 +74,7 @@ def searching(tmp_path_factory):
     """Setup of a planner node before whose goal a box stands, and its orders of the flight."""
     folder = tmp_path_factory.mktemp("box")
     world = folder / "box.toml"
-    world.write_text(
-        'name = "box"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
-        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
-        "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
-    )
+    world.write_text(POSTS)
     config = MissionConfig(world=str(world), seed=2, planner="rrtconnect")
     attacked = replace(config, instruction=InstructionConfig(target="planner", seed=1))
     fly_mission(attacked, folder, Watcher())
@@ -86,6 +83,7 @@ def searching(tmp_path_factory):
     return Setup(config=config, briefing=briefing, node="planner"), orders["planner"][:2]
 
 
+@pytest.mark.slow
 @traced
 def test_the_instructions_of_a_search_stay_in_scope_and_windows_are_parts_of_the_request(searching):
     place = Rehearsal(*searching)

@@ -233,7 +233,6 @@ def guarded(fly_short, limit):
     return fly
 
 
-@pytest.mark.slow
 def test_a_golden_flight_is_the_same_with_a_silent_gate(guarded, short_flight):
     golden, run = load_run(short_flight.path), guarded()
     assert run.result["detection"]["alarm_count"] == 0
@@ -242,7 +241,6 @@ def test_a_golden_flight_is_the_same_with_a_silent_gate(guarded, short_flight):
     assert same_file(run.folder.tlog, golden.folder.tlog)
 
 
-@pytest.mark.slow
 def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
     guarded, short_flight, tmp_path
 ):
@@ -263,7 +261,6 @@ def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
     assert not differing_results(again.result, run.result)
 
 
-@pytest.mark.slow
 def test_a_wild_waypoint_far_ahead_is_dropped_before_the_collision_check_sees_it(guarded):
     fault = FaultConfig(target="waypoint_x", at="time=2", exact_bits=(61,), seed=5)
     run = guarded(fault=fault)
@@ -276,7 +273,6 @@ def test_a_wild_waypoint_far_ahead_is_dropped_before_the_collision_check_sees_it
     assert run.result["outcome"] == "success"
 
 
-@pytest.mark.slow
 def test_a_stage_that_is_not_protected_is_not_watched(fly_short, limit):
     config = replace(limit, protect=("perception", "planning"))
     run = load_run(fly_short(detector=config, fault=FLIP).path)
@@ -284,7 +280,6 @@ def test_a_stage_that_is_not_protected_is_not_watched(fly_short, limit):
     assert run.result["fault"]["activation"]["activation"] == "read"
 
 
-@pytest.mark.slow
 def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
     """The threshold's highest exponent bit: 8 becomes a number beyond all deltas."""
     fault = FaultConfig(target="detector.threshold", at="time=1", exact_bits=(62,))
@@ -297,7 +292,6 @@ def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
     assert change["state"] == "threshold"
 
 
-@pytest.mark.slow
 def test_a_flip_in_a_number_of_a_plan_is_seen_by_the_extended_watch_alone(
     fly_short, short_flight, tmp_path
 ):
@@ -320,7 +314,6 @@ def test_a_flip_in_a_number_of_a_plan_is_seen_by_the_extended_watch_alone(
     assert same_file(again.folder.trace, runs["extended"].folder.trace)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gad", "aad"])
 def test_a_flip_in_a_number_of_the_flown_plan_is_undone_before_the_check_reads_it(fly_short, name):
     fault = FaultConfig(target="plan_future_collision_seq", at="phase=flying", exact_bits=(14,))
@@ -334,7 +327,6 @@ def test_a_flip_in_a_number_of_the_flown_plan_is_undone_before_the_check_reads_i
     assert result["outcome"] == "success"
 
 
-@pytest.mark.slow
 def test_a_golden_flight_is_the_same_with_the_extended_watch(fly_short, short_flight):
     golden, run = load_run(short_flight.path), load_run(fly_short(detector=EXTENDED).path)
     assert run.result["detection"]["alarm_count"] == 0
@@ -354,7 +346,6 @@ def test_a_flight_with_a_model_of_another_stack_ends_before_it_begins(fly_short,
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.slow
 def test_a_model_of_another_stack_flies_where_that_is_asked_for(fly_short):
     detector = DetectorConfig(name="gad", any_stack=True)
     run = load_run(fly_short(stack="mavbench-release", detector=detector).path)
