@@ -9,6 +9,7 @@ often as a flight calls it (perception 3.5 times a simulated second, control 50 
 from __future__ import annotations
 
 import argparse
+import functools
 import math
 import time
 from collections import defaultdict
@@ -18,7 +19,7 @@ import numpy as np
 from mavfi_cli import autonomy
 from mavfi_cli.autonomy import collision, planners, planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
-from mavfi_cli.autonomy.smoothing import Departure, Sequence
+from mavfi_cli.autonomy.orders import PlanRequest
 from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.frames import quaternion_from_euler
 from mavfi_cli.core.types import DepthFrame, Trajectory
@@ -122,19 +123,23 @@ class Flight:
             row = reference_waypoint(self._trajectory, self._flown_s(now_s) + LEAD_S)
             start, velocity = row[0:3], row[4:7]
         self._plans += 1
-        departure = Departure(stamp_s=now_s + LEAD_S, velocity_enu_mps=velocity, yaw_rad=self._yaw)
-        inputs = planning.StageInputs(
-            snapshot=snapshot,
+        request = PlanRequest(
+            stamp_s=now_s + LEAD_S,
             position_enu_m=start,
-            departure=departure,
+            velocity_enu_mps=velocity,
+            yaw_rad=self._yaw,
             goal_enu_m=self._world.goal_enu_m,
-            bounds_enu_m=self._bounds,
-            sequence=Sequence(trajectory_seq=self._plans),
-            seed=1000 * self._seed + self._plans,
+            attempt=self._plans,
+            trajectory_seq=self._plans,
         )
-        self._next = self._watch.call(
-            "planner + smoothing", planning.plan, self._planner, inputs, planning.StageParams()
-        ).trajectory
+        plan = functools.partial(
+            planning.plan,
+            bounds_enu_m=self._bounds,
+            seed=1000 * self._seed + self._plans,
+            params=planning.StageParams(),
+        )
+        found = self._watch.call("planner + smoothing", plan, self._planner, request, snapshot)
+        self._next = found if isinstance(found, Trajectory) else None
 
     def _track(self, now_s: float) -> None:
         """One control tick; then the vehicle is where it should be."""

@@ -30,11 +30,13 @@ class ActivePlan:
         rate: Trajectory seconds per second, 0..1.
         rate_change_per_s: Time derivative of the rate.
         pace: Factor on the clock's rate from the current command, 0..1.
+        checked: Trajectory that was last sent to the collision check.
     """
 
     def __init__(self, v_max_mps: float, brake_mps2: float) -> None:
         self._v_max_mps = v_max_mps
         self._brake_mps2 = brake_mps2
+        self.checked: Trajectory | None = None
         self.stand()
 
     def stand(self) -> None:
@@ -58,6 +60,13 @@ class ActivePlan:
         self.rate += change
         self.rate_change_per_s = change / step_s if step_s > 0.0 else 0.0
         self.time_s += 0.5 * (before + self.rate) * step_s * self.pace
+
+    def exchange(self, flown: Trajectory, changed: Trajectory) -> None:
+        """Replace a trajectory by a changed version, without a new collision check."""
+        if self.trajectory is flown:
+            self.trajectory = changed
+        if self.checked is flown:
+            self.checked = changed
 
     def skip_waypoint(self) -> None:
         """Skip to the next waypoint, or to the end if there is none."""

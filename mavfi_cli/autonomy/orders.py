@@ -1,11 +1,11 @@
-"""Messages between the mission logic and the planning and control nodes."""
+"""Messages between the mission logic and the planner."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
 
-from mavfi_cli.core.types import FloatArray, Trajectory
+from mavfi_cli.core.types import FloatArray
 
 
 class PilotMode(Enum):
@@ -22,17 +22,26 @@ class PilotMode(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlanRequest:
-    """Request for a trajectory."""
+class Departure:
+    """Start of a trajectory: state of motion and sequence numbers."""
 
-    stamp_s: float  # start of the trajectory
-    position_enu_m: FloatArray  # (3,)
+    stamp_s: float
     velocity_enu_mps: FloatArray  # (3,)
     yaw_rad: float
+    trajectory_seq: int = 0
+    future_collision_seq: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanRequest(Departure):
+    """Request for a trajectory from a position to the goal.
+
+    `trajectory_seq` is the newest known number; the planner's node takes the next.
+    """
+
+    position_enu_m: FloatArray  # (3,)
     goal_enu_m: FloatArray  # (3,)
     attempt: int  # number of the plan in the mission; seeds the planner
-    trajectory_seq: int  # newest known number; the plan takes the next
-    future_collision_seq: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,17 +50,3 @@ class PlanFailure:
 
     stamp_s: float  # requested start of the trajectory
     reason: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Directive:
-    """Input of the control stage in one tick."""
-
-    mode: PilotMode
-    trajectory: Trajectory | None  # None: hold `hold_enu_m`
-    time_s: float  # point on the trajectory, from its first waypoint
-    rate: float  # trajectory seconds per second, 0..1
-    rate_change_per_s: float
-    hold_enu_m: FloatArray  # (3,)
-    hold_yaw_rad: float
-    plan: PlanRequest | None = None

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mavfi_cli.autonomy.active_plan import ActivePlan
-from mavfi_cli.autonomy.orders import Directive, PilotMode, PlanFailure, PlanRequest
+from mavfi_cli.autonomy.orders import PilotMode, PlanFailure, PlanRequest
+from mavfi_cli.autonomy.tracking import TrackingInputs
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
@@ -73,6 +74,15 @@ class Counters:
     stops: int = 0
     slowdowns: int = 0
     look_rounds: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Directive:
+    """Decision of one tick: the inputs of control, and a request if a plan is needed."""
+
+    mode: PilotMode
+    tracking: TrackingInputs
+    plan: PlanRequest | None
 
 
 class Pilot:
@@ -279,12 +289,17 @@ class Pilot:
         assert self._hold is not None
         return Directive(
             mode=self.mode,
-            trajectory=self.active.trajectory,
-            time_s=self.active.time_s,
-            rate=self.active.rate,
-            rate_change_per_s=self.active.rate_change_per_s,
-            hold_enu_m=self._hold,
-            hold_yaw_rad=self._hold_yaw + self._look_round_angle(stamp_s),
+            tracking=TrackingInputs(
+                stamp_s=stamp_s,
+                position_enu_m=state.position_enu_m,
+                velocity_enu_mps=state.velocity_enu_mps,
+                trajectory=self.active.trajectory,
+                time_s=self.active.time_s,
+                rate=self.active.rate,
+                rate_change_per_s=self.active.rate_change_per_s,
+                hold_enu_m=self._hold,
+                hold_yaw_rad=self._hold_yaw + self._look_round_angle(stamp_s),
+            ),
             plan=plan,
         )
 

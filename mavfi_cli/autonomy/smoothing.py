@@ -27,6 +27,7 @@ from mavfi_cli.autonomy import corners
 from mavfi_cli.autonomy.corners import Motion, MotionLimits
 from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.heading import headings, turn_time_s
+from mavfi_cli.autonomy.orders import Departure
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 NEGLIGIBLE_MPS = 0.1  # lower speeds count as rest
@@ -67,23 +68,6 @@ class SmoothingParams:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Departure:
-    """State of motion at the start of a trajectory."""
-
-    stamp_s: float
-    velocity_enu_mps: FloatArray  # (3,)
-    yaw_rad: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sequence:
-    """Sequence numbers of a trajectory."""
-
-    trajectory_seq: int = 0
-    future_collision_seq: int = 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Smoothed:
     """A trajectory, and a flag that is True if all of it lies in free space."""
 
@@ -95,7 +79,6 @@ def smooth(
     path_enu_m: FloatArray,
     grid: ObstacleGrid | None,
     departure: Departure,
-    sequence: Sequence,
     params: SmoothingParams,
 ) -> Smoothed:
     """Compute the trajectory along a free path (n, 3) from its first to its last point.
@@ -116,23 +99,7 @@ def smooth(
             break
         caps[blamed] = np.where(q[blamed] > SLOWEST_SQUARED, 0.25 * q[blamed], 0.0)
     free = free and bool(_piecewise_free(spline, grid).all())
-    return Smoothed(trajectory=_waypoints(spline, departure, sequence, params), free=free)
-
-
-def brake(
-    position_enu_m: FloatArray, departure: Departure, sequence: Sequence, params: SmoothingParams
-) -> Trajectory:
-    """Compute the shortest straight stop that the planned acceleration allows, then hold.
-
-    The yaw stays constant.
-    """
-    velocity = _cut(departure.velocity_enu_mps, params.v_max_mps)
-    vertices = _run_out(position_enu_m, velocity, params)
-    flight = _Flight(position_enu_m, velocity, departure.yaw_rad, vertices, params)
-    spline = flight.fly(flight.corner_caps())[2]
-    trajectory = _waypoints(spline, departure, sequence, params)
-    trajectory.waypoints[:, 3] = departure.yaw_rad
-    return trajectory
+    return Smoothed(trajectory=_waypoints(spline, departure, params), free=free)
 
 
 class _Flight:
@@ -262,9 +229,7 @@ def _piecewise_free(spline: FloatArray, grid: ObstacleGrid | None) -> NDArray[np
     return np.array([grid.path_free(piece) for piece in points], np.bool_)
 
 
-def _waypoints(
-    spline: FloatArray, departure: Departure, sequence: Sequence, params: SmoothingParams
-) -> Trajectory:
+def _waypoints(spline: FloatArray, departure: Departure, params: SmoothingParams) -> Trajectory:
     """Convert control points (m, 3) to the trajectory of the spline's m - 1 knots."""
     period = params.sample_period_s
     velocities = np.diff(spline, axis=0) / period
@@ -281,6 +246,6 @@ def _waypoints(
         stamp_s=departure.stamp_s,
         waypoints=waypoints,
         durations_s=np.full(len(waypoints), period),
-        trajectory_seq=sequence.trajectory_seq,
-        future_collision_seq=sequence.future_collision_seq,
+        trajectory_seq=departure.trajectory_seq,
+        future_collision_seq=departure.future_collision_seq,
     )

@@ -8,8 +8,8 @@ import numpy as np
 
 from mavfi_cli.autonomy import collision, planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
+from mavfi_cli.autonomy.orders import PlanRequest
 from mavfi_cli.autonomy.planners import find, names
-from mavfi_cli.autonomy.smoothing import Departure, Sequence
 from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.types import DepthFrame, Trajectory
 
@@ -23,16 +23,19 @@ def run_every_kernel() -> None:
     trajectory: Trajectory | None = None
     for name in ("rrtstar", "rrt", "rrtconnect"):
         assert name in names()
-        inputs = planning.StageInputs(
-            snapshot=snapshot,
+        request = PlanRequest(
+            stamp_s=0.0,
             position_enu_m=start,
-            departure=Departure(stamp_s=0.0, velocity_enu_mps=np.array([0.0, 1.0, 0.0]), yaw_rad=0),
+            velocity_enu_mps=np.array([0.0, 1.0, 0.0]),
+            yaw_rad=0,
             goal_enu_m=goal,
-            bounds_enu_m=_BOUNDS,
-            sequence=Sequence(),
-            seed=1,
+            attempt=1,
         )
-        trajectory = planning.plan(find(name), inputs, planning.StageParams()).trajectory
+        params = planning.StageParams()
+        found = planning.plan(
+            find(name), request, snapshot, bounds_enu_m=_BOUNDS, seed=1, params=params
+        )
+        trajectory = found if isinstance(found, Trajectory) else None
     _check_and_track(snapshot, trajectory)
 
 

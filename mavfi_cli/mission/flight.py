@@ -8,6 +8,7 @@ process of its own simulates the next tick while the heavy kernels run.
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -27,15 +28,10 @@ from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission.briefing import Briefing, require_flyable
-from mavfi_cli.mission.companion.companion import Companion
-from mavfi_cli.mission.companion.protection import gate_of, protection_of
+from mavfi_cli.mission.companion.injection import NoInjection, injection_of
+from mavfi_cli.mission.companion.pipeline import Companion
+from mavfi_cli.mission.companion.protection import protection_of
 from mavfi_cli.mission.flight_logger import FlightLogger
-from mavfi_cli.mission.injection import (
-    DetectorInjection,
-    NoInjection,
-    ProcessInjection,
-    SourceInjection,
-)
 from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
@@ -121,14 +117,11 @@ class Flight:
         """Set goal and camera mounting, and create the companion."""
         require_flyable(briefing, self._config.takeoff_height_m, self._stack.goal_tolerance_m)
         self._briefing = briefing
-        fault, shortest_s = self._config.fault, self._shortest_flight_s(briefing)
         protection = protection_of(self._config.detector, self._config.stack, self.wall)
-        if fault is not None and fault.killed_node is not None:
-            self.injection = ProcessInjection(fault, shortest_s)
-        elif fault is not None and fault.attacks_detector:
-            self.injection = DetectorInjection(fault, shortest_s, gate_of(protection))
-        elif fault is not None:
-            self.injection = SourceInjection(fault, shortest_s)
+        if self._config.instruction is None:
+            self.injection = injection_of(
+                self._config.fault, self._shortest_flight_s(briefing), protection
+            )
         self.companion = Companion(
             self._config,
             self._stack,
@@ -144,7 +137,8 @@ class Flight:
         """Attach a recorder of the nodes' inputs. Call it after `brief`."""
         assert self.companion is not None
         recorder.briefing = self._briefing
-        self.companion.executor.on_start = recorder.on_start
+        for name, node in self.companion.executor.nodes.items():
+            node.on_start = functools.partial(recorder.on_start, name)
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """Return a lower bound of the flight time.
@@ -321,7 +315,7 @@ class Flight:
             return
         if self.takeover_s > stamp_s:
             self.takeover_s = stamp_s
-        command = companion.tick(stamp_s, state)
+        command = companion.tick(state)
         if command is not None:
             self._session.set_target(
                 command.velocity_enu_mps.tolist(),

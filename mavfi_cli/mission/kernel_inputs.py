@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ from mavfi_cli.attack.kernels.inputs import (
     save_inputs,
 )
 from mavfi_cli.autonomy import tracking
-from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.core.errors import ConfigError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, derive
@@ -49,9 +49,7 @@ def _middle(name: str, config: MissionConfig, recorder: Recorder) -> KernelInput
     if min(len(frames), len(clouds), len(ticks)) < 4:
         raise TargetError(name, "is too short to record kernels")
     cloud = len(clouds) // 2
-    checks = [
-        order for order in recorder.orders["collision_check"] if order[0].trajectory is not None
-    ]
+    checks = recorder.orders.get("collision_check")
     if not checks:
         raise TargetError(name, "never checked a trajectory")
     check, stamp_s = checks[len(checks) // 2]
@@ -61,12 +59,7 @@ def _middle(name: str, config: MissionConfig, recorder: Recorder) -> KernelInput
         frame=frames[len(frames) // 2],
         mapped=tuple(clouds[:cloud]),
         cloud=clouds[cloud],
-        check=CollisionInputs(
-            stamp_s=stamp_s,
-            snapshot=check.snapshot,
-            trajectory=check.trajectory,
-            time_s=check.time_s,
-        ),
+        check=replace(check, stamp_s=stamp_s, front_enu_m=None),
         task=_hard_task(name, config, recorder),
         tracking_state=state,
         tracking=inputs,

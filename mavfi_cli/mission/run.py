@@ -26,16 +26,15 @@ from mavfi_cli.autonomy import is_compiled, planners, warm_up
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission import briefing
-from mavfi_cli.mission.companion.response import response_times
+from mavfi_cli.mission.companion.injection import NoInjection
 from mavfi_cli.mission.flight import Flight
-from mavfi_cli.mission.injection import NoInjection
 from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.plan_file import write_plans
 from mavfi_cli.mission.record.run_folder import CRASH, RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.record.statistics import mission_statistics, plan_lines
-from mavfi_cli.mission.record.timetable import timetable_of, write_timetable
+from mavfi_cli.mission.record.timetable import response_times, timetable_of, write_timetable
 from mavfi_cli.mission.record.trace import write_trace
 from mavfi_cli.mission.vehicle import OtherEnd, StartVehicle, other_end, start_vehicle
 from mavfi_cli.spec.mission import MissionConfig, stack_of

@@ -64,10 +64,10 @@ class Driver:
     def vehicle(self):
         if self.last is None:
             return state()
-        if self.last.trajectory is None:
-            return state(*self.last.hold_enu_m)
-        waypoints = self.last.trajectory.waypoints
-        done_m = self.last.time_s * waypoints[0, 4]
+        if self.last.tracking.trajectory is None:
+            return state(*self.last.tracking.hold_enu_m)
+        waypoints = self.last.tracking.trajectory.waypoints
+        done_m = self.last.tracking.time_s * waypoints[0, 4]
         return state(waypoints[0, 0] + done_m, waypoints[0, 1], waypoints[0, 2])
 
     def fly(self, speed=2.0, ticks=50, **changes):
@@ -100,8 +100,8 @@ def driver():
 def test_it_hovers_where_it_is_and_asks_for_a_plan_once(driver):
     directive = driver.tick(10, at=state(3.0, 4.0, 5.0))
     assert directive.mode is PilotMode.WAITING
-    assert directive.trajectory is None
-    np.testing.assert_array_equal(directive.hold_enu_m, [3.0, 4.0, 5.0])
+    assert directive.tracking.trajectory is None
+    np.testing.assert_array_equal(directive.tracking.hold_enu_m, [3.0, 4.0, 5.0])
     (request,) = driver.requests
     assert request.stamp_s == 1.02
     np.testing.assert_array_equal(request.position_enu_m, [3.0, 4.0, 5.0])
@@ -116,16 +116,16 @@ def test_a_plan_from_a_hover_may_be_late_and_begins_at_its_beginning(driver):
     driver.tick(500)
     driver.pilot.on_plan(plan)
     directive = driver.tick()
-    assert directive.trajectory is plan
+    assert directive.tracking.trajectory is plan
     assert directive.mode is PilotMode.FLYING
-    assert directive.rate == 1.0
-    assert 0.0 <= directive.time_s <= TICK_S
+    assert directive.tracking.rate == 1.0
+    assert 0.0 <= directive.tracking.time_s <= TICK_S
 
 
 def test_the_clock_of_the_trajectory_runs_with_time(driver):
     driver.fly(ticks=50)
-    before = driver.last.time_s
-    assert driver.tick(50).time_s == pytest.approx(before + 1.0)
+    before = driver.last.tracking.time_s
+    assert driver.tick(50).tracking.time_s == pytest.approx(before + 1.0)
 
 
 def test_a_trajectory_that_ends_short_of_the_goal_asks_for_the_next(driver):
@@ -133,7 +133,7 @@ def test_a_trajectory_that_ends_short_of_the_goal_asks_for_the_next(driver):
     driver.until(lambda d: d.mode is PilotMode.WAITING)
     assert driver.now_s == pytest.approx(1.02 + plan.duration_s, abs=0.05)
     assert len(driver.requests) == 2
-    assert driver.last.hold_enu_m[0] == pytest.approx(4.0)  # the end: 3 m + 0.5 s at 2 m/s
+    assert driver.last.tracking.hold_enu_m[0] == pytest.approx(4.0)  # the end: 3 m + 0.5 s at 2 m/s
 
 
 def test_arrival_within_the_tolerance_ends_everything(driver):
@@ -145,8 +145,8 @@ def test_arrival_within_the_tolerance_ends_everything(driver):
     assert far_driver.tick(at=just_out).mode is PilotMode.FLYING
     directive = far_driver.tick(at=near)
     assert directive.mode is PilotMode.ARRIVED
-    assert directive.trajectory is None
-    np.testing.assert_array_equal(directive.hold_enu_m, GOAL)
+    assert directive.tracking.trajectory is None
+    np.testing.assert_array_equal(directive.tracking.hold_enu_m, GOAL)
     assert far_driver.tick(100, at=state()).mode is PilotMode.ARRIVED
     assert len(far_driver.requests) == 1
 
@@ -214,10 +214,10 @@ def test_evading_goes_on_at_full_speed_and_plans_from_ahead(driver):
     plan = driver.fly(speed=2.0)
     driver.foresee(9.0)
     directive = driver.tick()
-    assert directive.rate == 1.0
+    assert directive.tracking.rate == 1.0
     request = driver.requests[-1]
     assert request.stamp_s == pytest.approx(driver.now_s + P.plan_lead_s)
-    ahead_m = 2.0 * (directive.time_s + P.plan_lead_s)
+    ahead_m = 2.0 * (directive.tracking.time_s + P.plan_lead_s)
     assert request.position_enu_m[0] == pytest.approx(plan.waypoints[0, 0] + ahead_m)
     assert request.velocity_enu_mps[0] == pytest.approx(2.0)
     assert request.future_collision_seq == 1
@@ -226,11 +226,11 @@ def test_evading_goes_on_at_full_speed_and_plans_from_ahead(driver):
 def test_slowing_ramps_to_the_slow_rate_within_the_braking_limit(driver):
     driver.fly(speed=2.0)
     driver.foresee(SLOW_S)
-    rates = [driver.tick().rate for _ in range(100)]
+    rates = [driver.tick().tracking.rate for _ in range(100)]
     steps = -np.diff([1.0, *rates])
     assert steps.max() * 2.0 <= P.brake_mps2 * TICK_S + 1e-9
     assert rates[-1] == pytest.approx(P.slow_rate)
-    assert driver.last.rate_change_per_s == 0.0
+    assert driver.last.tracking.rate_change_per_s == 0.0
 
 
 def test_stopping_stands_within_the_braking_distance_then_plans_from_there(driver):
@@ -240,12 +240,12 @@ def test_stopping_stands_within_the_braking_distance_then_plans_from_there(drive
     begun_s = driver.now_s
     driver.until(lambda d: d.mode is PilotMode.WAITING)
     assert driver.now_s - begun_s == pytest.approx(2.0 / P.brake_mps2, abs=2 * TICK_S)
-    way_m = driver.last.hold_enu_m[0] - begun_m
+    way_m = driver.last.tracking.hold_enu_m[0] - begun_m
     assert way_m == pytest.approx(2.0**2 / (2.0 * P.brake_mps2), abs=0.05)
-    assert driver.last.trajectory is None
-    assert plan.waypoints[0, 1] == driver.last.hold_enu_m[1]
+    assert driver.last.tracking.trajectory is None
+    assert plan.waypoints[0, 1] == driver.last.tracking.hold_enu_m[1]
     request = driver.requests[-1]
-    np.testing.assert_array_equal(request.position_enu_m, driver.last.hold_enu_m)
+    np.testing.assert_array_equal(request.position_enu_m, driver.last.tracking.hold_enu_m)
     np.testing.assert_array_equal(request.velocity_enu_mps, np.zeros(3))
 
 
@@ -291,13 +291,15 @@ def test_the_next_plan_takes_over_at_its_own_stamp_without_a_jump(driver):
     driver.tick(4)
     driver.pilot.on_plan(plan)
     before = driver.last
-    while driver.last.trajectory is not plan:
+    while driver.last.tracking.trajectory is not plan:
         before = driver.last
         driver.tick()
     assert driver.now_s - TICK_S < request.stamp_s <= driver.now_s
     assert driver.last.mode is PilotMode.FLYING
-    old_x = before.trajectory.waypoints[0, 0] + 2.0 * before.time_s
-    assert plan.waypoints[0, 0] + 2.0 * driver.last.time_s == pytest.approx(old_x + 2.0 * TICK_S)
+    old_x = before.tracking.trajectory.waypoints[0, 0] + 2.0 * before.tracking.time_s
+    assert plan.waypoints[0, 0] + 2.0 * driver.last.tracking.time_s == pytest.approx(
+        old_x + 2.0 * TICK_S
+    )
     assert driver.pilot.counters.replans == 1
 
 
@@ -307,8 +309,8 @@ def test_a_late_plan_is_entered_where_it_should_be_by_now(driver):
     plan = straight(request)
     driver.pilot.on_plan(plan)
     directive = driver.tick()
-    assert directive.trajectory is plan
-    assert directive.time_s == pytest.approx(driver.now_s - request.stamp_s, abs=1e-9)
+    assert directive.tracking.trajectory is plan
+    assert directive.tracking.time_s == pytest.approx(driver.now_s - request.stamp_s, abs=1e-9)
 
 
 @pytest.mark.parametrize(("asked_after", "answered_after"), [(100, 1), (5, 10)])
@@ -324,16 +326,16 @@ def test_a_plan_made_while_slowing_goes_on_at_the_velocity_that_it_has(
     driver.tick()
     request = driver.requests[-1]
     speed = float(request.velocity_enu_mps[0])
-    assert speed == pytest.approx(2.0 * driver.last.rate)
+    assert speed == pytest.approx(2.0 * driver.last.tracking.rate)
     driver.tick(answered_after)
     plan = straight(request, speed=speed)
     driver.pilot.on_plan(plan)
     before = driver.last
-    while driver.last.trajectory is not plan:
+    while driver.last.tracking.trajectory is not plan:
         before = driver.last
         driver.tick()
-    assert speed * driver.last.rate == pytest.approx(2.0 * before.rate, abs=0.07)
-    assert driver.until(lambda d: d.rate == 1.0).trajectory is plan
+    assert speed * driver.last.tracking.rate == pytest.approx(2.0 * before.tracking.rate, abs=0.07)
+    assert driver.until(lambda d: d.tracking.rate == 1.0).tracking.trajectory is plan
 
 
 def test_a_plan_that_is_too_late_is_not_flown_and_it_stops(driver):
@@ -364,7 +366,7 @@ def test_a_plan_out_of_order_or_ignorant_of_the_newest_collision_is_asked_for_ag
 def test_a_plan_that_nobody_asked_for_is_ignored(driver):
     plan = driver.fly()
     driver.pilot.on_plan(replace(plan, trajectory_seq=5, stamp_s=driver.now_s))
-    assert driver.tick(10).trajectory is plan
+    assert driver.tick(10).tracking.trajectory is plan
 
 
 def test_a_new_collision_before_the_change_asks_for_yet_another_plan(driver):
@@ -383,10 +385,10 @@ def test_the_answer_to_an_abandoned_request_is_not_taken_for_the_new_one(driver)
     driver.until(lambda d: d.mode is PilotMode.WAITING)
     assert len(driver.requests) == 3
     driver.pilot.on_plan(old)
-    assert driver.tick().trajectory is None
+    assert driver.tick().tracking.trajectory is None
     new = straight(driver.requests[-1])
     driver.pilot.on_plan(new)
-    assert driver.tick().trajectory is new
+    assert driver.tick().tracking.trajectory is new
 
 
 @pytest.mark.parametrize("stamp_s", [math.inf, math.nan, 1e9])
@@ -433,12 +435,14 @@ def test_a_failed_plan_in_flight_stops_it(driver):
 def test_three_failures_look_all_round_once(driver):
     for _ in range(P.look_round_after):
         driver.until(lambda d: d.plan is not None)
-        assert driver.last.hold_yaw_rad == 0.0
+        assert driver.last.tracking.hold_yaw_rad == 0.0
         fail(driver)
     begun_s = driver.now_s
-    assert driver.tick(50).hold_yaw_rad == pytest.approx((driver.now_s - begun_s) * math.tau / 6)
+    assert driver.tick(50).tracking.hold_yaw_rad == pytest.approx(
+        (driver.now_s - begun_s) * math.tau / 6
+    )
     driver.tick(400)
-    assert driver.last.hold_yaw_rad == pytest.approx(math.tau)
+    assert driver.last.tracking.hold_yaw_rad == pytest.approx(math.tau)
     assert driver.pilot.counters.look_rounds == 1
 
 
@@ -501,7 +505,7 @@ def test_too_far_from_the_reference_it_stops_and_plans_from_where_it_is(driver, 
     here = driver.vehicle().position_enu_m
     directive = driver.tick(at=state(here[0] + 2.0 * TICK_S, off_m, 5.0))
     assert directive.mode is PilotMode.WAITING
-    assert directive.trajectory is None
+    assert directive.tracking.trajectory is None
     assert directive.plan is not None
     np.testing.assert_array_equal(directive.plan.position_enu_m[1], off_m)
 
@@ -571,8 +575,8 @@ def test_no_sequence_of_messages_breaks_it(plan):
         else:
             ticks, place, yaw = step
             driver.tick(ticks, at=state(*place, yaw=yaw))
-        assert 0.0 <= driver.last.rate <= 1.0
-        assert driver.last.time_s >= 0.0
+        assert 0.0 <= driver.last.tracking.rate <= 1.0
+        assert driver.last.tracking.time_s >= 0.0
         hovers = driver.pilot.active.trajectory is None
         assert hovers or driver.pilot.mode not in (PilotMode.WAITING, PilotMode.ARRIVED)
 
@@ -618,7 +622,7 @@ def test_a_report_stops_the_vehicle_when_braking_has_to_begin_or_at_once(uses, w
     begun_s = driver.now_s
     driver.foresee(3.0)
     driver.foresee(0.1)  # the same number: only the first counts
-    driver.until(lambda d: d.trajectory is None)
+    driver.until(lambda d: d.tracking.trajectory is None)
     assert driver.now_s - begun_s == pytest.approx(waits_s, abs=1.5 * TICK_S)
     assert driver.pilot.counters.stops == 1
 
@@ -631,7 +635,7 @@ def test_a_corrupted_time_to_collision_puts_the_stop_off_for_ever(time_s):
     driver.tick(200)
     assert driver.pilot.mode is PilotMode.FLYING
     assert driver.foresee(math.nan, seq=2) is PilotMode.FLYING
-    assert driver.tick().trajectory is None  # a NaN is no time at all
+    assert driver.tick().tracking.trajectory is None  # a NaN is no time at all
 
 
 def test_it_hovers_where_it_has_braked_and_only_then_plans():
@@ -642,7 +646,7 @@ def test_it_hovers_where_it_has_braked_and_only_then_plans():
     for x, speed in [(10.4, 1.0), (10.5, 0.4)]:
         directive = driver.tick(at=moving(x, speed))
         assert directive.mode is PilotMode.STOPPING
-        assert directive.hold_enu_m[0] == x
+        assert directive.tracking.hold_enu_m[0] == x
         assert len(driver.requests) == 1
     directive = driver.tick(at=moving(10.6, 0.2))
     assert directive.mode is PilotMode.WAITING
@@ -655,7 +659,7 @@ def test_a_larger_number_makes_it_reject_what_is_older_at_a_bounded_rate():
     driver.tick()
     driver.pilot.on_plan(straight(driver.requests[-1], count=4, trajectory_seq=2**30))
     driver.until(lambda d: d.mode is PilotMode.FLYING)
-    driver.until(lambda d: d.trajectory is None)
+    driver.until(lambda d: d.tracking.trajectory is None)
     begun_s = driver.now_s
     for number in range(2, 8):
         asked = len(driver.requests)
@@ -676,14 +680,14 @@ def test_a_plan_that_knows_of_a_later_collision_makes_it_ignore_reports():
 def test_it_has_arrived_only_at_rest_and_only_without_a_plan():
     driver = Driver(**PAPER)
     driver.fly(speed=2.0, count=40)  # the trajectory ends at the goal
-    driver.until(lambda d: d.trajectory is None)
+    driver.until(lambda d: d.tracking.trajectory is None)
     assert driver.now_s > 20.0
     assert driver.pilot.mode is PilotMode.ARRIVED
 
 
 def test_the_turn_before_departure_looks_all_round_and_asks_for_nothing():
     driver = Driver(**PAPER, turns_before_departure=True)
-    yaws = [driver.tick().hold_yaw_rad for _ in range(299)]
+    yaws = [driver.tick().tracking.hold_yaw_rad for _ in range(299)]
     assert driver.requests == []
     assert yaws == sorted(yaws)
     assert yaws[-1] == pytest.approx(2.0 * math.pi, abs=0.05)
@@ -712,4 +716,4 @@ def test_it_slows_down_where_it_does_not_look():
         for _ in range(100):
             here = driver.vehicle().position_enu_m
             driver.tick(at=state(*here, yaw=yaw))
-        assert driver.last.rate == rate
+        assert driver.last.tracking.rate == rate

@@ -1,14 +1,16 @@
 """The whole planning stage: from a map to a trajectory that the collision check finds free."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from mavfi_cli import autonomy
 from mavfi_cli.autonomy import collision, planning
 from mavfi_cli.autonomy.occupancy import snapshot_of
+from mavfi_cli.autonomy.orders import PlanRequest
 from mavfi_cli.autonomy.planners import find
-from mavfi_cli.autonomy.smoothing import Departure, Sequence
+from mavfi_cli.core.types import Trajectory
 
 BOUNDS = np.array([-5.0, -12.0, 1.0, 25.0, 12.0, 10.0])
 
@@ -22,15 +24,23 @@ def blocks():
     return snapshot_of(np.vstack([block + shift for shift in shifts]))
 
 
-def inputs(velocity=(0.0, 0.0, 0.0), goal=(20.0, 0.0, 5.0), seed=1):
-    return planning.StageInputs(
-        snapshot=blocks(),
+def request(velocity=(0.0, 0.0, 0.0), goal=(20.0, 0.0, 5.0)):
+    return PlanRequest(
+        stamp_s=3.0,
         position_enu_m=np.array([0.0, 0.0, 5.0]),
-        departure=Departure(stamp_s=3.0, velocity_enu_mps=np.array(velocity), yaw_rad=0.0),
+        velocity_enu_mps=np.array(velocity),
+        yaw_rad=0.0,
         goal_enu_m=np.array(goal),
-        bounds_enu_m=BOUNDS,
-        sequence=Sequence(trajectory_seq=5, future_collision_seq=2),
-        seed=seed,
+        attempt=1,
+        trajectory_seq=5,
+        future_collision_seq=2,
+    )
+
+
+def plan(planner, asked, seed=1):
+    params = planning.StageParams()
+    return planning.plan(
+        find(planner), asked, blocks(), bounds_enu_m=BOUNDS, seed=seed, params=params
     )
 
 
@@ -38,36 +48,23 @@ def test_plans_pass_the_collision_check_at_rest_and_in_motion():
     rng = np.random.default_rng(0)
     for seed in range(12):
         velocity = rng.uniform(-1, 1, 3) * [1.5, 1.5, 0.2] if seed % 2 else np.zeros(3)
-        given = inputs(velocity, seed=seed)
-        found = planning.plan(find("rrtstar"), given, planning.StageParams())
-        assert found.trajectory is not None, found.reason
-        free_s = collision.time_to_collision(
-            given.snapshot, found.trajectory, 0.0, collision.CollisionParams()
-        )
+        found = plan("rrtstar", request(velocity), seed)
+        assert isinstance(found, Trajectory), found.reason
+        free_s = collision.time_to_collision(blocks(), found, 0.0, collision.CollisionParams())
         assert free_s == math.inf
-        assert found.trajectory.trajectory_seq == 5
-        assert len(found.path_enu_m) >= 3
+        assert found.trajectory_seq == 5
+        assert np.ptp(found.waypoints[:, 1:3]) > 0.5  # it goes round the blocks
 
 
 def test_a_blocked_goal_is_refused_with_its_reason():
-    found = planning.plan(find("rrt"), inputs(goal=(6.0, 0.0, 5.0)), planning.StageParams())
-    assert found.trajectory is None
-    assert found.reason == "goal blocked"
+    found = plan("rrt", request(goal=(6.0, 0.0, 5.0)))
+    assert (found.stamp_s, found.reason) == (3.0, "goal blocked")
 
 
 def test_a_start_that_cannot_stop_in_time_is_refused():
-    given = inputs(velocity=(3.0, 0.0, 0.0))
-    close = planning.StageInputs(
-        **{
-            name: getattr(given, name)
-            for name in given.__dataclass_fields__
-            if name != "position_enu_m"
-        },
-        position_enu_m=np.array([2.9, 0.0, 5.0]),
-    )
-    found = planning.plan(find("rrtstar"), close, planning.StageParams())
-    assert found.trajectory is None
-    assert found.reason == "no free way on"
+    given = request(velocity=(3.0, 0.0, 0.0))
+    found = plan("rrtstar", replace(given, position_enu_m=np.array([2.9, 0.0, 5.0])))
+    assert (found.stamp_s, found.reason) == (3.0, "no free way on")
 
 
 def test_warm_up_runs_every_kernel():

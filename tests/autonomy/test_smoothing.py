@@ -8,11 +8,9 @@ import pytest
 
 from mavfi_cli.autonomy import grid as grids
 from mavfi_cli.autonomy.occupancy import empty_snapshot, snapshot_of
+from mavfi_cli.autonomy.orders import Departure
 from mavfi_cli.autonomy.smoothing import (
-    Departure,
-    Sequence,
     SmoothingParams,
-    brake,
     smooth,
 )
 from mavfi_cli.autonomy.trajectory import reference_waypoint
@@ -36,7 +34,7 @@ def path(*points):
 
 
 def test_a_straight_flight_takes_as_long_as_a_trapezoid():
-    result = smooth(path([0, 0, 5], [15, 0, 5]), OPEN, departure(), Sequence(), PARAMS)
+    result = smooth(path([0, 0, 5], [15, 0, 5]), OPEN, departure(), PARAMS)
     speed, acceleration = 2.7, 3.0
     ideal_s = 15.0 / speed + speed / acceleration
     assert ideal_s <= result.trajectory.duration_s <= ideal_s + 3 * PARAMS.sample_period_s
@@ -47,22 +45,22 @@ def test_a_straight_flight_takes_as_long_as_a_trapezoid():
 
 
 def test_sequence_and_stamp_are_carried():
-    sequence = Sequence(trajectory_seq=4, future_collision_seq=2)
-    made = smooth(path([0, 0, 5], [5, 0, 5]), None, departure(), sequence, PARAMS).trajectory
+    numbered = replace(departure(), trajectory_seq=4, future_collision_seq=2)
+    made = smooth(path([0, 0, 5], [5, 0, 5]), None, numbered, PARAMS).trajectory
     assert (made.stamp_s, made.trajectory_seq, made.future_collision_seq) == (7.0, 4, 2)
     assert (made.durations_s == 0.5).all()
 
 
 def test_vertical_speeds_keep_their_own_limits():
-    up = smooth(path([0, 0, 1], [0, 0, 9]), OPEN, departure(), Sequence(), PARAMS).trajectory
-    down = smooth(path([0, 0, 9], [0, 0, 1]), OPEN, departure(), Sequence(), PARAMS).trajectory
+    up = smooth(path([0, 0, 1], [0, 0, 9]), OPEN, departure(), PARAMS).trajectory
+    down = smooth(path([0, 0, 9], [0, 0, 1]), OPEN, departure(), PARAMS).trajectory
     assert flown(up)[:, 6].max() == pytest.approx(PARAMS.climb_max_mps)
     assert flown(down)[:, 6].min() == pytest.approx(-PARAMS.descent_max_mps)
 
 
 def test_a_corner_is_cut_no_more_than_allowed():
     corner = path([0, 0, 5], [10, 0, 5], [10, 10, 5])
-    rows = flown(smooth(corner, OPEN, departure(), Sequence(), PARAMS).trajectory)
+    rows = flown(smooth(corner, OPEN, departure(), PARAMS).trajectory)
     gap = np.linalg.norm(rows[:, :3] - corner[1], axis=1).min()
     # The spline adds at most a T^2 / 8.
     assert 0.2 < gap <= PARAMS.corner_cut_m + 3.0 * 0.25 / 8.0
@@ -75,9 +73,9 @@ def test_where_a_corner_may_not_be_cut_it_is_slowed_down_until_it_is_free():
     cells = np.array([[-0.85 - 0.2 * i, 0.85 + 0.2 * j, 5.1] for i in range(20) for j in range(20)])
     grid = grids.build(snapshot_of(cells), BOUNDS, 0.5)
     assert grid.path_free(legs)
-    fast = smooth(legs, OPEN, departure(), Sequence(), PARAMS)
+    fast = smooth(legs, OPEN, departure(), PARAMS)
     assert not grid.path_free(flown(fast.trajectory)[:, :3])
-    careful = smooth(legs, grid, departure(), Sequence(), PARAMS)
+    careful = smooth(legs, grid, departure(), PARAMS)
     assert careful.free
     assert grid.path_free(flown(careful.trajectory)[:, :3])
     np.testing.assert_allclose(careful.trajectory.waypoints[-1, :3], legs[-1])
@@ -85,7 +83,7 @@ def test_where_a_corner_may_not_be_cut_it_is_slowed_down_until_it_is_free():
 
 @pytest.mark.parametrize("yaw_rad", [math.pi, -math.pi / 2, 2.0])
 def test_a_large_turn_is_made_before_flying_so_that_the_camera_looks_ahead(yaw_rad):
-    made = smooth(path([0, 0, 5], [10, 0, 5]), OPEN, departure(yaw_rad=yaw_rad), Sequence(), PARAMS)
+    made = smooth(path([0, 0, 5], [10, 0, 5]), OPEN, departure(yaw_rad=yaw_rad), PARAMS)
     rows = flown(made.trajectory)
     moving = np.linalg.norm(rows[:, 4:7], axis=1) > 0.5
     assert np.abs(np.cos(rows[moving, 3]) - 1.0).max() < 0.3
@@ -93,15 +91,15 @@ def test_a_large_turn_is_made_before_flying_so_that_the_camera_looks_ahead(yaw_r
 
 
 def test_a_small_turn_is_made_on_the_way():
-    made = smooth(path([0, 0, 5], [10, 0, 5]), OPEN, departure(yaw_rad=0.7), Sequence(), PARAMS)
-    straight = smooth(path([0, 0, 5], [10, 0, 5]), OPEN, departure(), Sequence(), PARAMS)
+    made = smooth(path([0, 0, 5], [10, 0, 5]), OPEN, departure(yaw_rad=0.7), PARAMS)
+    straight = smooth(path([0, 0, 5], [10, 0, 5]), OPEN, departure(), PARAMS)
     assert made.trajectory.duration_s == straight.trajectory.duration_s
     assert made.trajectory.waypoints[-1, 3] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_start_in_motion_goes_on_smoothly():
     velocity = np.array([0.0, 2.5, 0.0])
-    made = smooth(path([0, 0, 5], [12, 0, 5]), OPEN, departure(velocity, 1.5), Sequence(), PARAMS)
+    made = smooth(path([0, 0, 5], [12, 0, 5]), OPEN, departure(velocity, 1.5), PARAMS)
     first = reference_waypoint(made.trajectory, 0.0)
     np.testing.assert_allclose(first[:3], [0, 0, 5], atol=1e-12)
     np.testing.assert_allclose(first[4:7], velocity, atol=1e-12)
@@ -111,49 +109,27 @@ def test_a_start_in_motion_goes_on_smoothly():
 def test_a_start_in_motion_towards_a_wall_is_not_called_free():
     wall = snapshot_of(np.array([[0.1, 1.1 + 0.0, 5.1]]))
     grid = grids.build(wall, BOUNDS, 0.5)
-    made = smooth(
-        path([0, 0, 5], [12, 0, 5]), grid, departure((0, 2.5, 0), 1.5), Sequence(), PARAMS
-    )
+    made = smooth(path([0, 0, 5], [12, 0, 5]), grid, departure((0, 2.5, 0), 1.5), PARAMS)
     assert not made.free
     assert np.isfinite(made.trajectory.waypoints).all()
 
 
-def test_braking_ends_at_rest_within_the_stopping_distance_and_keeps_the_yaw():
-    velocity = np.array([1.2, -2.0, 0.3])
-    made = brake(np.array([1.0, 2.0, 5.0]), departure(velocity, 0.4), Sequence(), PARAMS)
-    rows = flown(made)
-    np.testing.assert_allclose(rows[0, 4:7], velocity, atol=1e-12)
-    end = made.waypoints[-1]
-    assert not end[4:].any()
-    speed = float(np.linalg.norm(velocity))
-    travelled = float(np.linalg.norm(end[:3] - [1.0, 2.0, 5.0]))
-    assert travelled == pytest.approx(0.25 * speed + 1.02 * speed**2 / 6.0)
-    assert (made.waypoints[:, 3] == 0.4).all()
-    assert (np.linalg.norm(rows[:, 7:10], axis=1) <= 5.0).all()
-
-
-def test_braking_at_rest_holds():
-    made = brake(np.array([1.0, 2.0, 5.0]), departure(), Sequence(), PARAMS)
-    assert (made.waypoints[:, :3] == [1.0, 2.0, 5.0]).all()
-    assert not made.waypoints[:, 4:].any()
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300])
 def test_a_senseless_departure_gives_a_sound_trajectory(bad):
-    made = smooth(path([0, 0, 5], [5, 0, 5]), None, departure((bad, 0, 0), bad), Sequence(), PARAMS)
+    made = smooth(path([0, 0, 5], [5, 0, 5]), None, departure((bad, 0, 0), bad), PARAMS)
     assert np.isfinite(made.trajectory.waypoints).all()
     assert (np.linalg.norm(flown(made.trajectory)[:, 4:7], axis=1) <= 3.0 + 1e-9).all()
 
 
 def test_a_path_that_is_a_point_is_a_hover():
     here = path([1, 2, 5], [1, 2, 5])
-    made = smooth(here, OPEN, departure(), Sequence(), PARAMS)
+    made = smooth(here, OPEN, departure(), PARAMS)
     assert (made.trajectory.waypoints[:, :3] == here[0]).all()
 
 
 def test_other_limits_are_kept_as_well():
     slow = replace(PARAMS, v_max_mps=1.0, a_max_mps2=0.5)
     corner = path([0, 0, 5], [4, 0, 5], [4, 4, 5])
-    rows = flown(smooth(corner, OPEN, departure(), Sequence(), slow).trajectory)
+    rows = flown(smooth(corner, OPEN, departure(), slow).trajectory)
     assert np.linalg.norm(rows[:, 4:7], axis=1).max() <= 1.0
     assert np.linalg.norm(rows[:, 7:10], axis=1).max() <= 0.5

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from mavfi_cli.autonomy import collision, tracking
 from mavfi_cli.autonomy.collision import CollisionParams
 from mavfi_cli.autonomy.occupancy import snapshot_of
-from mavfi_cli.autonomy.smoothing import Departure, Sequence, SmoothingParams, brake, smooth
+from mavfi_cli.autonomy.orders import Departure
+from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingParams, TrackingState
 from mavfi_cli.autonomy.trajectory import reference_waypoint, without_waypoint
 from mavfi_cli.core.types import Trajectory
@@ -65,23 +66,16 @@ def assert_flyable(trajectory, start, end, departure, end_atol=1e-9):
 @settings(max_examples=150, deadline=None)
 @given(paths, departures())
 def test_any_path_is_flown_within_the_limits(path, departure):
-    made = smooth(path, None, departure, Sequence(), PARAMS)
+    made = smooth(path, None, departure, PARAMS)
     last_leg_m = np.linalg.norm(path[-1] - path[-2])
     end_atol = 1e-9 if last_leg_m > ONE_VERTEX_M else ONE_VERTEX_M
     assert_flyable(made.trajectory, path[0], path[-1], departure, end_atol)
 
 
-@settings(max_examples=80, deadline=None)
-@given(points.map(np.array), departures())
-def test_any_motion_is_braked_within_the_limits(position, departure):
-    made = brake(position, departure, Sequence(), PARAMS)
-    assert_flyable(made, position, made.waypoints[-1, :3], departure)
-
-
 def flown_trajectory():
     path = np.array([[0.0, 0, 5], [10, 0, 5], [14, 9, 6]])
-    departure = Departure(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
-    return smooth(path, None, departure, Sequence(trajectory_seq=1), PARAMS).trajectory
+    departure = Departure(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0, trajectory_seq=1)
+    return smooth(path, None, departure, PARAMS).trajectory
 
 
 def flip(array, flips):

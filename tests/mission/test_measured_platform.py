@@ -8,6 +8,7 @@ from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.companion.executor import Executor
 from mavfi_cli.mission.latency import latency_model
+from mavfi_cli.mission.companion.executor import Executor, Node
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.report.summary import measured_lines
@@ -53,7 +54,10 @@ def test_an_invocation_takes_what_it_took_times_the_factor():
 
     published = []
     executor = Executor(draw_latency_s=model.draw_s, cores=2, compute_first=True, wall=wall)
-    executor.add("octomap", work, lambda value, stamp_s: published.append((value, stamp_s)))
+    octomap = executor.add(Node("octomap", work))
+
+    async def turn(value):
+        published.append((await octomap.run(value), executor.now_s))
 
     class Told:
         """Measures what the test says."""
@@ -70,7 +74,7 @@ def test_an_invocation_takes_what_it_took_times_the_factor():
     wall.measure = Told
     for start_s, value in ((0.0, "a"), (1.0, "b"), (2.0, "c")):
         executor.advance(start_s)
-        executor.submit("octomap", value)
+        executor.start(turn(value))
     executor.advance(3.0)
     assert [value for value, _ in published] == ["a", "b", "c"]
     assert [stamp_s for _, stamp_s in published] == pytest.approx([0.04, 1.12, 2.08])
@@ -79,7 +83,7 @@ def test_an_invocation_takes_what_it_took_times_the_factor():
     assert told["kernels"]["octomap"] == pytest.approx(
         {"host_median_s": 0.020, "latency_median_s": 0.080, "invocations": 3}
     )
-    assert executor.nodes["octomap"].busy_s == pytest.approx(0.24)
+    assert octomap.busy_s == pytest.approx(0.24)
 
 
 def test_other_platforms_measure_nothing(short_flight):

@@ -10,7 +10,7 @@ import pytest
 from mavfi_cli.autonomy import planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import OccupancyMap
 from mavfi_cli.mission.companion import node_process
-from mavfi_cli.mission.companion.executor import Executor
+from mavfi_cli.mission.companion.executor import Executor, Node
 from mavfi_cli.mission.record.run_folder import load_run
 
 
@@ -31,12 +31,12 @@ def at_invocation(monkeypatch):
         os.write(theirs, b"1")
         os.set_blocking(token, False)
 
-        def kernel(*arguments):
+        def kernel(*arguments, **named):
             if os.getpid() != here:
                 calls.append(1)
                 if len(calls) == number and taken(token):
                     action()
-            return real(*arguments)
+            return real(*arguments, **named)
 
         monkeypatch.setattr(owner, name, kernel)
 
@@ -136,47 +136,67 @@ def dying(value, _stamp_s):
     return value
 
 
+class Nodes(Executor):
+    """An executor of one core whose nodes die over "die", and the outputs of its nodes."""
+
+    def __init__(self, names):
+        super().__init__(draw_latency_s=lambda _name: 0.1, cores=1, restart_s=1.0)
+        self.published = []
+        for name in names:
+            self.add(Node(name, dying))
+
+    def submit(self, name, value):
+        async def turn():
+            output = await self.nodes[name].run(value)
+            self.published.append((name, output, round(self.now_s, 9)))
+
+        self.start(turn())
+
+
 @pytest.fixture
-def executor():
-    made = Executor(draw_latency_s=lambda _name: 0.1, cores=1, restart_s=1.0)
-    yield made
-    made.close()
+def executor_of():
+    made = []
+
+    def make(*names):
+        made.append(Nodes(names))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
 
 
-def test_the_input_is_lost_and_the_newest_waits_for_the_restart(executor):
-    published = []
-    executor.add("a", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
+def test_the_input_is_lost_and_the_newest_waits_for_the_restart(executor_of):
+    executor = executor_of("a")
     executor.isolate("a")
     for stamp_s, value in [(0.0, "first"), (0.2, "die"), (0.4, "old"), (0.5, "new")]:
         executor.advance(stamp_s)
         executor.submit("a", value)
     executor.advance(5.0)
     # Due at 0.3, up again 1 s later, and then 0.1 s of work.
-    assert published == [("first", 0.1), ("new", 1.4)]
+    assert executor.published == [("a", "first", 0.1), ("a", "new", 1.4)]
     assert executor.nodes["a"].dropped == 1
     assert [(loss.stamp_s, loss.how) for loss in executor.losses] == [
         (pytest.approx(0.3), "killed by SIGKILL")
     ]
 
 
-def test_a_node_that_is_down_leaves_its_core_to_others(executor):
-    published = []
-    executor.add("a", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
-    executor.add("b", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
+def test_a_node_that_is_down_leaves_its_core_to_others(executor_of):
+    executor = executor_of("a", "b")
     executor.isolate("a")
     executor.submit("a", "die")
     executor.submit("b", "other")
     executor.advance(0.5)
-    assert published == [("other", 0.2)]
+    assert executor.published == [("b", "other", 0.2)]
 
 
-def test_a_call_of_a_node_that_is_down_gives_nothing(executor):
-    executor.add("a", dying, lambda _value, _stamp_s: None)
+def test_a_call_of_a_node_that_is_down_gives_nothing(executor_of):
+    executor = executor_of("a")
     executor.isolate("a")
     given = []
     for stamp_s, value in [(0.0, 1), (0.2, "die"), (0.5, 2), (1.0, 3), (1.2, 4), (1.4, 5)]:
         executor.advance(stamp_s)
-        given.append(executor.call("a", value, stamp_s))
+        given.append(executor.call(executor.nodes["a"], value))
     assert given == [(1, 0.1), None, None, None, (4, 0.1), (5, 0.1)]
 
 
@@ -189,10 +209,14 @@ def test_settling_waits_for_work_whose_output_is_not_due_yet(tmp_path):
         done.touch()
 
     executor = Executor(draw_latency_s=lambda _name: 1.0, cores=1)
-    executor.add("slow", run, lambda _output, _stamp_s: None)
+    slow = executor.add(Node("slow", run))
     executor.isolate("slow")
+
+    async def turn():
+        await slow.run(1)
+
     try:
-        executor.submit("slow", 1)
+        executor.start(turn())
         executor.compute()
         assert not done.exists()
         executor.settle()
@@ -201,42 +225,35 @@ def test_settling_waits_for_work_whose_output_is_not_due_yet(tmp_path):
         executor.close()
 
 
-def test_nodes_that_share_a_process_take_turns_and_end_together(executor):
-    published = []
-    for name in ("map", "check", "plan"):
-
-        def publish(value, stamp_s, name=name):
-            published.append((name, value, round(stamp_s, 9)))
-
-        executor.add(name, dying, publish)
+def test_nodes_that_share_a_process_take_turns_and_end_together(executor_of):
+    executor = executor_of("map", "check", "plan")
     executor.share_process(("map", "check", "plan"))
     executor.isolate("check")
     for value, name in enumerate(("plan", "map", "check", "map")):
         executor.submit(name, value)
     executor.advance(1.0)
     # After the planner comes the map again, as in a loop over the three.
-    assert published == [("plan", 0, 0.1), ("map", 3, 0.2), ("check", 2, 0.3)]
+    assert executor.published == [("plan", 0, 0.1), ("map", 3, 0.2), ("check", 2, 0.3)]
     executor.submit("check", "die")
     executor.submit("plan", "waits")
     executor.advance(1.5)
     executor.submit("map", "while down")
     executor.advance(5.0)
-    assert published[3:] == [("map", "while down", 2.2)]
+    assert executor.published[3:] == [("map", "while down", 2.2)]
     assert [node.restarts for node in executor.nodes.values()] == [1, 1, 1]
     assert [loss.node for loss in executor.losses] == ["check"]
 
 
-def test_a_kill_loses_the_work_under_way_and_what_waits(executor):
-    published = []
-    executor.add("a", dying, lambda value, stamp_s: published.append((value, round(stamp_s, 9))))
+def test_a_kill_loses_the_work_under_way_and_what_waits(executor_of):
+    executor = executor_of("a")
     executor.isolate("a")
     executor.submit("a", "under way")
     executor.submit("a", "waiting")
     executor.advance(0.05)
-    executor.kill("a", 0.05)
-    executor.kill("a", 0.05)  # nothing is left to kill
+    executor.kill("a")
+    executor.kill("a")  # nothing is left to kill
     executor.advance(0.5)
     executor.submit("a", "newer")
     executor.advance(3.0)
-    assert published == [("newer", 1.15)]
+    assert executor.published == [("a", "newer", 1.15)]
     assert [(loss.stamp_s, loss.how) for loss in executor.losses] == [(0.05, "killed by SIGKILL")]

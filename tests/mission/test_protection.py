@@ -15,6 +15,7 @@ from mavfi_cli.detect import model
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission.companion import protection as protection_module
 from mavfi_cli.mission.companion.protection import Protection, Response
+from mavfi_cli.mission.companion.protection import PASSED, Protection, Response
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of, differing_results, same_file
@@ -70,7 +71,7 @@ def protection(config):
 
 
 def tick(gate, command, at_s=0.0):
-    return gate.tick(TRAJECTORY, 0, command, at_s)[0]
+    return gate.tick(TRAJECTORY, 0, command, at_s).response
 
 
 def test_after_so_many_alarms_in_a_row_it_holds_and_then_accepts(limit):
@@ -98,14 +99,14 @@ def test_a_hover_does_not_end_the_row(limit):
     gate = protection(limit)
     tick(gate, COMMAND)
     gate.gate.memory["gate"][REFERENCE, NAMES.index("waypoint_vy")] += 2048
-    told = [gate.tick(TRAJECTORY, 1, COMMAND, at_s)[0] for at_s in (0.02, 0.04, 0.06)]
+    told = [gate.tick(TRAJECTORY, 1, COMMAND, at_s).response for at_s in (0.02, 0.04, 0.06)]
     assert told == [Response.RECOMPUTE, Response.RECOMPUTE, Response.HOLD]
     plan = replace(TRAJECTORY, trajectory_seq=2)
-    assert gate.tick(None, -1, COMMAND, 0.08)[0] is Response.PASS
-    assert gate.plan(plan, 0.1) is Response.PASS
-    assert gate.ahead(plan, 0, None, 0.1)[0] is Response.PASS
-    assert gate.tick(plan, 0, COMMAND, 0.1)[0] is Response.ACCEPT
-    assert gate.tick(plan, 1, COMMAND, 0.12)[0] is Response.PASS
+    assert gate.tick(None, -1, COMMAND, 0.08).response is Response.PASS
+    assert gate.plan(plan, 0.1).response is Response.PASS
+    assert gate.ahead(plan, 0, None, 0.1).response is Response.PASS
+    assert gate.tick(plan, 0, COMMAND, 0.1).response is Response.ACCEPT
+    assert gate.tick(plan, 1, COMMAND, 0.12).response is Response.PASS
     assert tick(gate, WILD, 0.14) is Response.RECOMPUTE  # a row of its own
 
 
@@ -124,10 +125,10 @@ def test_a_wild_report_is_withheld(limit):
     calm = CollisionReport(
         stamp_s=0.0, collision=True, time_to_collision_s=3.0, future_collision_seq=1
     )
-    assert gate.report(calm, 0.0)[0] is Response.PASS
+    assert gate.report(calm, 0.0).response is Response.PASS
     wild = replace(calm, future_collision_seq=1 << 20)
-    assert gate.report(wild, 0.3)[0] is Response.RECOMPUTE
-    assert gate.report(calm, 0.6)[0] is Response.PASS
+    assert gate.report(wild, 0.3).response is Response.RECOMPUTE
+    assert gate.report(calm, 0.6).response is Response.PASS
     assert gate.summary()["recoveries"]["perception"] == {"count": 1, "total_s": 0.3}
 
 
@@ -150,9 +151,9 @@ FIRST = replace(TRAJECTORY, waypoints=np.full((6, 10), 0.25))
 
 def test_a_plan_with_a_wrong_number_is_withheld_until_recomputing_has_confirmed_it():
     gate = protection(replace(EXTENDED, alarms_max=2))
-    assert gate.plan(FIRST, 0.0) is Response.PASS
+    assert gate.plan(FIRST, 0.0).response is Response.PASS
     wrong = [replace(FIRST, trajectory_seq=number) for number in (900, 901, 902, 903)]
-    assert [gate.plan(plan, 0.1) for plan in wrong] == [
+    assert [gate.plan(plan, 0.1).response for plan in wrong] == [
         Response.RECOMPUTE, Response.HOLD, Response.ACCEPT, Response.PASS,
     ]  # fmt: skip
     assert {alarm["states"] for alarm in gate.summary()["alarms"]} == {("plan_trajectory_seq",)}
@@ -163,10 +164,11 @@ def test_a_plan_with_a_wrong_number_is_withheld_until_recomputing_has_confirmed_
 def test_a_flown_plan_gets_back_the_number_that_was_accepted(name):
     gate = protection(replace(EXTENDED, name=name))
     gate.plan(FIRST, 0.0)
-    response, alarm = gate.ahead(replace(FIRST, trajectory_seq=1025), 0, None, 0.1)
-    assert (response, alarm.stage) == (Response.RECOMPUTE, Stage.PLANNING)
-    assert alarm.mended.trajectory_seq == 1
-    assert gate.ahead(alarm.mended, 0, None, 0.2) == (Response.PASS, None)
+    verdict = gate.ahead(replace(FIRST, trajectory_seq=1025), 0, None, 0.1)
+    assert verdict.withheld
+    assert verdict.blames(Stage.PLANNING)
+    assert verdict.alarm.mended.trajectory_seq == 1
+    assert gate.ahead(verdict.alarm.mended, 0, None, 0.2) is PASSED
 
 
 def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):

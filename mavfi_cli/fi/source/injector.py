@@ -20,7 +20,7 @@ from mavfi_cli.fi import bits as bit_operations
 from mavfi_cli.fi.source.fault import Persistence, SourceFault, When
 from mavfi_cli.fi.source.schedule import Moment, Pattern, Schedule
 
-M = TypeVar("M", CollisionReport, Trajectory, Command)
+M = TypeVar("M")
 
 MAX_LISTED_STRIKES = 100
 _WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Command: "command"}

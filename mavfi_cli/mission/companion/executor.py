@@ -2,8 +2,12 @@
 
 A node runs one kernel. Its input queue has length one: a newer input replaces a waiting one. An
 invocation that starts at `t` occupies the node and one core of the platform until `t` plus its
-latency. Its output is published at that time. The computation itself happens at any host time in
+latency. Its output takes effect at that time. The computation itself happens at any host time in
 between, so the vehicle's simulation need not wait for it.
+
+What is done with the outputs is written down in turns. A turn is a coroutine that awaits one node
+after the other: `cloud = await point_cloud.run(frame)` continues when the cloud takes effect. It
+never continues if its input was replaced or lost.
 
 Nodes that share a process run one after the other in the listed order, each with its newest input.
 They end together, and all their waiting inputs are lost.
@@ -17,18 +21,25 @@ host noticed it, so they are repeatable.
 from __future__ import annotations
 
 import contextlib
+import functools
 import heapq
-from collections.abc import Callable, Sequence
+import types
+from collections.abc import Callable, Coroutine, Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.companion.node_process import NodeLost, NodeProcess
 
-Run = Callable[[Any, float], Any]  # (input, start stamp) -> output
-Publish = Callable[[Any, float], None]  # (output, stamp at which it takes effect)
-_Event = Callable[[float], None]
+In = TypeVar("In")
+Out = TypeVar("Out")
+AnyNode: TypeAlias = "Node[Any, Any]"
+Turn: TypeAlias = "Coroutine[tuple[AnyNode, Any], Any, None]"
 _SAME_S = 1e-9
+
+
+class TurnOver(Exception):
+    """Ends a turn before its last node."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,14 +54,20 @@ class Loss:
 
 
 @dataclass(slots=True, eq=False)
-class Node:
-    """A node: its kernel, the consumer of its output, and its queue of length one."""
+class Node(Generic[In, Out]):
+    """A node: its kernel and its queue of length one.
+
+    Attributes:
+        kernel: Function from input and start stamp to output.
+        on_start: Callback for every invocation with input and start stamp.
+        on_restart: Callback after a restart, before the node reads its next input.
+    """
 
     name: str
-    run: Run
-    publish: Publish
-    on_restart: Callable[[Node], None]
-    pending: Any = None
+    kernel: Callable[[In, float], Out]
+    on_start: Callable[[In, float], None] = lambda _input, _start_s: None
+    on_restart: Callable[[], None] = lambda: None
+    pending: tuple[In, Turn] | None = None  # waiting input and the turn that it belongs to
     busy: bool = False
     invocations: int = 0
     dropped: int = 0  # inputs replaced by a newer one before they were read
@@ -60,16 +77,22 @@ class Node:
     restarts: int = 0
     finished: int = 0  # completed or failed invocations
     free_s: float = 0.0  # end of the newest invocation outside the queue
-    mates: list[Node] = field(default_factory=list)  # others in its process, in cyclic order
+    mates: list[AnyNode] = field(default_factory=list)  # others in its process, in cyclic order
+
+    @types.coroutine
+    def run(self, value: In) -> Generator[tuple[AnyNode, In], Out, Out]:
+        """Submit an input, and continue when its output takes effect."""
+        return (yield self, value)
 
 
 @dataclass(slots=True, eq=False)
 class _Job:
-    """An invocation between its start and the publication of its output."""
+    """An invocation between its start and the effect of its output."""
 
-    node: Node
+    node: AnyNode
     start_s: float
     input: Any
+    turn: Turn | None = None
     order: int | None = None  # number of the request to the node's process
     done: bool = False
     cancelled: bool = False  # True if its process was killed before the output was due
@@ -82,7 +105,7 @@ class _Job:
         process = self.node.process
         if process is None:
             with wall.measure(self.node.name):
-                self.output = self.node.run(self.input, self.start_s)
+                self.output = self.node.kernel(self.input, self.start_s)
             self.done = True
         else:
             self.order = process.order(self.node.name, self.input, self.start_s)
@@ -125,9 +148,10 @@ class Executor:
         compute_first: Draw an invocation's latency after its computation.
         restart_s: Simulated time from a node's end until its successor is ready, s.
         watchdog_s: Simulated time after which an unfinished invocation is killed, s.
+        now_s: Present simulated time, s.
+        nodes: All nodes by name, in the order of their addition.
         losses: Losses of all nodes, in order.
         timetable: All invocations in the order of their starts.
-        on_start: Callback for every invocation with node, input and start stamp.
     """
 
     draw_latency_s: Callable[[str], float]
@@ -137,46 +161,31 @@ class Executor:
     restart_s: float = 1.0
     watchdog_s: float = 5.0
     now_s: float = 0.0
+    nodes: dict[str, AnyNode] = field(default_factory=dict)
     losses: list[Loss] = field(default_factory=list)
-    on_start: Callable[[str, Any, float], None] = lambda _node, _input, _start_s: None
     timetable: list[Invocation] = field(default_factory=list)
-    _nodes: dict[str, Node] = field(default_factory=dict)
-    _events: list[tuple[float, int, _Event]] = field(default_factory=list)  # heap: time, order
-    _waiting: list[Node] = field(default_factory=list)
+    _events: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)  # a heap
+    _waiting: list[AnyNode] = field(default_factory=list)
     _uncomputed: list[_Job] = field(default_factory=list)
     _jobs: dict[str, _Job] = field(default_factory=dict)  # jobs with a pending output
     _working: int = 0
     _count: int = 0
 
-    def add(
-        self,
-        name: str,
-        run: Run,
-        publish: Publish,
-        on_restart: Callable[[Node], None] = lambda _node: None,
-    ) -> Node:
-        """Add a node.
-
-        Args:
-            name: Name of the node, which selects its latency.
-            run: Kernel of the node.
-            publish: Consumer of its output at the due time.
-            on_restart: Callback after a restart, before the node reads its next input.
-        """
-        node = Node(name=name, run=run, publish=publish, on_restart=on_restart)
-        self._nodes[name] = node
+    def add(self, node: Node[In, Out]) -> Node[In, Out]:
+        """Add a node. Its name selects its latency."""
+        self.nodes[node.name] = node
         return node
 
     def share_process(self, names: Sequence[str]) -> None:
         """Let nodes share one single-threaded process whose loop runs them in this order."""
-        nodes = [self._nodes[name] for name in names]
+        nodes = [self.nodes[name] for name in names]
         for place, node in enumerate(nodes):
             node.mates = nodes[place + 1 :] + nodes[:place]
 
-    def process_of(self, name: str) -> dict[str, Run]:
+    def process_of(self, name: str) -> dict[str, Callable[[Any, float], Any]]:
         """Return the kernels in the process of a node, by node name."""
-        node = self._nodes[name]
-        return {each.name: each.run for each in (node, *node.mates)}
+        node = self.nodes[name]
+        return {each.name: each.kernel for each in (node, *node.mates)}
 
     def isolate(self, name: str, process: NodeProcess | None = None) -> None:
         """Run a node's kernel in a separate process from now on, until `close`.
@@ -186,10 +195,138 @@ class Executor:
             process: Process that serves them; by default a fork of this one with a copy of their
                 state.
         """
-        node = self._nodes[name]
+        node = self.nodes[name]
         node.process = process or NodeProcess.fork(self.process_of(name))
         for mate in node.mates:
             mate.process = node.process
+
+    # Turns
+
+    def start(self, turn: Turn) -> None:
+        """Begin a turn at the present simulated time."""
+        self._go_on(turn, None)
+
+    def _go_on(self, turn: Turn, output: Any) -> None:
+        """Run a turn up to the next node that it awaits, and submit the input to that node."""
+        try:
+            node, value = turn.send(output)
+        except (StopIteration, TurnOver):
+            return
+        if node.pending is not None:
+            node.dropped += 1
+        node.pending = value, turn
+        self._start_if_free(node)
+
+    def call(
+        self, node: Node[In, Out], value: In, *, again: bool = False
+    ) -> tuple[Out, float] | None:
+        """Run a node at once, outside the queue and without using a core of the platform.
+
+        Args:
+            again: Repeat the newest invocation; otherwise the node waits until its end.
+
+        Returns:
+            Output, and latency until it takes effect, s; None if the node is busy, down or lost.
+        """
+        if node.busy or (self.now_s < node.free_s - _SAME_S and not again):
+            node.dropped += 1
+            return None
+        job = self._begin_job(node, value)
+        node.finished += 1
+        lost: NodeLost | None = None
+        try:
+            job.result(self.wall)
+        except NodeLost as loss:
+            lost = loss
+        latency_s = self._book(job)
+        node.free_s = max(node.free_s, self.now_s + latency_s)
+        if lost is None:
+            return job.output, latency_s
+        node.busy = True
+        gone_s = self.now_s + self.watchdog_s if lost.hung else self.now_s
+        self._note_loss(node, gone_s, lost)
+        self._at(gone_s + self.restart_s, self._restart, node)
+        return None
+
+    # Time
+
+    def advance(self, stamp_s: float) -> None:
+        """Let all outputs take effect that are due up to `stamp_s`, in the order of time."""
+        while self._events and self._events[0][0] <= stamp_s:
+            due_s, _, event = heapq.heappop(self._events)
+            self.now_s = max(self.now_s, due_s)
+            event()
+        self.now_s = max(self.now_s, stamp_s)
+
+    def compute(self) -> None:
+        """Begin the computation of all started invocations. May be called at any time."""
+        while self._uncomputed:
+            self._uncomputed.pop(0).begin(self.wall)
+
+    def _at(self, stamp_s: float, event: Callable[..., None], *about: Any) -> None:
+        due: Callable[[], None] = functools.partial(event, *about)
+        heapq.heappush(self._events, (stamp_s, self._count, due))
+        self._count += 1
+
+    def _start_if_free(self, node: AnyNode) -> None:
+        if node.busy or node.pending is None or any(mate.busy for mate in node.mates):
+            return
+        if self._working >= self.cores:
+            if node not in self._waiting:
+                self._waiting.append(node)
+            return
+        (value, turn), node.pending = node.pending, None
+        node.busy = True
+        job = self._begin_job(node, value)
+        job.turn = turn
+        if self.compute_first:
+            job.begin(self.wall)
+        latency_s = self._book(job)
+        self._working += 1
+        self._uncomputed.append(job)
+        self._jobs[node.name] = job
+        self._at(self.now_s + latency_s, self._finish, job)
+
+    def _begin_job(self, node: AnyNode, value: Any) -> _Job:
+        node.invocations += 1
+        node.on_start(value, self.now_s)
+        return _Job(node=node, start_s=self.now_s, input=value)
+
+    def _book(self, job: _Job) -> float:
+        """Draw the latency of an invocation and add it to the timetable."""
+        latency_s = self.draw_latency_s(job.node.name)
+        job.node.busy_s += latency_s
+        end_s = job.start_s + latency_s
+        self.timetable.append(Invocation(node=job.node.name, start_s=job.start_s, end_s=end_s))
+        return latency_s
+
+    def _finish(self, job: _Job) -> None:
+        if job.cancelled:
+            return
+        job.node.finished += 1
+        self._jobs.pop(job.node.name, None)
+        try:
+            output = job.result(self.wall)
+        except NodeLost as loss:
+            self._lose(job, loss)
+            return
+        job.node.busy = False
+        assert job.turn is not None
+        self._go_on(job.turn, output)  # its core is still busy, so new invocations queue last
+        self._start_next(job.node)
+        self._working -= 1
+        self._start_waiting()
+
+    def _start_next(self, node: AnyNode) -> None:
+        """Start the next node of the process that has an input."""
+        for each in (*node.mates, node):
+            self._start_if_free(each)
+
+    def _start_waiting(self) -> None:
+        while self._waiting and self._working < self.cores:
+            self._start_if_free(self._waiting.pop(0))
+
+    # Ends of processes
 
     def settle(self) -> None:
         """Wait for pending computations, so that a fault does not depend on the host's speed."""
@@ -198,16 +335,22 @@ class Executor:
                 job.settle(self.wall)
         self._jobs.clear()
 
-    def kill(self, name: str, stamp_s: float) -> None:
+    def close(self) -> None:
+        """End the processes of all nodes."""
+        for node in self.nodes.values():
+            if node.process is not None:
+                node.process.close(kill=True)
+                node.process = None
+
+    def kill(self, name: str) -> None:
         """Kill the process of a node as a signal would. Does nothing if the node is down.
 
         Its present and waiting inputs are lost.
 
         Args:
             name: Name of a node in a separate process.
-            stamp_s: Present stamp, s.
         """
-        node = self._nodes[name]
+        node = self.nodes[name]
         together = (node, *node.mates)
         jobs = [self._jobs.pop(each.name) for each in together if each.name in self._jobs]
         if not jobs and any(each.busy for each in together):
@@ -217,142 +360,19 @@ class Executor:
             job.cancelled = True
             self._working -= 1
         node.busy, node.pending = True, None
-        self._note_loss(node, stamp_s, NodeLost(hung=False, how="killed by SIGKILL"))
-        self._at(stamp_s + self.restart_s, lambda up_s: self._restart(node, up_s))
+        self._note_loss(node, self.now_s, NodeLost(hung=False, how="killed by SIGKILL"))
+        self._at(self.now_s + self.restart_s, self._restart, node)
         self._start_waiting()
 
-    def close(self) -> None:
-        """End the processes of all nodes."""
-        for node in self._nodes.values():
-            if node.process is not None:
-                node.process.close(kill=True)
-                node.process = None
-
-    def call(
-        self, name: str, value: Any, stamp_s: float, *, again: bool = False
-    ) -> tuple[Any, float] | None:
-        """Run a node at once, outside the queue and without using a core of the platform.
-
-        Args:
-            again: Repeat the newest invocation; otherwise the node waits until its end.
-
-        Returns:
-            Output, and latency until it takes effect, s; None if the node is busy, down or lost.
-        """
-        node = self._nodes[name]
-        if node.busy or (stamp_s < node.free_s - _SAME_S and not again):
-            node.dropped += 1
-            return None
-        node.invocations += 1
-        node.finished += 1
-        self.on_start(name, value, stamp_s)
-        output: Any = None
-        lost: NodeLost | None = None
-        try:
-            output = _Job(node=node, start_s=stamp_s, input=value).result(self.wall)
-        except NodeLost as loss:
-            lost = loss
-        latency_s = self.draw_latency_s(name)
-        self._book(name, stamp_s, latency_s)
-        node.free_s = max(node.free_s, stamp_s + latency_s)
-        if lost is None:
-            return output, latency_s
-        node.busy = True
-        gone_s = stamp_s + self.watchdog_s if lost.hung else stamp_s
-        self._note_loss(node, gone_s, lost)
-        self._at(gone_s + self.restart_s, lambda stamp_s: self._restart(node, stamp_s))
-        return None
-
-    @property
-    def nodes(self) -> dict[str, Node]:
-        """All nodes by name, in the order of their addition."""
-        return self._nodes
-
-    def submit(self, name: str, value: Any) -> None:
-        """Submit an input, which must not be None, to a node at the present simulated time."""
-        node = self._nodes[name]
-        if node.pending is not None:
-            node.dropped += 1
-        node.pending = value
-        self._start_if_free(node)
-
-    def advance(self, stamp_s: float) -> None:
-        """Publish all outputs that are due up to `stamp_s`, in the order of time."""
-        while self._events and self._events[0][0] <= stamp_s:
-            due_s, _, event = heapq.heappop(self._events)
-            self.now_s = max(self.now_s, due_s)
-            event(due_s)
-        self.now_s = max(self.now_s, stamp_s)
-
-    def compute(self) -> None:
-        """Begin the computation of all started invocations. May be called at any time."""
-        while self._uncomputed:
-            self._uncomputed.pop(0).begin(self.wall)
-
-    def _book(self, name: str, start_s: float, latency_s: float) -> None:
-        """Add an invocation to the timetable."""
-        self._nodes[name].busy_s += latency_s
-        end_s = start_s + latency_s
-        self.timetable.append(Invocation(node=name, start_s=start_s, end_s=end_s))
-
-    def _start_if_free(self, node: Node) -> None:
-        if node.busy or node.pending is None or any(mate.busy for mate in node.mates):
-            return
-        if self._working >= self.cores:
-            if node not in self._waiting:
-                self._waiting.append(node)
-            return
-        job = _Job(node=node, start_s=self.now_s, input=node.pending)
-        node.pending = None
-        node.busy = True
-        node.invocations += 1
-        self.on_start(node.name, job.input, job.start_s)
-        if self.compute_first:
-            job.begin(self.wall)
-        latency_s = self.draw_latency_s(node.name)
-        self._book(node.name, job.start_s, latency_s)
-        self._working += 1
-        self._uncomputed.append(job)
-        self._jobs[node.name] = job
-        self._at(self.now_s + latency_s, lambda stamp_s: self._finish(job, stamp_s))
-
-    def _at(self, stamp_s: float, event: _Event) -> None:
-        heapq.heappush(self._events, (stamp_s, self._count, event))
-        self._count += 1
-
-    def _finish(self, job: _Job, end_s: float) -> None:
-        if job.cancelled:
-            return
-        job.node.finished += 1
-        self._jobs.pop(job.node.name, None)
-        try:
-            output = job.result(self.wall)
-        except NodeLost as loss:
-            self._lose(job, end_s, loss)
-            return
-        job.node.busy = False
-        job.node.publish(output, end_s)  # its core is still busy, so new invocations queue last
-        self._start_next(job.node)
-        self._working -= 1
-        self._start_waiting()
-
-    def _start_next(self, node: Node) -> None:
-        """Start the next node of the process that has an input."""
-        for each in (*node.mates, node):
-            self._start_if_free(each)
-
-    def _start_waiting(self) -> None:
-        while self._waiting and self._working < self.cores:
-            self._start_if_free(self._waiting.pop(0))
-
-    def _lose(self, job: _Job, end_s: float, loss: NodeLost) -> None:
+    def _lose(self, job: _Job, loss: NodeLost) -> None:
         """Handle a lost output: the node stays busy until its death, then until its restart."""
+        end_s = self.now_s
         gone_s = max(end_s, job.start_s + self.watchdog_s) if loss.hung else end_s
         job.node.busy_s += gone_s - end_s
         self._note_loss(job.node, gone_s, loss)
-        self._at(gone_s, lambda stamp_s: self._end_process(job.node, stamp_s))
+        self._at(gone_s, self._end_process, job.node)
 
-    def _note_loss(self, node: Node, gone_s: float, loss: NodeLost) -> None:
+    def _note_loss(self, node: AnyNode, gone_s: float, loss: NodeLost) -> None:
         entry = Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how,
                      traceback=loss.traceback)  # fmt: skip
         node.losses.append(entry)
@@ -360,12 +380,12 @@ class Executor:
         for mate in node.mates:
             mate.pending = None
 
-    def _end_process(self, node: Node, stamp_s: float) -> None:
+    def _end_process(self, node: AnyNode) -> None:
         self._working -= 1
-        self._at(stamp_s + self.restart_s, lambda up_s: self._restart(node, up_s))
+        self._at(self.now_s + self.restart_s, self._restart, node)
         self._start_waiting()
 
-    def _restart(self, node: Node, _stamp_s: float) -> None:
+    def _restart(self, node: AnyNode) -> None:
         """Start a new process with fresh state, as the nodes' copies in this process never ran."""
         if node.process is not None:
             node.process.close(kill=True)
@@ -376,5 +396,5 @@ class Executor:
             each.restarts += 1
             each.busy = False
         for each in together:
-            each.on_restart(each)
+            each.on_restart()
         self._start_next(node)

@@ -8,32 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
-from mavfi_cli.autonomy.orders import Directive, PlanFailure, PlanRequest
+from mavfi_cli.autonomy.orders import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.planners.base import PlanningParams
 from mavfi_cli.core.seeds import Stream, derive
-from mavfi_cli.core.types import (
-    CollisionReport,
-    Command,
-    DepthFrame,
-    FloatArray,
-    PointCloud,
-    Trajectory,
-    VehicleState,
-)
+from mavfi_cli.core.types import CollisionReport, Command, DepthFrame, PointCloud, Trajectory
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import Stack
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckInput:
-    """Input of the collision check."""
-
-    snapshot: occupancy.MapSnapshot
-    trajectory: Trajectory | None
-    time_s: float
-    position_enu_m: FloatArray | None = None  # (3,) vehicle; None if the path is not shifted to it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,23 +30,6 @@ class ControlInput:
     goes_on: bool = False
     fresh: tracking.TrackingState | None  # state to compute from instead of the controller's own
     yaw_rad: float  # vehicle's yaw, for the first invocation of the controller
-
-
-def tracking_inputs(
-    stamp_s: float, state: VehicleState, directive: Directive
-) -> tracking.TrackingInputs:
-    """Build the controller's inputs from the pilot's directive in the tick of a state."""
-    return tracking.TrackingInputs(
-        stamp_s=stamp_s,
-        position_enu_m=state.position_enu_m,
-        velocity_enu_mps=state.velocity_enu_mps,
-        trajectory=directive.trajectory,
-        time_s=directive.time_s,
-        rate=directive.rate,
-        rate_change_per_s=directive.rate_change_per_s,
-        hold_enu_m=directive.hold_enu_m,
-        hold_yaw_rad=directive.hold_yaw_rad,
-    )
 
 
 class Kernels:
@@ -118,19 +83,13 @@ class Kernels:
         self._map.insert(cloud)
         return self._map.snapshot()
 
-    def collision_check(self, check: CheckInput, stamp_s: float) -> tuple[CollisionReport, float]:
-        """Check a trajectory. Return the report and the stamp of its map's frame."""
-        inputs = collision.CollisionInputs(
-            stamp_s=stamp_s,
-            snapshot=check.snapshot,
-            trajectory=self._as_read(check.trajectory),
-            time_s=check.time_s,
-            front_enu_m=check.position_enu_m,
-        )
+    def collision_check(self, inputs: collision.CollisionInputs, stamp_s: float) -> CollisionReport:
+        """Check a trajectory."""
+        read = replace(inputs, stamp_s=stamp_s, trajectory=self._as_read(inputs.trajectory))
         self._collision_state, report = collision.step(
-            self._collision_state, inputs, self._collision_params
+            self._collision_state, read, self._collision_params
         )
-        return report, check.snapshot.stamp_s
+        return report
 
     def planner(
         self, job: tuple[PlanRequest, occupancy.MapSnapshot], _stamp_s: float
@@ -140,29 +99,14 @@ class Kernels:
         newest = request.trajectory_seq
         if self._stack.owns_sequence_numbers:
             newest, self._plans = self._plans, self._plans + 1
-        found = planning.plan(
+        return planning.plan(
             self._planner,
-            planning.StageInputs(
-                snapshot=snapshot,
-                position_enu_m=request.position_enu_m,
-                departure=smoothing.Departure(
-                    stamp_s=request.stamp_s,
-                    velocity_enu_mps=request.velocity_enu_mps,
-                    yaw_rad=request.yaw_rad,
-                ),
-                goal_enu_m=request.goal_enu_m,
-                bounds_enu_m=self._bounds_enu_m,
-                sequence=smoothing.Sequence(
-                    trajectory_seq=_next_int32(newest),
-                    future_collision_seq=request.future_collision_seq,
-                ),
-                seed=derive(self._seed, Stream.PLANNER, request.attempt),
-            ),
-            self._planning_params,
+            replace(request, trajectory_seq=_next_int32(newest)),
+            snapshot,
+            bounds_enu_m=self._bounds_enu_m,
+            seed=derive(self._seed, Stream.PLANNER, request.attempt),
+            params=self._planning_params,
         )
-        if found.trajectory is None:
-            return PlanFailure(stamp_s=request.stamp_s, reason=found.reason)
-        return found.trajectory
 
     def control(self, job: ControlInput, _stamp_s: float) -> Command:
         """Run one control tick."""

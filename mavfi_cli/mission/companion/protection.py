@@ -59,33 +59,51 @@ class _Recovery:
     in_a_row: int = 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Decision about a message, and the alarm that caused it."""
+
+    response: Response
+    alarm: Alarm | None = None
+
+    @property
+    def withheld(self) -> bool:
+        """True if the message does not take effect."""
+        return self.response in (Response.RECOMPUTE, Response.HOLD)
+
+    def blames(self, stage: Stage) -> bool:
+        """Return True if the alarm names this stage as the one to recompute."""
+        return self.alarm is not None and self.alarm.stage is stage
+
+
+PASSED = Verdict(response=Response.PASS)
+
+
 class NoProtection:
     """Null object that lets every message pass."""
 
     gate: Gate | None = None
 
-    def report(self, report: CollisionReport, stamp_s: float) -> tuple[Response, Stage]:
+    def report(self, report: CollisionReport, stamp_s: float) -> Verdict:
         """Passes."""
-        return Response.PASS, Stage.PERCEPTION
+        return PASSED
 
-    def plan(self, plan: Trajectory, stamp_s: float) -> Response:
+    def plan(self, plan: Trajectory, stamp_s: float) -> Verdict:
         """Passes."""
-        return Response.PASS
+        return PASSED
 
     def lose_plan(self) -> None:
         """Do nothing."""
 
-    def ahead(
-        self, plan: Trajectory, first: int, only: int | None, stamp_s: float
-    ) -> tuple[Response, Alarm | None]:
+    def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Verdict:
         """Passes."""
-        return Response.PASS, None
+        return PASSED
 
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
-    ) -> tuple[Response, Stage]:
+    ) -> Verdict:
         """Passes."""
-        return Response.PASS, Stage.CONTROL
+        return PASSED
 
     def news(self) -> list[str]:
         """Return no news."""
@@ -120,56 +138,54 @@ class Protection(NoProtection):
         self._news: list[str] = []
         self._told_s: dict[Stage, float] = {}
 
-    def report(self, report: CollisionReport, stamp_s: float) -> tuple[Response, Stage]:
-        """Judge a collision report on its arrival. Return the stage to recompute, too."""
+    def report(self, report: CollisionReport, stamp_s: float) -> Verdict:
+        """Judge a collision report on its arrival."""
         alarm = self._judge("report", self.gate.judge_report, report)
         if alarm is None:
             self._recovered(Stage.PERCEPTION, stamp_s, proven=True)
-            return Response.PASS, Stage.PERCEPTION
-        response = self._respond(alarm, "report", Stage.PERCEPTION, stamp_s)
-        if response is Response.ACCEPT:
+            return PASSED
+        verdict = self._respond(alarm, "report", Stage.PERCEPTION, stamp_s)
+        if not verdict.withheld:
             self.gate.accept_report()
-        return response, alarm.stage
+        return verdict
 
-    def plan(self, plan: Trajectory, stamp_s: float) -> Response:
+    def plan(self, plan: Trajectory, stamp_s: float) -> Verdict:
         """Judge a plan on its arrival."""
         alarm = self._judge("plan", self.gate.judge_plan, plan)
         if alarm is None:
             self._recovered(Stage.PLANNING, stamp_s, proven=False)
-            return Response.PASS
-        response = self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
-        if response is Response.ACCEPT:
+            return PASSED
+        verdict = self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
+        if not verdict.withheld:
             self.gate.accept_plan(plan)
-        return response
+        return verdict
 
     def lose_plan(self) -> None:
         """Note that the planner has answered without a usable plan."""
         self.gate.lose_plan()
 
-    def ahead(
-        self, plan: Trajectory, first: int, only: int | None, stamp_s: float
-    ) -> tuple[Response, Alarm | None]:
+    def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Verdict:
         """Judge the active plan from the present waypoint on, or a single waypoint."""
         alarm = self._judge("ahead", self.gate.judge_ahead, plan, first)
         if alarm is None or only not in (None, alarm.waypoint):
-            return Response.PASS, None
-        return self._respond(alarm, "ahead", alarm.stage, stamp_s), alarm
+            return PASSED
+        return self._respond(alarm, "ahead", alarm.stage, stamp_s)
 
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
-    ) -> tuple[Response, Stage]:
-        """Judge the present waypoint and the command. Return the stage at fault, too."""
+    ) -> Verdict:
+        """Judge the present waypoint and the command."""
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         if alarm is None:
             flown = Stage.PLANNING in self.gate.fresh
             self._recovered(Stage.CONTROL, stamp_s, proven=flown or self.gate.detector.per_stage)
             if flown:
                 self._recoveries[Stage.PLANNING].in_a_row = 0
-            return Response.PASS, Stage.CONTROL
-        response = self._respond(alarm, "tick", alarm.stage, stamp_s)
-        if response is Response.ACCEPT:
+            return PASSED
+        verdict = self._respond(alarm, "tick", alarm.stage, stamp_s)
+        if not verdict.withheld:
             self.gate.accept_tick()
-        return response, alarm.stage
+        return verdict
 
     def _judge(self, kind: str, check: Callable[..., Alarm | None], *message: Any) -> Alarm | None:
         self._checks[kind] += 1
@@ -178,7 +194,7 @@ class Protection(NoProtection):
         self._wall.add("gate", perf_counter() - begun_s)
         return alarm
 
-    def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Response:
+    def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Verdict:
         recovery = self._recoveries[stage]
         recovery.in_a_row += 1
         if recovery.in_a_row < self._config.alarms_max:
@@ -205,7 +221,7 @@ class Protection(NoProtection):
                 )
             )
         self._tell(alarm, stage, response, stamp_s)
-        return response
+        return Verdict(response=response, alarm=alarm)
 
     def _tell(self, alarm: Alarm, stage: Stage, response: Response, stamp_s: float) -> None:
         last_s = self._told_s.get(stage)

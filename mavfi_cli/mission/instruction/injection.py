@@ -16,8 +16,9 @@ from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion.executor import Executor
+from mavfi_cli.mission.companion.injection import SCHEMA, NoInjection
 from mavfi_cli.mission.companion.node_process import NodeProcess
-from mavfi_cli.mission.injection import SCHEMA, NoInjection
+
 from mavfi_cli.mission.instruction.plan import PlannedFault, plan_fault, planned_of
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.orders import Recorder
@@ -41,6 +42,7 @@ class InstructionInjection(NoInjection):
         spawned: ServedProcess,
         for_debugger: Callable[[int], None] | None = None,
     ) -> None:
+        super().__init__()
         self._planned = planned
         self._spawned = spawned
         self._for_debugger = for_debugger

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.link.images import ImageReceiver
-from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.executor import Node
+from mavfi_cli.mission.companion.pipeline import Companion
 
 
 def mission_statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def plan_lines(companion: Companion | None) -> list[dict[str, Any]]:
     ]
 
 
-def _work(node: Node) -> dict[str, Any]:
+def _work(node: Node[Any, Any]) -> dict[str, Any]:
     return {
         "invocations": node.invocations,
         "dropped_inputs": node.dropped,
@@ -45,7 +45,7 @@ def _work(node: Node) -> dict[str, Any]:
     }
 
 
-def _ends(node: Node) -> dict[str, Any]:
+def _ends(node: Node[Any, Any]) -> dict[str, Any]:
     """Return the crashes and hangs of a node."""
     crashes = [
         {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_atomically
-from mavfi_cli.mission.companion.companion import Companion
 from mavfi_cli.mission.companion.executor import Invocation
-from mavfi_cli.mission.companion.response import Reaction
+from mavfi_cli.mission.companion.pipeline import Companion, Reaction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +35,19 @@ def timetable_of(companion: Companion | None) -> Timetable:
     return Timetable(
         invocations=tuple(companion.executor.timetable), reactions=tuple(companion.reactions)
     )
+
+
+def response_times(reactions: Sequence[Reaction]) -> dict[str, float | None]:
+    """Return median and 95th percentile of the response time, s."""
+    times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])
+    times = times[np.isfinite(times)]
+    if not len(times):
+        return {"median": None, "p95": None, "count": 0}
+    return {
+        "median": round(float(np.median(times)), 9),
+        "p95": round(float(np.percentile(times, 95.0)), 9),
+        "count": len(times),
+    }
 
 
 _RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's

@@ -1,31 +1,28 @@
-"""Injection of a fault into a mission, and its record on disk."""
+"""Injection of a source-level fault into a mission, and its record on disk."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.types import CollisionReport, Command, Trajectory
+from mavfi_cli.core.states import Message
+from mavfi_cli.core.types import Trajectory
 from mavfi_cli.detect.gate import Gate
 from mavfi_cli.fi.source.activation import Follower, Reader
-from mavfi_cli.fi.source.fault import SourceFault, Trigger
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
 from mavfi_cli.fi.source.memory import MemoryInjector
 from mavfi_cli.fi.source.schedule import Moment, Schedule
-from mavfi_cli.spec.fault import PROCESS, FaultConfig
+from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.companion.executor import Executor
+from mavfi_cli.mission.companion.protection import NoProtection, gate_of
+from mavfi_cli.spec.fault import DETECTOR, PROCESS, FaultConfig
+from mavfi_cli.spec.mission import MissionConfig
 
-if TYPE_CHECKING:
-    from mavfi_cli.mission.briefing import Briefing
-    from mavfi_cli.mission.companion.executor import Executor
-    from mavfi_cli.spec.mission import MissionConfig
-
-M = TypeVar("M", CollisionReport, Trajectory, Command)
-
+M = TypeVar("M")
 SCHEMA = 1
 
 
@@ -37,13 +34,15 @@ class NoInjection:
         in_queue: True if the injection site is control's copy of the plan.
     """
 
-    follower: Follower | None = None
     in_queue = False
+
+    def __init__(self) -> None:
+        self.follower = Follower()
 
     def watch(self, moment: Moment) -> None:
         """Observe the mission once per control tick and before every report."""
 
-    def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
+    def pass_on(self, message: M, moment: Moment) -> M:
         """Return the message unchanged."""
         return message
 
@@ -69,15 +68,37 @@ class NoInjection:
         return None
 
 
+class _Injector(Protocol):
+    """Decides when a fault strikes, and lists its strikes."""
+
+    drawn_time_s: float
+    strikes: list[Strike]
+
+    @property
+    def count(self) -> int: ...
+
+    @property
+    def missed(self) -> str: ...
+
+    def watch(self, moment: Moment) -> None: ...
+
+
 class _Recorded(NoInjection, ABC):
     """Record of a fault, written before the flight, at the first strike and at the end."""
 
+    _injector: _Injector
+
     def __init__(self, config: FaultConfig) -> None:
+        super().__init__()
         self._config = config
         self._path: Path | None = None
         self._state = "planned"
         self._news: list[str] = []
-        self._strike: Strike | None = None
+        self._strike: Strike | None = None  # the newest
+
+    def watch(self, moment: Moment) -> None:
+        """Update the trigger."""
+        self._injector.watch(moment)
 
     def begin(self, path: Path) -> None:
         """Write the planned fault before the flight."""
@@ -88,10 +109,6 @@ class _Recorded(NoInjection, ABC):
         """Return one line per strike since the last call."""
         news, self._news = self._news, []
         return news
-
-    @abstractmethod
-    def _missed(self) -> str:
-        """Return the reason why the fault has not struck."""
 
     def _on_strike(self, strike: Strike) -> None:
         """Write the first strike to disk before its message is passed on."""
@@ -112,18 +129,50 @@ class _Recorded(NoInjection, ABC):
 
     def record(self) -> dict[str, Any]:
         """Return the requested fault, the drawn values and the strikes."""
-        reason = self._missed() if self._state == "not_injected" else ""
+        stage, units = self._site()
+        activation, reader = self._activation()
+        trigger, injector = self._config.trigger(), self._injector
         return {
             "schema": SCHEMA,
             "level": "source",
             "state": self._state,
-            "reason": reason,
+            "reason": injector.missed if self._state == "not_injected" else "",
             "request": self._config.to_dict(),
+            "stage": stage,
+            "states": list(units),
+            "units": list(units.values()),
+            "trigger": {
+                "when": trigger.when.value,
+                "number": trigger.number,
+                "phase": trigger.phase,
+                "drawn_time_s": injector.drawn_time_s,
+            },
+            "strikes": [asdict(strike) for strike in injector.strikes],
+            "strike_count": injector.count,
+            "activation": {
+                "activation": activation,
+                "first_reader": asdict(reader) if reader else None,
+            },
         }
+
+    @abstractmethod
+    def _site(self) -> tuple[str, dict[str, str]]:
+        """Return the stage, and the unit of each attacked state by name."""
+
+    @abstractmethod
+    def _activation(self) -> tuple[str, Reader | None]:
+        """Return the activation and the first reader of the corrupted values."""
+
+    def _read_at_once(self, name: str, state: str) -> tuple[str, Reader | None]:
+        """Return the activation of a fault that the first strike activates."""
+        if not self._injector.strikes:
+            return "not_injected", None
+        stamp_s = self._injector.strikes[0].stamp_s
+        return "read", Reader(name=name, stamp_s=stamp_s, state=state)
 
 
 class SourceInjection(_Recorded):
-    """Injection of one source-level fault into a mission.
+    """Injection of one fault into the messages between nodes, or into the active plan.
 
     Args:
         config: Configuration of the fault.
@@ -132,26 +181,17 @@ class SourceInjection(_Recorded):
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
         super().__init__(config)
-        self._fault: SourceFault = config.draw()
-        self._injector = SourceInjector(
-            self._fault,
+        self._injector: SourceInjector = SourceInjector(
+            config.draw(),
             seed=config.seed,
             shortest_flight_s=shortest_flight_s,
             listener=self._on_strike,
         )
-        self.follower: Follower = Follower()
         self.in_queue = config.strikes_queue
 
-    def watch(self, moment: Moment) -> None:
-        """Update the trigger."""
-        self._injector.watch(moment)
-
-    def _missed(self) -> str:
-        return self._injector.missed
-
-    def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
+    def pass_on(self, message: M, moment: Moment) -> M:
         """Return the message as its receiver gets it, corrupted if the fault strikes."""
-        return self._followed(message, self._injector.pass_on(message, moment, index))
+        return self._followed(message, self._injector.pass_on(message, moment))
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
         """Return the active trajectory from this tick on, corrupted if the fault strikes."""
@@ -159,26 +199,16 @@ class SourceInjection(_Recorded):
         return self._followed(trajectory, struck)
 
     def _followed(self, message: M, sent: M) -> M:
-        if sent is not message and self._strike is not None:
+        if sent is not message and self._strike is not None and isinstance(sent, Message):
             self.follower.struck(sent, self._strike)
         return sent
 
-    def record(self) -> dict[str, Any]:
-        """Return the requested fault, the drawn values and the strikes."""
-        fault, reader = self._fault, self.follower.reader
-        return {
-            **super().record(),
-            "stage": fault.states[0].stage.value,
-            "states": [state.name for state in fault.states],
-            "units": [state.unit for state in fault.states],
-            "trigger": trigger_record(fault.trigger, self._injector.drawn_time_s),
-            "strikes": [asdict(strike) for strike in self._injector.strikes],
-            "strike_count": self._injector.count,
-            "activation": {
-                "activation": self.follower.activation.value,
-                "first_reader": asdict(reader) if reader else None,
-            },
-        }
+    def _site(self) -> tuple[str, dict[str, str]]:
+        states = self._injector.fault.states
+        return states[0].stage.value, {state.name: state.unit for state in states}
+
+    def _activation(self) -> tuple[str, Reader | None]:
+        return self.follower.activation.value, self.follower.reader
 
 
 class DetectorInjection(_Recorded):
@@ -194,11 +224,10 @@ class DetectorInjection(_Recorded):
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float, gate: Gate) -> None:
         super().__init__(config)
-        self._trigger = config.trigger()
-        self._injector = MemoryInjector(
+        self._injector: MemoryInjector = MemoryInjector(
             gate.memory,
             config.detector_part,
-            trigger=self._trigger,
+            trigger=config.trigger(),
             corruption=config.corruption(),
             bits=config.exact_bits,
             seed=config.seed,
@@ -206,37 +235,48 @@ class DetectorInjection(_Recorded):
             listener=self._on_strike,
         )
 
-    def watch(self, moment: Moment) -> None:
-        """Update the trigger."""
-        self._injector.watch(moment)
-
-    def _missed(self) -> str:
-        return self._injector.missed
-
     def strike_memory(self, moment: Moment) -> None:
-        """Corrupt the detector's memory if the trigger fires."""
+        """Strike the detector's memory if the fault is due."""
         self._injector.strike(moment)
 
-    def record(self) -> dict[str, Any]:
-        """Return the requested fault, the drawn values and the strikes."""
-        applied = self._state == "applied"
-        return {
-            **super().record(),
-            "stage": "detector",
-            "states": [self._injector.array],
-            "units": ["1"],
-            "trigger": trigger_record(self._trigger, self._injector.drawn_time_s),
-            "strikes": [asdict(strike) for strike in self._injector.strikes],
-            "strike_count": self._injector.count,
-            "activation": {
-                "activation": "read" if applied else "not_injected",
-                "first_reader": self._reader() if applied else None,
-            },
-        }
+    def _site(self) -> tuple[str, dict[str, str]]:
+        return DETECTOR, {self._injector.array: "1"}
 
-    def _reader(self) -> dict[str, Any]:
-        stamp_s = self._injector.strikes[0].stamp_s
-        return asdict(Reader(name="detector", stamp_s=stamp_s, state=self._injector.array))
+    def _activation(self) -> tuple[str, Reader | None]:
+        return self._read_at_once(DETECTOR, self._injector.array)
+
+
+class _Killer:
+    """Decides when the process of a node is killed, which happens once."""
+
+    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
+        rng = generator(config.seed, Stream.FAULT, "process")
+        self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
+        self._schedule = Schedule(config.trigger(), config.corruption(), self.drawn_time_s)
+        self.strikes: list[Strike] = []
+        self.watch = self._schedule.watch
+
+    @property
+    def count(self) -> int:
+        """Number of kills."""
+        return len(self.strikes)
+
+    @property
+    def missed(self) -> str:
+        """Reason why the fault has not struck."""
+        return self._schedule.missed("control tick")
+
+    def strike(self, moment: Moment) -> Strike | None:
+        """Return the kill if it is due now."""
+        if not self._schedule.due(moment):
+            return None
+        self._schedule.acted(moment)
+        strike = Strike(
+            stamp_s=moment.stamp_s, tick=moment.tick, phase=moment.phase, invocation=moment.tick,
+            changes=(),
+        )  # fmt: skip
+        self.strikes.append(strike)
+        return strike
 
 
 class ProcessInjection(_Recorded):
@@ -245,75 +285,55 @@ class ProcessInjection(_Recorded):
     Args:
         config: Configuration of the fault. Its target is `process.NODE`.
         shortest_flight_s: Interval from which a random trigger is drawn, s.
-
-    Attributes:
-        node: Node whose process is killed.
-        kill: Function that kills a node's process at a stamp, s. Set it before the flight.
     """
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
         super().__init__(config)
         assert config.killed_node is not None
-        self.node = config.killed_node
-        self.kill: Callable[[str, float], None] = lambda _node, _stamp_s: None
-        rng = generator(config.seed, Stream.FAULT, "process")
-        self._drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
-        self._schedule = Schedule(config.trigger(), config.corruption(), self._drawn_time_s)
+        self._node = config.killed_node
+        self._injector: _Killer = _Killer(config, shortest_flight_s)
+        self._executor: Executor | None = None
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
         """Have the node that is killed work in a process of its own."""
-        executor.isolate(self.node)
-        self.kill = executor.kill
-
-    def watch(self, moment: Moment) -> None:
-        """Update the trigger."""
-        self._schedule.watch(moment)
-
-    def _missed(self) -> str:
-        return self._schedule.missed("control tick")
+        self._executor = executor
+        executor.isolate(self._node)
 
     def strike_memory(self, moment: Moment) -> None:
         """Kill the process if the trigger fires."""
-        if not self._schedule.due(moment):
-            return
-        self._schedule.acted(moment)
-        strike = Strike(
-            stamp_s=moment.stamp_s, tick=moment.tick, phase=moment.phase, invocation=moment.tick,
-            changes=(),
-        )  # fmt: skip
-        self._on_strike(strike)
-        self.kill(self.node, moment.stamp_s)
-
-    def record(self) -> dict[str, Any]:
-        """Return the requested fault, the drawn values and the kill."""
-        strike = self._strike
-        reader = None
+        strike = self._injector.strike(moment)
         if strike is not None:
-            target = self._config.target
-            reader = asdict(Reader(name=self.node, stamp_s=strike.stamp_s, state=target))
-        return {
-            **super().record(),
-            "stage": PROCESS,
-            "states": [self._config.target],
-            "units": [""],
-            "trigger": trigger_record(self._config.trigger(), self._drawn_time_s),
-            "strikes": [] if strike is None else [asdict(strike)],
-            "strike_count": int(strike is not None),
-            "activation": {
-                "activation": "not_injected" if strike is None else "read",
-                "first_reader": reader,
-            },
-        }
+            self._on_strike(strike)
+            assert self._executor is not None
+            self._executor.kill(self._node)
+
+    def _site(self) -> tuple[str, dict[str, str]]:
+        return PROCESS, {self._config.target: ""}
+
+    def _activation(self) -> tuple[str, Reader | None]:
+        return self._read_at_once(self._node, self._config.target)
 
 
-def trigger_record(trigger: Trigger, drawn_time_s: float) -> dict[str, Any]:
-    """Return a trigger as plain values."""
-    return {
-        "when": trigger.when.value,
-        "number": trigger.number,
-        "phase": trigger.phase,
-        "drawn_time_s": drawn_time_s,
-    }
+def injection_of(
+    config: FaultConfig | None, shortest_flight_s: float, protection: NoProtection
+) -> NoInjection:
+    """Create the injection of a source-level fault, or the null object without a fault.
+
+    Args:
+        config: Fault.
+        shortest_flight_s: Interval from which a random trigger is drawn, s.
+        protection: Protection whose detector the fault may corrupt.
+
+    Raises:
+        FaultSpecError: A fault in the detector needs one.
+    """
+    if config is None:
+        return NoInjection()
+    if config.killed_node is not None:
+        return ProcessInjection(config, shortest_flight_s)
+    if config.attacks_detector:
+        return DetectorInjection(config, shortest_flight_s, gate_of(protection))
+    return SourceInjection(config, shortest_flight_s)
 
 
 def strike_text(strike: Strike) -> str:

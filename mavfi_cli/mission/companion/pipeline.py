@@ -1,0 +1,482 @@
+"""The companion computer: from a depth frame to a setpoint, in the order of the methods below.
+
+    depth frame -> point cloud -> OctoMap -> collision check -> pilot -> tracking -> setpoint
+                                     |                            |  ^
+                                     +------------> planner <-----+--+
+
+A line `output = self.publish(await self._node.run(value))` submits the value to a node and goes on
+after the node's latency in simulated time. Every output passes through `publish`, where a fault may
+strike it and the detector may withhold it. A withheld message ends the turn.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mavfi_cli.autonomy.collision import CollisionInputs
+from mavfi_cli.autonomy.occupancy import MapSnapshot, empty_snapshot
+from mavfi_cli.autonomy.orders import PilotMode, PlanRequest
+from mavfi_cli.autonomy.pilot import Pilot, PilotParams
+from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
+from mavfi_cli.autonomy.trajectory import waypoint_index
+from mavfi_cli.core.states import Message, of_stage
+from mavfi_cli.core.types import (
+    CollisionReport,
+    Command,
+    DepthFrame,
+    PointCloud,
+    Stage,
+    Trajectory,
+    VehicleState,
+)
+from mavfi_cli.core.wall import WallClock
+from mavfi_cli.fi.source.schedule import Moment
+from mavfi_cli.mission.briefing import Briefing
+from mavfi_cli.mission.companion.executor import Executor, Node, TurnOver
+from mavfi_cli.mission.companion.injection import NoInjection
+from mavfi_cli.mission.companion.kernels import ControlInput, Kernels
+from mavfi_cli.mission.companion.protection import PASSED, NoProtection, Response, Verdict
+from mavfi_cli.mission.companion.recovery import Recovery
+from mavfi_cli.mission.latency import latency_model
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import PlatformProfile
+from mavfi_cli.spec.stack import Stack
+
+M = TypeVar("M", PointCloud, MapSnapshot, CollisionReport, Trajectory, Command)
+
+# A command computed within one physics step of the vehicle is sent in the tick of its state,
+# because the simulation does not resolve shorter delays.
+SAME_TICK_S = 0.004
+ATTEMPTS = 2  # maximum recomputations of a command in one tick
+BRAKE_SHARE = 0.6  # fraction of a_max assumed for stopping, as in planned motion
+
+# Monitored states that the receivers of a message read.
+REPORT_STATES = {state.name for state in of_stage(Stage.PERCEPTION)}
+COMMAND_STATES = {state.name for state in of_stage(Stage.CONTROL)}
+FOLLOWED_STATES = {s.name for s in of_stage(Stage.PLANNING) if s.name.startswith("waypoint_")}
+PLAN_STATES = {s.name for s in of_stage(Stage.PLANNING)} - FOLLOWED_STATES
+CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
+
+
+class Withheld(TurnOver):
+    """The detector withholds a message."""
+
+    def __init__(self, verdict: Verdict) -> None:
+        super().__init__()
+        self.verdict = verdict
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setpoint:
+    """A computed command and its inputs."""
+
+    due_s: float  # end of control's computation
+    command: Command
+    inputs: TrackingInputs
+    waypoint: int  # index in the trajectory of the inputs
+    attempt: int  # number of recomputations
+    frame_s: float | None  # stamp of a depth frame that no earlier command has used
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reaction:
+    """Response of the pipeline to one depth frame."""
+
+    frame_stamp_s: float
+    setpoint_stamp_s: float
+
+
+class Companion:
+    """Perception, planning and control of one mission.
+
+    Attributes:
+        pilot: The mission's state machine.
+        executor: Nodes and simulated time.
+        report, command: Newest messages that took effect.
+        plans: All plans that took effect.
+        reactions: Depth frames with the first setpoint that depends on each.
+    """
+
+    def __init__(
+        self,
+        config: MissionConfig,
+        stack: Stack,
+        platform: PlatformProfile,
+        planner: Planner,
+        briefing: Briefing,
+        wall: WallClock,
+        injection: NoInjection,
+        protection: NoProtection,
+    ) -> None:
+        self._config, self._stack = config, stack
+        self._injection, self._follower = injection, injection.follower
+        self.protection = protection
+        self.pilot = Pilot(_pilot_params(config, stack), briefing.goal_enu_m)
+        self._recovery = Recovery(protection, self.pilot, self._follower, self._see_again)
+        self._latency = latency_model(platform, config.seed, wall)
+        self.executor = Executor(
+            draw_latency_s=self._latency.draw_s,
+            cores=platform.cores,
+            compute_first=platform.measured_factor is not None,
+            wall=wall,
+            restart_s=config.node_restart_s,
+            watchdog_s=config.node_watchdog_s,
+        )
+        kernels, add = Kernels(config, stack, planner, briefing), self.executor.add
+        self._point_cloud = add(Node("point_cloud", kernels.point_cloud))
+        self._octomap = add(Node("octomap", kernels.octomap, on_restart=self._octomap_is_up))
+        self._collision_check = add(
+            Node("collision_check", kernels.collision_check, on_start=self._check_starts)
+        )
+        self._planner = add(Node("planner", kernels.planner, on_restart=self._planner_is_up))
+        self._control = add(Node("control", kernels.control, on_restart=self._control_is_up))
+        for nodes in stack.processes:
+            self.executor.share_process(nodes)
+        self._frame: DepthFrame | None = None
+        self._map: MapSnapshot | None = None
+        self._heard_seq = 0  # newest future_collision_seq known to the planner
+        self._queued: Trajectory | None = None  # control's copy of the plan
+        self._setpoints: deque[Setpoint] = deque()  # computed, not yet due
+        self._state: VehicleState | None = None
+        self._fresh_frame_s: float | None = None
+        self._takeover_s: float | None = None
+        self._ticks = 0
+        self.report: CollisionReport | None = None
+        self.command: Command | None = None
+        self.plans: list[Trajectory] = []
+        self.reactions: list[Reaction] = []
+
+    # Perception
+
+    def take_frame(self, frame: DepthFrame) -> None:
+        """Handle a new depth image."""
+        self._frame = frame
+        self.executor.start(self._see(frame))
+
+    async def _see(self, frame: DepthFrame) -> None:
+        """Add a frame to the map, and check the active plan against the new map."""
+        cloud = self.publish(await self._point_cloud.run(frame))
+        self._map = self.publish(await self._octomap.run(cloud))
+        await self._check()
+
+    async def _check(self) -> None:
+        """Check the rest of the active plan against the newest map, and tell the pilot."""
+        self._recovery.look_ahead(self._now_s)
+        active, snapshot = self.pilot.active, self._map
+        if snapshot is None or active.trajectory is None:
+            return
+        active.checked = active.trajectory
+        shifts = self._stack.shifts_path_to_vehicle and self._state is not None
+        inputs = CollisionInputs(
+            stamp_s=self._now_s,
+            snapshot=snapshot,
+            trajectory=active.trajectory,
+            time_s=active.time_s,
+            front_enu_m=self._state.position_enu_m if shifts and self._state else None,
+        )
+        report = await self._collision_check.run(inputs)
+        self._fresh_frame_s = snapshot.stamp_s
+        self.report = report = self.publish(report)
+        if report.collision:
+            self._heard_seq = max(self._heard_seq, report.future_collision_seq)
+        timely = self.pilot.on_report(report)
+        read = REPORT_STATES if timely else REPORT_STATES - {"time_to_collision"}
+        self._follower.read(report, "mission logic", self._now_s, read)
+
+    def _see_again(self) -> None:
+        """Recompute perception from the newest frame."""
+        if self._frame is not None:
+            self.executor.start(self._see(self._frame))
+
+    # Planning
+
+    async def _plan(self, request: PlanRequest) -> None:
+        """Plan a trajectory on the newest map, and give it to the pilot."""
+        assert self._map is not None
+        if self._stack.owns_sequence_numbers:
+            request = replace(request, future_collision_seq=self._heard_seq)
+        result = await self._planner.run((request, self._map))
+        if isinstance(result, Trajectory):
+            result = self.publish(result)
+            self.plans.append(result)
+            self._follower.read(result, "mission logic", self._now_s, PLAN_STATES)
+        else:
+            self.protection.lose_plan()
+        self.pilot.on_plan(result)
+
+    # Control
+
+    def tick(self, state: VehicleState) -> Command | None:
+        """Run one control tick in flight and return the command to send now.
+
+        The caller must call `executor.advance` before and `executor.compute` after it.
+        """
+        if self._takeover_s is None:
+            self._takeover_s = self._now_s
+        if not self.sees:
+            return None
+        self._ticks += 1
+        self._state = self._recovery.state = state
+        copy = self._strike_memory()
+        directive = self.pilot.update(self._now_s, state)
+        self._injection.watch(self._moment())
+        if directive.plan is not None:
+            self.executor.start(self._plan(directive.plan))
+        inputs = directive.tracking
+        if inputs.trajectory is not None:
+            if inputs.trajectory is not self.pilot.active.checked:
+                self.executor.start(self._check())
+            if copy is not None:
+                inputs = replace(inputs, trajectory=copy)
+        setpoint = self._track(inputs)
+        if setpoint is not None:  # otherwise the node is busy or down, and the last command holds
+            self._setpoints.append(setpoint)
+        while self._setpoints and self._setpoints[0].due_s <= self._now_s:
+            self._send(self._setpoints.popleft())
+        return self.command
+
+    def _track(
+        self, inputs: TrackingInputs, attempt: int = 0, fresh: TrackingState | None = None
+    ) -> Setpoint | None:
+        """Compute a command, which is due after control's latency.
+
+        Args:
+            inputs: Vehicle's state and reference.
+            attempt: Number of earlier computations of this command.
+            fresh: State of the controller to begin with; None for its own.
+        """
+        assert self._state is not None
+        followed = inputs.trajectory
+        goes_on = self._stack.control_owns_queue and followed is self._queued
+        job = ControlInput(
+            inputs=replace(inputs, trajectory=None) if goes_on else inputs,
+            goes_on=goes_on,
+            fresh=fresh,
+            yaw_rad=self._state.yaw_rad,
+        )
+        called = self.executor.call(self._control, job, again=attempt > 0)
+        if called is None:
+            return None
+        self._queued = followed
+        command, latency_s = called
+        frame_s, self._fresh_frame_s = self._fresh_frame_s, None
+        return Setpoint(
+            due_s=self._now_s + (latency_s if latency_s >= SAME_TICK_S else 0.0),
+            command=command,
+            inputs=inputs,
+            waypoint=0 if followed is None else waypoint_index(followed, inputs.time_s),
+            attempt=attempt,
+            frame_s=frame_s,
+        )
+
+    def _send(self, setpoint: Setpoint) -> None:
+        """Let a due command take effect."""
+        try:
+            command = self.publish(setpoint.command, setpoint)
+        except Withheld as withheld:
+            if self._fresh_frame_s is None:
+                self._fresh_frame_s = setpoint.frame_s  # still without a setpoint
+            self._track_again(setpoint, withheld.verdict)
+            return
+        self.command = command
+        active = self.pilot.active
+        active.pace = command.pace
+        if command.skips_waypoint and setpoint.inputs.trajectory is active.trajectory:
+            active.skip_waypoint()
+        self._follower.read(command, "setpoint", self._now_s, COMMAND_STATES)
+        if setpoint.frame_s is not None:
+            self.reactions.append(
+                Reaction(frame_stamp_s=setpoint.frame_s, setpoint_stamp_s=self._now_s)
+            )
+
+    def _track_again(self, setpoint: Setpoint, verdict: Verdict) -> None:
+        """Recompute a withheld command, in this tick if the platform is fast enough.
+
+        If that did not help, or the waypoint is at fault, drop the waypoint and begin with a fresh
+        state. After ATTEMPTS alarms the last command holds until the next tick.
+        """
+        if verdict.response is Response.HOLD or setpoint.attempt >= ATTEMPTS:
+            return
+        assert self._state is not None
+        inputs, fresh, last = setpoint.inputs, None, self.command
+        if verdict.blames(Stage.PLANNING) or setpoint.attempt > 0:
+            if inputs.trajectory is not None:
+                bridged = self._recovery.drop(inputs.trajectory, setpoint.waypoint)
+                inputs = replace(inputs, trajectory=bridged)
+            if last is not None:
+                fresh = TrackingState(yaw_rad=last.yaw_rad, stamp_s=last.stamp_s)
+        inputs = replace(
+            inputs,
+            stamp_s=self._now_s,
+            position_enu_m=self._state.position_enu_m,
+            velocity_enu_mps=self._state.velocity_enu_mps,
+        )
+        renewed = self._track(inputs, setpoint.attempt + 1, fresh)
+        if renewed is None:
+            return
+        if renewed.due_s <= self._now_s:
+            self._send(renewed)
+        else:
+            self._setpoints.append(renewed)
+
+    # Every message
+
+    def publish(self, message: M, setpoint: Setpoint | None = None) -> M:
+        """Give a kernel's output to its receivers. Return it as they get it.
+
+        Args:
+            message: Output of a kernel.
+            setpoint: Setpoint of a command.
+
+        Raises:
+            Withheld: The detector withholds the message. Its recovery has begun.
+        """
+        moment = self._moment(foresees=isinstance(message, CollisionReport) and message.collision)
+        if isinstance(message, CollisionReport):
+            self._injection.watch(moment)
+        message = self._injection.pass_on(message, moment)
+        if isinstance(message, Message):  # clouds and maps contain no monitored state
+            verdict = self._judge(message, setpoint)
+            if verdict.withheld:
+                self._recovery.recover(message, verdict)
+                raise Withheld(verdict)
+        return message
+
+    def _judge(self, message: Message, setpoint: Setpoint | None) -> Verdict:
+        """Have the detector judge a message. A plan that is no longer needed is not judged."""
+        if isinstance(message, CollisionReport):
+            return self.protection.report(message, self._now_s)
+        if isinstance(message, Command):
+            assert setpoint is not None
+            followed = setpoint.inputs.trajectory
+            return self.protection.tick(followed, setpoint.waypoint, message, self._now_s)
+        if self.pilot.expects(message):
+            return self.protection.plan(message, self._now_s)
+        self.protection.lose_plan()
+        return PASSED
+
+    def _strike_memory(self) -> Trajectory | None:
+        """Let a fault strike memory, and the detector look at the active plan, before its use.
+
+        If control owns its queue, its copy is the active trajectory, and control passes the rest of
+        it to the other nodes. Otherwise the next tick replaces the copy.
+
+        Returns:
+            Trajectory that control uses in this tick instead of the active one; None if it is the
+            same.
+        """
+        active, moment, copy = self.pilot.active, self._moment(), None
+        self._injection.strike_memory(moment)
+        flown = active.trajectory
+        if flown is not None:
+            struck = self._injection.strike_latched(flown, moment, active.waypoint)
+            if self._injection.in_queue and not self._stack.control_owns_queue:
+                copy = None if struck is flown else struck
+            else:
+                active.exchange(flown, struck)
+            self._recovery.look_round(self._now_s, flown)
+        self._follow(copy)
+        return copy
+
+    def _follow(self, copy: Trajectory | None) -> None:
+        """Note that mission logic and control read the present waypoint and the next yaw."""
+        follower, active = self._follower, self.pilot.active
+        if not follower.waits:
+            return
+        flown = copy or active.trajectory
+        if flown is not None:
+            at = active.waypoint
+            follower.read(flown, "control", self._now_s, FOLLOWED_STATES, at)
+            follower.read(flown, "control", self._now_s, {"waypoint_yaw"}, at + 1)
+        follower.settle(lambda m: m is self.report or m is copy or self.pilot.holds(m))
+
+    def _check_starts(self, inputs: CollisionInputs, start_s: float) -> None:
+        """Note that the collision check has read its trajectory."""
+        self._follower.read(inputs.trajectory, "collision_check", start_s, CHECKED_STATES)
+
+    # Restarts of nodes
+
+    def _octomap_is_up(self) -> None:
+        """Nodes in OctoMap's process have lost the map."""
+        if self._octomap.mates:
+            self._map = empty_snapshot(self._config.map_resolution_m)
+
+    def _planner_is_up(self) -> None:
+        """Repeat the lost request unless a newer one is waiting."""
+        self._heard_seq = 0
+        if self._planner.pending is None:
+            self.pilot.plan_lost()
+
+    def _control_is_up(self) -> None:
+        """If control owned its queue, the pilot requests a new plan."""
+        if self._stack.control_owns_queue and self._state is not None:
+            self._queued = None
+            self.pilot.control_lost(self._state)
+
+    # Views
+
+    @property
+    def _now_s(self) -> float:
+        return self.executor.now_s
+
+    def _moment(self, *, foresees: bool = False) -> Moment:
+        takeover_s = self._now_s if self._takeover_s is None else self._takeover_s
+        return Moment(
+            stamp_s=self._now_s,
+            flight_s=self._now_s - takeover_s,
+            tick=self._ticks,
+            phase=self.pilot.mode.value,
+            foresees=foresees,
+        )
+
+    @property
+    def measured(self) -> dict[str, Any] | None:
+        """Return factor and medians of a measured platform; None for any other."""
+        return self._latency.summary()
+
+    @property
+    def sees(self) -> bool:
+        """True once there is a map, which planning needs."""
+        return self._map is not None
+
+    @property
+    def tracked(self) -> tuple[Trajectory, int] | None:
+        """Return the tracked trajectory and the index of its present waypoint."""
+        trajectory = self.pilot.active.trajectory
+        if trajectory is None or not len(trajectory.waypoints):
+            return None
+        return trajectory, self.pilot.active.waypoint
+
+    @property
+    def mode(self) -> PilotMode:
+        """Present mode of the pilot."""
+        return self.pilot.mode
+
+    def goal_distance_m(self, state: VehicleState) -> float:
+        """Return the distance to the goal, m."""
+        return float(np.linalg.norm(state.position_enu_m - self.pilot.goal_enu_m))
+
+
+def _pilot_params(config: MissionConfig, stack: Stack) -> PilotParams:
+    return PilotParams(
+        goal_tolerance_m=stack.goal_tolerance_m,
+        v_max_mps=config.v_max_mps,
+        a_max_mps2=config.a_max_mps2,
+        brake_mps2=BRAKE_SHARE * config.a_max_mps2,
+        guards_tracking=stack.guards_tracking,
+        tracking_error_max_m=stack.tracking_guard_m,
+        stops_on_report=stack.stops_on_report,
+        uses_time_to_collision=stack.uses_time_to_collision,
+        acts_on_report_once=stack.acts_on_report_once,
+        owns_sequence_numbers=stack.owns_sequence_numbers,
+        plans_in_motion=stack.plans_in_motion,
+        arrives_at_rest=stack.arrives_at_rest,
+        turns_before_departure=stack.turns_before_departure,
+        rejected_plan_pause_s=stack.rejected_plan_pause_s,
+        slows_where_blind=stack.slows_where_blind,
+    )
