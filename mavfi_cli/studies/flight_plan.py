@@ -14,11 +14,11 @@ from pathlib import Path
 from mavfi_cli.analysis.overhead import TIMES
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_text
+from mavfi_cli.mission.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import DEFAULT
-from mavfi_cli.mission.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.vpm.model import safe_velocity_mps
 from mavfi_cli.vpm.schemes import DETECTORS, Scheme
 from mavfi_cli.vpm.setting import ModelInputs, outcome

@@ -14,7 +14,6 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect import model
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission.companion import protection as protection_module
-from mavfi_cli.mission.companion.protection import Protection, Response
 from mavfi_cli.mission.companion.protection import PASSED, Protection, Response
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run

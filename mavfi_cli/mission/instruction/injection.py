@@ -18,7 +18,6 @@ from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.mission.companion.executor import Executor
 from mavfi_cli.mission.companion.injection import SCHEMA, NoInjection
 from mavfi_cli.mission.companion.node_process import NodeProcess
-
 from mavfi_cli.mission.instruction.plan import PlannedFault, plan_fault, planned_of
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.orders import Recorder
