@@ -18,6 +18,10 @@ import numpy as np
 from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import TURN_S
 from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.companion.briefing import Briefing, require_flyable
+from mavfi_cli.companion.injection import NoInjection, injection_of
+from mavfi_cli.companion.pipeline import Companion
+from mavfi_cli.companion.protection import protection_of
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
@@ -27,10 +31,6 @@ from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.transport import Transport
-from mavfi_cli.mission.briefing import Briefing, require_flyable
-from mavfi_cli.mission.companion.injection import NoInjection, injection_of
-from mavfi_cli.mission.companion.pipeline import Companion
-from mavfi_cli.mission.companion.protection import protection_of
 from mavfi_cli.mission.flight_logger import FlightLogger
 from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.progress import Watcher

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from mavfi_cli.autonomy.orders import PilotMode
+from mavfi_cli.companion.injection import NoInjection
+from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
-from mavfi_cli.mission.companion.injection import NoInjection
-from mavfi_cli.mission.companion.pipeline import Companion
 from mavfi_cli.mission.progress import FlightProgress, Watcher
 from mavfi_cli.mission.record.events import EventLog
 

@@ -16,10 +16,10 @@ from mavfi_cli.attack.kernels.inputs import (
 )
 from mavfi_cli.autonomy import tracking
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
+from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.companion.kernels import ControlInput
 from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.mission import MissionConfig

@@ -23,10 +23,10 @@ import numpy as np
 
 from mavfi_cli import __version__
 from mavfi_cli.autonomy import is_compiled, planners, warm_up
+from mavfi_cli.companion import briefing
+from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission import briefing
-from mavfi_cli.mission.companion.injection import NoInjection
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.progress import Watcher

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mavfi_cli.analysis.overhead import TIMES
+from mavfi_cli.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_text
-from mavfi_cli.mission.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile

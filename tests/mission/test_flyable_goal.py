@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from mavfi_cli.companion.briefing import FARTHEST_M, Briefing, require_flyable
+from mavfi_cli.companion.kernels import _next_int32
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.mission.briefing import FARTHEST_M, Briefing, require_flyable
-from mavfi_cli.mission.companion.kernels import _next_int32
 
 
 def briefing(*goal: float) -> Briefing:

@@ -8,12 +8,12 @@ from missions import POSTS
 
 from mavfi_cli.attack.kernels.scope import kernel_scope
 from mavfi_cli.autonomy import warm_up
+from mavfi_cli.companion import node_process
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED, decode
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.fault import InstructionFault, Role, Stage, explicit_corruption
 from mavfi_cli.fi.tracer.image import Image, Location
-from mavfi_cli.mission.companion import node_process
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import fly_mission

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from mavfi_cli.mission.latency import LatencyModel
+from mavfi_cli.companion.latency import LatencyModel
 from mavfi_cli.mission.record.timetable import read_timetable
 from mavfi_cli.spec.platform import KERNELS, load_platform
 

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
+from mavfi_cli.companion.executor import Executor, Node
+from mavfi_cli.companion.latency import latency_model
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.mission.companion.executor import Executor, Node
-from mavfi_cli.mission.latency import latency_model
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.report.summary import measured_lines

@@ -9,8 +9,8 @@ import pytest
 
 from mavfi_cli.autonomy import planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import OccupancyMap
-from mavfi_cli.mission.companion import node_process
-from mavfi_cli.mission.companion.executor import Executor, Node
+from mavfi_cli.companion import node_process
+from mavfi_cli.companion.executor import Executor, Node
 from mavfi_cli.mission.record.run_folder import load_run
 
 

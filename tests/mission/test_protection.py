@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from mavfi_cli.campaign.specification_file import load_spec
+from mavfi_cli.companion import protection as protection_module
+from mavfi_cli.companion.protection import PASSED, Protection, Response
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, OtherStack, UnknownName
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect import model
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
-from mavfi_cli.mission.companion import protection as protection_module
-from mavfi_cli.mission.companion.protection import PASSED, Protection, Response
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of, differing_results, same_file

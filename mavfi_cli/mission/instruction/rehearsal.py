@@ -16,6 +16,7 @@ import numpy as np
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
 from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.fault import Stage
@@ -23,7 +24,6 @@ from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.fi.tracer.windows import WindowTooLong
-from mavfi_cli.mission.companion.node_process import NodeProcess
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 
 Order = tuple[Any, float]  # input, start stamp

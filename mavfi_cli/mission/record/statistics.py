@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.companion.executor import Node
+from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.link.images import ImageReceiver
-from mavfi_cli.mission.companion.executor import Node
-from mavfi_cli.mission.companion.pipeline import Companion
 
 
 def mission_statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:

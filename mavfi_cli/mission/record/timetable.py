@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mavfi_cli.companion.executor import Invocation
+from mavfi_cli.companion.pipeline import Companion, Reaction
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_atomically
-from mavfi_cli.mission.companion.executor import Invocation
-from mavfi_cli.mission.companion.pipeline import Companion, Reaction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

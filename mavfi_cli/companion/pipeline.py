@@ -24,6 +24,13 @@ from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
 from mavfi_cli.autonomy.trajectory import waypoint_index
+from mavfi_cli.companion.briefing import Briefing
+from mavfi_cli.companion.executor import Executor, Node, TurnOver
+from mavfi_cli.companion.injection import NoInjection
+from mavfi_cli.companion.kernels import ControlInput, Kernels
+from mavfi_cli.companion.latency import latency_model
+from mavfi_cli.companion.protection import PASSED, NoProtection, Response, Verdict
+from mavfi_cli.companion.recovery import Recovery
 from mavfi_cli.core.states import Message, of_stage
 from mavfi_cli.core.types import (
     CollisionReport,
@@ -36,13 +43,6 @@ from mavfi_cli.core.types import (
 )
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.source.schedule import Moment
-from mavfi_cli.mission.briefing import Briefing
-from mavfi_cli.mission.companion.executor import Executor, Node, TurnOver
-from mavfi_cli.mission.companion.injection import NoInjection
-from mavfi_cli.mission.companion.kernels import ControlInput, Kernels
-from mavfi_cli.mission.companion.protection import PASSED, NoProtection, Response, Verdict
-from mavfi_cli.mission.companion.recovery import Recovery
-from mavfi_cli.mission.latency import latency_model
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import Stack

@@ -28,8 +28,8 @@ from collections.abc import Callable, Coroutine, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeAlias, TypeVar
 
+from mavfi_cli.companion.node_process import NodeLost, NodeProcess
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.mission.companion.node_process import NodeLost, NodeProcess
 
 In = TypeVar("In")
 Out = TypeVar("Out")

@@ -7,6 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from mavfi_cli.companion.briefing import Briefing
+from mavfi_cli.companion.executor import Executor
+from mavfi_cli.companion.protection import NoProtection, gate_of
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import Message
@@ -16,9 +19,6 @@ from mavfi_cli.fi.source.activation import Follower, Reader
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
 from mavfi_cli.fi.source.memory import MemoryInjector
 from mavfi_cli.fi.source.schedule import Moment, Schedule
-from mavfi_cli.mission.briefing import Briefing
-from mavfi_cli.mission.companion.executor import Executor
-from mavfi_cli.mission.companion.protection import NoProtection, gate_of
 from mavfi_cli.spec.fault import DETECTOR, PROCESS, FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 

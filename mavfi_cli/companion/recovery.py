@@ -23,10 +23,10 @@ from collections.abc import Callable
 
 from mavfi_cli.autonomy.pilot import Pilot
 from mavfi_cli.autonomy.trajectory import without_waypoint
+from mavfi_cli.companion.protection import NoProtection, Response, Verdict
 from mavfi_cli.core.states import Message
 from mavfi_cli.core.types import CollisionReport, Stage, Trajectory, VehicleState
 from mavfi_cli.fi.source.activation import Follower
-from mavfi_cli.mission.companion.protection import NoProtection, Response, Verdict
 
 
 class Recovery:

@@ -11,9 +11,9 @@ from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoo
 from mavfi_cli.autonomy.orders import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.planners.base import PlanningParams
+from mavfi_cli.companion.briefing import Briefing
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import CollisionReport, Command, DepthFrame, PointCloud, Trajectory
-from mavfi_cli.mission.briefing import Briefing
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import Stack
 

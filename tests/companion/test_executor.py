@@ -3,7 +3,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.mission.companion.executor import Executor, Node, TurnOver
+from mavfi_cli.companion.executor import Executor, Node, TurnOver
 
 
 class Story(Executor):

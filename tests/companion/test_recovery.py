@@ -5,11 +5,11 @@ import pytest
 
 from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams
+from mavfi_cli.companion.protection import PASSED, NoProtection, Response, Verdict
+from mavfi_cli.companion.recovery import Recovery
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.detect.gate import Alarm
 from mavfi_cli.fi.source.activation import Follower
-from mavfi_cli.mission.companion.protection import PASSED, NoProtection, Response, Verdict
-from mavfi_cli.mission.companion.recovery import Recovery
 
 STATE = VehicleState(
     stamp_s=1.0, position_enu_m=np.array([1.4, 0.0, 0.0]), velocity_enu_mps=np.zeros(3),
