@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-from mavfi_cli.companion.briefing import Briefing
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.protection import NoProtection, gate_of
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import Message
-from mavfi_cli.core.types import Trajectory
+from mavfi_cli.core.types import Briefing, Trajectory
 from mavfi_cli.detect.gate import Gate
 from mavfi_cli.fi.source.activation import Follower, Reader
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
@@ -68,25 +66,50 @@ class NoInjection:
         return None
 
 
-class _Injector(Protocol):
-    """Decides when a fault strikes, and lists its strikes."""
+class _Killer:
+    """Decides when the process of a node is killed, which happens once."""
 
-    drawn_time_s: float
-    strikes: list[Strike]
+    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
+        rng = generator(config.seed, Stream.FAULT, "process")
+        self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
+        self._schedule = Schedule(config.trigger(), config.corruption(), self.drawn_time_s)
+        self.strikes: list[Strike] = []
+        self.watch = self._schedule.watch
 
     @property
-    def count(self) -> int: ...
+    def count(self) -> int:
+        """Number of kills."""
+        return len(self.strikes)
 
     @property
-    def missed(self) -> str: ...
+    def missed(self) -> str:
+        """Reason why the fault has not struck."""
+        return self._schedule.missed("control tick")
 
-    def watch(self, moment: Moment) -> None: ...
+    def strike(self, moment: Moment) -> Strike | None:
+        """Return the kill if it is due now."""
+        if not self._schedule.due(moment):
+            return None
+        self._schedule.acted(moment)
+        strike = Strike(
+            stamp_s=moment.stamp_s, tick=moment.tick, phase=moment.phase, invocation=moment.tick,
+            changes=(),
+        )  # fmt: skip
+        self.strikes.append(strike)
+        return strike
 
 
-class _Recorded(NoInjection, ABC):
-    """Record of a fault, written before the flight, at the first strike and at the end."""
+class _Recorded(NoInjection):
+    """Record of a fault, written before the flight, at the first strike and at the end.
 
-    _injector: _Injector
+    A subclass sets its injector, the attacked stage, the unit of each attacked state by name, and
+    who reads what is corrupted.
+    """
+
+    _injector: SourceInjector | MemoryInjector | _Killer
+    _stage: str
+    _units: dict[str, str]
+    _reader = ""
 
     def __init__(self, config: FaultConfig) -> None:
         super().__init__()
@@ -129,7 +152,6 @@ class _Recorded(NoInjection, ABC):
 
     def record(self) -> dict[str, Any]:
         """Return the requested fault, the drawn values and the strikes."""
-        stage, units = self._site()
         activation, reader = self._activation()
         trigger, injector = self._config.trigger(), self._injector
         return {
@@ -138,9 +160,9 @@ class _Recorded(NoInjection, ABC):
             "state": self._state,
             "reason": injector.missed if self._state == "not_injected" else "",
             "request": self._config.to_dict(),
-            "stage": stage,
-            "states": list(units),
-            "units": list(units.values()),
+            "stage": self._stage,
+            "states": list(self._units),
+            "units": list(self._units.values()),
             "trigger": {
                 "when": trigger.when.value,
                 "number": trigger.number,
@@ -155,20 +177,12 @@ class _Recorded(NoInjection, ABC):
             },
         }
 
-    @abstractmethod
-    def _site(self) -> tuple[str, dict[str, str]]:
-        """Return the stage, and the unit of each attacked state by name."""
-
-    @abstractmethod
     def _activation(self) -> tuple[str, Reader | None]:
-        """Return the activation and the first reader of the corrupted values."""
-
-    def _read_at_once(self, name: str, state: str) -> tuple[str, Reader | None]:
-        """Return the activation of a fault that the first strike activates."""
+        """Return the activation and the first reader, who reads what is corrupted at once."""
         if not self._injector.strikes:
             return "not_injected", None
         stamp_s = self._injector.strikes[0].stamp_s
-        return "read", Reader(name=name, stamp_s=stamp_s, state=state)
+        return "read", Reader(name=self._reader, stamp_s=stamp_s, state=next(iter(self._units)))
 
 
 class SourceInjection(_Recorded):
@@ -187,6 +201,9 @@ class SourceInjection(_Recorded):
             shortest_flight_s=shortest_flight_s,
             listener=self._on_strike,
         )
+        states = self._injector.fault.states
+        self._stage = states[0].stage.value
+        self._units = {state.name: state.unit for state in states}
         self.in_queue = config.strikes_queue
 
     def pass_on(self, message: M, moment: Moment) -> M:
@@ -202,10 +219,6 @@ class SourceInjection(_Recorded):
         if sent is not message and self._strike is not None and isinstance(sent, Message):
             self.follower.struck(sent, self._strike)
         return sent
-
-    def _site(self) -> tuple[str, dict[str, str]]:
-        states = self._injector.fault.states
-        return states[0].stage.value, {state.name: state.unit for state in states}
 
     def _activation(self) -> tuple[str, Reader | None]:
         return self.follower.activation.value, self.follower.reader
@@ -234,49 +247,12 @@ class DetectorInjection(_Recorded):
             shortest_flight_s=shortest_flight_s,
             listener=self._on_strike,
         )
+        self._stage = self._reader = DETECTOR
+        self._units = {self._injector.array: "1"}
 
     def strike_memory(self, moment: Moment) -> None:
         """Strike the detector's memory if the fault is due."""
         self._injector.strike(moment)
-
-    def _site(self) -> tuple[str, dict[str, str]]:
-        return DETECTOR, {self._injector.array: "1"}
-
-    def _activation(self) -> tuple[str, Reader | None]:
-        return self._read_at_once(DETECTOR, self._injector.array)
-
-
-class _Killer:
-    """Decides when the process of a node is killed, which happens once."""
-
-    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
-        rng = generator(config.seed, Stream.FAULT, "process")
-        self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
-        self._schedule = Schedule(config.trigger(), config.corruption(), self.drawn_time_s)
-        self.strikes: list[Strike] = []
-        self.watch = self._schedule.watch
-
-    @property
-    def count(self) -> int:
-        """Number of kills."""
-        return len(self.strikes)
-
-    @property
-    def missed(self) -> str:
-        """Reason why the fault has not struck."""
-        return self._schedule.missed("control tick")
-
-    def strike(self, moment: Moment) -> Strike | None:
-        """Return the kill if it is due now."""
-        if not self._schedule.due(moment):
-            return None
-        self._schedule.acted(moment)
-        strike = Strike(
-            stamp_s=moment.stamp_s, tick=moment.tick, phase=moment.phase, invocation=moment.tick,
-            changes=(),
-        )  # fmt: skip
-        self.strikes.append(strike)
-        return strike
 
 
 class ProcessInjection(_Recorded):
@@ -290,8 +266,9 @@ class ProcessInjection(_Recorded):
     def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
         super().__init__(config)
         assert config.killed_node is not None
-        self._node = config.killed_node
+        self._node = self._reader = config.killed_node
         self._injector: _Killer = _Killer(config, shortest_flight_s)
+        self._stage, self._units = PROCESS, {config.target: ""}
         self._executor: Executor | None = None
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
@@ -306,12 +283,6 @@ class ProcessInjection(_Recorded):
             self._on_strike(strike)
             assert self._executor is not None
             self._executor.kill(self._node)
-
-    def _site(self) -> tuple[str, dict[str, str]]:
-        return PROCESS, {self._config.target: ""}
-
-    def _activation(self) -> tuple[str, Reader | None]:
-        return self._read_at_once(self._node, self._config.target)
 
 
 def injection_of(

@@ -5,17 +5,24 @@ If a node runs in its own process, its state is there, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
 from mavfi_cli.autonomy.orders import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.planners.base import PlanningParams
-from mavfi_cli.companion.briefing import Briefing
 from mavfi_cli.core.seeds import Stream, derive
-from mavfi_cli.core.types import CollisionReport, Command, DepthFrame, PointCloud, Trajectory
+from mavfi_cli.core.types import (
+    Briefing,
+    CollisionReport,
+    Command,
+    DepthFrame,
+    PointCloud,
+    Trajectory,
+)
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.stack import Stack
+from mavfi_cli.spec.stack import KEYS, Stack
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,9 +57,8 @@ class Kernels:
         )
         self._collision_params = collision.CollisionParams(
             radius_m=stack.check_radius_m,
-            refuses_far_waypoints=stack.refuses_far_waypoints,
             farthest_m=stack.farthest_waypoint_m,
-            owns_sequence_numbers=stack.owns_sequence_numbers,
+            **settings_of(stack, collision.CollisionParams),
         )
         self._collision_state = collision.CollisionState()
         self._planning_params = planning.StageParams(
@@ -67,8 +73,7 @@ class Kernels:
             kd=stack.damping_gain,
             v_max_mps=v_max,
             a_max_mps2=a_max,
-            stretches_clock=stack.stretches_clock,
-            skips_endless_slices=stack.skips_endless_slices,
+            **settings_of(stack, tracking.TrackingParams),
         )
         self._tracking_state: tracking.TrackingState | None = None
         self._queue: Trajectory | None = None  # control's own copy of the plan
@@ -129,6 +134,11 @@ class Kernels:
         waypoints = trajectory.waypoints.copy()
         waypoints[:, 7:10] = 0.0
         return replace(trajectory, waypoints=waypoints)
+
+
+def settings_of(stack: Stack, params: type) -> dict[str, Any]:
+    """Return the settings of a stack that the parameters of a kernel contain by the same name."""
+    return {each.name: getattr(stack, each.name) for each in fields(params) if each.name in KEYS}
 
 
 def _next_int32(value: int) -> int:

@@ -24,15 +24,15 @@ from mavfi_cli.autonomy.pilot import Pilot, PilotParams
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
 from mavfi_cli.autonomy.trajectory import waypoint_index
-from mavfi_cli.companion.briefing import Briefing
 from mavfi_cli.companion.executor import Executor, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.companion.kernels import ControlInput, Kernels
+from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of
 from mavfi_cli.companion.latency import latency_model
 from mavfi_cli.companion.protection import PASSED, NoProtection, Response, Verdict
 from mavfi_cli.companion.recovery import Recovery
 from mavfi_cli.core.states import Message, of_stage
 from mavfi_cli.core.types import (
+    Briefing,
     CollisionReport,
     Command,
     DepthFrame,
@@ -171,13 +171,13 @@ class Companion:
         if snapshot is None or active.trajectory is None:
             return
         active.checked = active.trajectory
-        shifts = self._stack.shifts_path_to_vehicle and self._state is not None
+        moved_to = self._state if self._stack.shifts_path_to_vehicle else None
         inputs = CollisionInputs(
             stamp_s=self._now_s,
             snapshot=snapshot,
             trajectory=active.trajectory,
             time_s=active.time_s,
-            front_enu_m=self._state.position_enu_m if shifts and self._state else None,
+            front_enu_m=None if moved_to is None else moved_to.position_enu_m,
         )
         report = await self._collision_check.run(inputs)
         self._fresh_frame_s = snapshot.stamp_s
@@ -277,13 +277,10 @@ class Companion:
     def _send(self, setpoint: Setpoint) -> None:
         """Let a due command take effect."""
         try:
-            command = self.publish(setpoint.command, setpoint)
+            command = self.command = self.publish(setpoint.command, setpoint)
         except Withheld as withheld:
-            if self._fresh_frame_s is None:
-                self._fresh_frame_s = setpoint.frame_s  # still without a setpoint
             self._track_again(setpoint, withheld.verdict)
             return
-        self.command = command
         active = self.pilot.active
         active.pace = command.pace
         if command.skips_waypoint and setpoint.inputs.trajectory is active.trajectory:
@@ -300,6 +297,8 @@ class Companion:
         If that did not help, or the waypoint is at fault, drop the waypoint and begin with a fresh
         state. After ATTEMPTS alarms the last command holds until the next tick.
         """
+        if self._fresh_frame_s is None:
+            self._fresh_frame_s = setpoint.frame_s  # still without a setpoint
         if verdict.response is Response.HOLD or setpoint.attempt >= ATTEMPTS:
             return
         assert self._state is not None
@@ -464,19 +463,9 @@ class Companion:
 
 def _pilot_params(config: MissionConfig, stack: Stack) -> PilotParams:
     return PilotParams(
-        goal_tolerance_m=stack.goal_tolerance_m,
         v_max_mps=config.v_max_mps,
         a_max_mps2=config.a_max_mps2,
         brake_mps2=BRAKE_SHARE * config.a_max_mps2,
-        guards_tracking=stack.guards_tracking,
         tracking_error_max_m=stack.tracking_guard_m,
-        stops_on_report=stack.stops_on_report,
-        uses_time_to_collision=stack.uses_time_to_collision,
-        acts_on_report_once=stack.acts_on_report_once,
-        owns_sequence_numbers=stack.owns_sequence_numbers,
-        plans_in_motion=stack.plans_in_motion,
-        arrives_at_rest=stack.arrives_at_rest,
-        turns_before_departure=stack.turns_before_departure,
-        rejected_plan_pause_s=stack.rejected_plan_pause_s,
-        slows_where_blind=stack.slows_where_blind,
+        **settings_of(stack, PilotParams),
     )

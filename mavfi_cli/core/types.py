@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -31,6 +32,17 @@ class Outcome(Enum):
     CRASH = "crash"
     HANG = "hang"
     INTERRUPTED = "interrupted"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Briefing:
+    """Start, goal, flight bounds and camera of a mission, known before the flight."""
+
+    start_enu_m: FloatArray  # (3,) on the ground
+    goal_enu_m: FloatArray  # (3,)
+    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax of the allowed volume
+    camera_offset_flu_m: FloatArray  # (3,) from the vehicle's centre to the optical centre
+    hfov_rad: float = math.pi / 2.0  # used until the camera reports its own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

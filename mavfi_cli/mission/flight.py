@@ -18,12 +18,11 @@ import numpy as np
 from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import TURN_S
 from mavfi_cli.autonomy.planners import Planner
-from mavfi_cli.companion.briefing import Briefing, require_flyable
 from mavfi_cli.companion.injection import NoInjection, injection_of
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import protection_of
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
-from mavfi_cli.core.types import FloatArray, Outcome, VehicleState
+from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
@@ -31,12 +30,13 @@ from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.transport import Transport
+from mavfi_cli.mission.briefing import require_flyable
 from mavfi_cli.mission.flight_logger import FlightLogger
-from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.events import EventLog
 from mavfi_cli.mission.record.trace import Trace
+from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import Stack

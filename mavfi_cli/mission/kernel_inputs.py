@@ -20,7 +20,7 @@ from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.orders import Recorder
+from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.mission import MissionConfig
 

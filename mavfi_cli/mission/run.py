@@ -23,12 +23,11 @@ import numpy as np
 
 from mavfi_cli import __version__
 from mavfi_cli.autonomy import is_compiled, planners, warm_up
-from mavfi_cli.companion import briefing
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.types import Outcome
+from mavfi_cli.mission import briefing
 from mavfi_cli.mission.flight import Flight
-from mavfi_cli.mission.orders import Recorder
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.plan_file import write_plans
@@ -36,6 +35,7 @@ from mavfi_cli.mission.record.run_folder import CRASH, RunFolder, new_run_folder
 from mavfi_cli.mission.record.statistics import mission_statistics, plan_lines
 from mavfi_cli.mission.record.timetable import response_times, timetable_of, write_timetable
 from mavfi_cli.mission.record.trace import write_trace
+from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.mission.vehicle import OtherEnd, StartVehicle, other_end, start_vehicle
 from mavfi_cli.spec.mission import MissionConfig, stack_of
 from mavfi_cli.spec.platform import load_platform

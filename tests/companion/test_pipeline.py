@@ -8,11 +8,10 @@ import pytest
 
 from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.orders import PilotMode
-from mavfi_cli.companion.briefing import Briefing
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import ATTEMPTS, Companion
 from mavfi_cli.companion.protection import PASSED, NoProtection, Response, Verdict
-from mavfi_cli.core.types import DepthFrame, Stage, Trajectory, VehicleState
+from mavfi_cli.core.types import Briefing, DepthFrame, Stage, Trajectory, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm
 from mavfi_cli.spec.mission import MissionConfig

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from mavfi_cli.companion.briefing import FARTHEST_M, Briefing, require_flyable
 from mavfi_cli.companion.kernels import _next_int32
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.types import Briefing
+from mavfi_cli.mission.briefing import FARTHEST_M, require_flyable
 
 
 def briefing(*goal: float) -> Briefing:

@@ -14,11 +14,11 @@ from click.testing import CliRunner
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.replay import replay
-from mavfi_cli.companion.briefing import of_config
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
+from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run

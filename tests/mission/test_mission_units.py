@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.companion import briefing
 from mavfi_cli.companion.pipeline import Reaction
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName, VehicleProcessError
 from mavfi_cli.core.files import plain, write_atomically, write_json, write_text
 from mavfi_cli.core.states import STATES
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory, VehicleState
+from mavfi_cli.mission import briefing
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.run_folder import load_run, new_run_folder
 from mavfi_cli.mission.record.timetable import response_times

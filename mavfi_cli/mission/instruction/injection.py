@@ -10,17 +10,17 @@ from typing import Any
 from mavfi_cli.attack.attacker import LiveAttack, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.served import ServedProcess
-from mavfi_cli.companion.briefing import Briefing
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import FaultError
+from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.instruction.plan import PlannedFault, plan_fault, planned_of
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
-from mavfi_cli.mission.orders import Recorder
+from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.spec.mission import MissionConfig
 
 _TIMING = ("stop_s",)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from mavfi_cli.attack.kernels.scope import node_scope
 from mavfi_cli.attack.served import channel, newest_cache_ns
 from mavfi_cli.autonomy import planners, warm_up
-from mavfi_cli.companion.briefing import Briefing
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.node_process import serve
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.channel import receive, send
+from mavfi_cli.core.types import Briefing
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.spec.mission import MissionConfig, stack_of
 from mavfi_cli.spec.platform import load_platform

@@ -7,31 +7,18 @@ the world. For a foreign autopilot the briefing comes from the command line.
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mavfi_cli.core.errors import ConfigError, VehicleProcessError
-from mavfi_cli.core.types import FloatArray
+from mavfi_cli.core.types import Briefing, FloatArray
 from mavfi_cli.spec.mission import MissionConfig
 
 FILE = "briefing.json"
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home
 FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
 MARGIN_M = 30.0  # flight bounds round home and goal without a known world
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Briefing:
-    """Start, goal, flight bounds and camera of a mission."""
-
-    start_enu_m: FloatArray  # (3,) on the ground
-    goal_enu_m: FloatArray  # (3,)
-    bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax of the allowed volume
-    camera_offset_flu_m: FloatArray  # (3,) from the vehicle's centre to the optical centre
-    hfov_rad: float = math.pi / 2.0  # used until the camera reports its own
 
 
 def of_simulation(folder: Path) -> Briefing:

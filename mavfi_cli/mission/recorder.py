@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mavfi_cli.companion.briefing import Briefing
+from mavfi_cli.core.types import Briefing
 
 
 class Recorder:
