@@ -141,22 +141,16 @@ class Protection(NoProtection):
     def report(self, report: CollisionReport, stamp_s: float) -> Verdict:
         """Judge a collision report on its arrival."""
         alarm = self._judge("report", self.gate.judge_report, report)
-        if alarm is None:
-            self._recovered(Stage.PERCEPTION, stamp_s, proven=True)
-            return PASSED
-        verdict = self._respond(alarm, "report", Stage.PERCEPTION, stamp_s)
-        if not verdict.withheld:
+        verdict = self._verdict(alarm, "report", Stage.PERCEPTION, stamp_s, proven=True)
+        if verdict.response is Response.ACCEPT:
             self.gate.accept_report()
         return verdict
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Verdict:
         """Judge a plan on its arrival."""
         alarm = self._judge("plan", self.gate.judge_plan, plan)
-        if alarm is None:
-            self._recovered(Stage.PLANNING, stamp_s, proven=False)
-            return PASSED
-        verdict = self._respond(alarm, "plan", Stage.PLANNING, stamp_s)
-        if not verdict.withheld:
+        verdict = self._verdict(alarm, "plan", Stage.PLANNING, stamp_s, proven=False)
+        if verdict.response is Response.ACCEPT:
             self.gate.accept_plan(plan)
         return verdict
 
@@ -176,14 +170,13 @@ class Protection(NoProtection):
     ) -> Verdict:
         """Judge the present waypoint and the command."""
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
-        if alarm is None:
-            flown = Stage.PLANNING in self.gate.fresh
-            self._recovered(Stage.CONTROL, stamp_s, proven=flown or self.gate.detector.per_stage)
-            if flown:
-                self._recoveries[Stage.PLANNING].in_a_row = 0
-            return PASSED
-        verdict = self._respond(alarm, "tick", alarm.stage, stamp_s)
-        if not verdict.withheld:
+        stage = Stage.CONTROL if alarm is None else alarm.stage
+        flown = Stage.PLANNING in self.gate.fresh
+        proven = flown or self.gate.detector.per_stage
+        verdict = self._verdict(alarm, "tick", stage, stamp_s, proven=proven)
+        if alarm is None and flown:
+            self._recoveries[Stage.PLANNING].in_a_row = 0
+        if verdict.response is Response.ACCEPT:
             self.gate.accept_tick()
         return verdict
 
@@ -193,6 +186,15 @@ class Protection(NoProtection):
         alarm = check(*message)
         self._wall.add("gate", perf_counter() - begun_s)
         return alarm
+
+    def _verdict(
+        self, alarm: Alarm | None, message: str, stage: Stage, stamp_s: float, *, proven: bool
+    ) -> Verdict:
+        """Count a message that passes, or respond to its alarm."""
+        if alarm is None:
+            self._recovered(stage, stamp_s, proven=proven)
+            return PASSED
+        return self._respond(alarm, message, stage, stamp_s)
 
     def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Verdict:
         recovery = self._recoveries[stage]

@@ -34,7 +34,6 @@ from mavfi_cli.mission.briefing import require_flyable
 from mavfi_cli.mission.flight_logger import FlightLogger
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
-from mavfi_cli.mission.record.events import EventLog
 from mavfi_cli.mission.record.trace import Trace
 from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.spec.mission import MissionConfig
@@ -71,7 +70,7 @@ class Flight:
         self._interrupts = interrupts
         self.link = RecordedLink(transport, SYSTEM_ID, COMPONENT_ID)
         self._session = self._new_session()
-        self._images = ImageReceiver()
+        self.images = ImageReceiver()
         self._frames: list[ImageFrame] = []
         self._camera_asked = False
         self._unheard_s = self._unspoken_s = 0.0
@@ -80,6 +79,7 @@ class Flight:
         self.companion: Companion | None = None
         self.injection = NoInjection()
         self._logger = FlightLogger(watcher)
+        self.log = self._logger.log
         self.trace = Trace()
         self.wall = WallClock()
         self.stamp_s = 0.0
@@ -236,7 +236,7 @@ class Flight:
         stamp_ms = None
         with self.wall.measure("link"):
             for message in self.link.messages(data, self.stamp_s):
-                self._frames += self._images.feed(message)
+                self._frames += self.images.feed(message)
                 if type(message) is _PACKET:
                     continue  # half of all messages, and nothing that the session looks at
                 self._session.handle(message)
@@ -386,13 +386,3 @@ class Flight:
         if self.goal_enu_m is None:
             return quality.QualityOfFlight()
         return quality.from_states(*self.trace.motion(), self.goal_enu_m)
-
-    @property
-    def log(self) -> EventLog:
-        """All events so far."""
-        return self._logger.log
-
-    @property
-    def images(self) -> ImageReceiver:
-        """Receiver of the camera's frames."""
-        return self._images
