@@ -28,7 +28,7 @@ from mavfi_cli.companion.executor import Executor, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of
 from mavfi_cli.companion.latency import latency_model
-from mavfi_cli.companion.protection import PASSED, NoProtection, Response, Verdict
+from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
 from mavfi_cli.companion.recovery import Recovery
 from mavfi_cli.core.states import Message, of_stage
 from mavfi_cli.core.types import (
@@ -66,9 +66,9 @@ CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 class Withheld(TurnOver):
     """The detector withholds a message."""
 
-    def __init__(self, verdict: Verdict) -> None:
+    def __init__(self, decision: Decision) -> None:
         super().__init__()
-        self.verdict = verdict
+        self.decision = decision
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -279,7 +279,7 @@ class Companion:
         try:
             command = self.command = self.publish(setpoint.command, setpoint)
         except Withheld as withheld:
-            self._track_again(setpoint, withheld.verdict)
+            self._track_again(setpoint, withheld.decision)
             return
         active = self.pilot.active
         active.pace = command.pace
@@ -291,7 +291,7 @@ class Companion:
                 Reaction(frame_stamp_s=setpoint.frame_s, setpoint_stamp_s=self._now_s)
             )
 
-    def _track_again(self, setpoint: Setpoint, verdict: Verdict) -> None:
+    def _track_again(self, setpoint: Setpoint, decision: Decision) -> None:
         """Recompute a withheld command, in this tick if the platform is fast enough.
 
         If that did not help, or the waypoint is at fault, drop the waypoint and begin with a fresh
@@ -299,11 +299,11 @@ class Companion:
         """
         if self._fresh_frame_s is None:
             self._fresh_frame_s = setpoint.frame_s  # still without a setpoint
-        if verdict.response is Response.HOLD or setpoint.attempt >= ATTEMPTS:
+        if decision.response is Response.HOLD or setpoint.attempt >= ATTEMPTS:
             return
         assert self._state is not None
         inputs, fresh, last = setpoint.inputs, None, self.command
-        if verdict.blames(Stage.PLANNING) or setpoint.attempt > 0:
+        if decision.blames(Stage.PLANNING) or setpoint.attempt > 0:
             if inputs.trajectory is not None:
                 bridged = self._recovery.drop(inputs.trajectory, setpoint.waypoint)
                 inputs = replace(inputs, trajectory=bridged)
@@ -340,13 +340,13 @@ class Companion:
             self._injection.watch(moment)
         message = self._injection.pass_on(message, moment)
         if isinstance(message, Message):  # clouds and maps contain no monitored state
-            verdict = self._judge(message, setpoint)
-            if verdict.withheld:
-                self._recovery.recover(message, verdict)
-                raise Withheld(verdict)
+            decision = self._judge(message, setpoint)
+            if decision.withheld:
+                self._recovery.recover(message, decision)
+                raise Withheld(decision)
         return message
 
-    def _judge(self, message: Message, setpoint: Setpoint | None) -> Verdict:
+    def _judge(self, message: Message, setpoint: Setpoint | None) -> Decision:
         """Have the detector judge a message. A plan that is no longer needed is not judged."""
         if isinstance(message, CollisionReport):
             return self.protection.report(message, self._now_s)

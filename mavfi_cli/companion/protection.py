@@ -60,7 +60,7 @@ class _Recovery:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class Decision:
     """Decision about a message, and the alarm that caused it."""
 
     response: Response
@@ -76,7 +76,7 @@ class Verdict:
         return self.alarm is not None and self.alarm.stage is stage
 
 
-PASSED = Verdict(response=Response.PASS)
+PASSED = Decision(response=Response.PASS)
 
 
 class NoProtection:
@@ -84,24 +84,24 @@ class NoProtection:
 
     gate: Gate | None = None
 
-    def report(self, report: CollisionReport, stamp_s: float) -> Verdict:
+    def report(self, report: CollisionReport, stamp_s: float) -> Decision:
         """Passes."""
         return PASSED
 
-    def plan(self, plan: Trajectory, stamp_s: float) -> Verdict:
+    def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
         """Passes."""
         return PASSED
 
     def lose_plan(self) -> None:
         """Do nothing."""
 
-    def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Verdict:
+    def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Decision:
         """Passes."""
         return PASSED
 
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
-    ) -> Verdict:
+    ) -> Decision:
         """Passes."""
         return PASSED
 
@@ -138,27 +138,27 @@ class Protection(NoProtection):
         self._news: list[str] = []
         self._told_s: dict[Stage, float] = {}
 
-    def report(self, report: CollisionReport, stamp_s: float) -> Verdict:
+    def report(self, report: CollisionReport, stamp_s: float) -> Decision:
         """Judge a collision report on its arrival."""
         alarm = self._judge("report", self.gate.judge_report, report)
-        verdict = self._verdict(alarm, "report", Stage.PERCEPTION, stamp_s, proven=True)
-        if verdict.response is Response.ACCEPT:
+        decision = self._decide(alarm, "report", Stage.PERCEPTION, stamp_s, proven=True)
+        if decision.response is Response.ACCEPT:
             self.gate.accept_report()
-        return verdict
+        return decision
 
-    def plan(self, plan: Trajectory, stamp_s: float) -> Verdict:
+    def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
         """Judge a plan on its arrival."""
         alarm = self._judge("plan", self.gate.judge_plan, plan)
-        verdict = self._verdict(alarm, "plan", Stage.PLANNING, stamp_s, proven=False)
-        if verdict.response is Response.ACCEPT:
+        decision = self._decide(alarm, "plan", Stage.PLANNING, stamp_s, proven=False)
+        if decision.response is Response.ACCEPT:
             self.gate.accept_plan(plan)
-        return verdict
+        return decision
 
     def lose_plan(self) -> None:
         """Note that the planner has answered without a usable plan."""
         self.gate.lose_plan()
 
-    def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Verdict:
+    def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Decision:
         """Judge the active plan from the present waypoint on, or a single waypoint."""
         alarm = self._judge("ahead", self.gate.judge_ahead, plan, first)
         if alarm is None or only not in (None, alarm.waypoint):
@@ -167,18 +167,18 @@ class Protection(NoProtection):
 
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
-    ) -> Verdict:
+    ) -> Decision:
         """Judge the present waypoint and the command."""
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         stage = Stage.CONTROL if alarm is None else alarm.stage
         flown = Stage.PLANNING in self.gate.fresh
         proven = flown or self.gate.detector.per_stage
-        verdict = self._verdict(alarm, "tick", stage, stamp_s, proven=proven)
+        decision = self._decide(alarm, "tick", stage, stamp_s, proven=proven)
         if alarm is None and flown:
             self._recoveries[Stage.PLANNING].in_a_row = 0
-        if verdict.response is Response.ACCEPT:
+        if decision.response is Response.ACCEPT:
             self.gate.accept_tick()
-        return verdict
+        return decision
 
     def _judge(self, kind: str, check: Callable[..., Alarm | None], *message: Any) -> Alarm | None:
         self._checks[kind] += 1
@@ -187,16 +187,16 @@ class Protection(NoProtection):
         self._wall.add("gate", perf_counter() - begun_s)
         return alarm
 
-    def _verdict(
+    def _decide(
         self, alarm: Alarm | None, message: str, stage: Stage, stamp_s: float, *, proven: bool
-    ) -> Verdict:
+    ) -> Decision:
         """Count a message that passes, or respond to its alarm."""
         if alarm is None:
             self._recovered(stage, stamp_s, proven=proven)
             return PASSED
         return self._respond(alarm, message, stage, stamp_s)
 
-    def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Verdict:
+    def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Decision:
         recovery = self._recoveries[stage]
         recovery.in_a_row += 1
         if recovery.in_a_row < self._config.alarms_max:
@@ -223,7 +223,7 @@ class Protection(NoProtection):
                 )
             )
         self._tell(alarm, stage, response, stamp_s)
-        return Verdict(response=response, alarm=alarm)
+        return Decision(response=response, alarm=alarm)
 
     def _tell(self, alarm: Alarm, stage: Stage, response: Response, stamp_s: float) -> None:
         last_s = self._told_s.get(stage)

@@ -23,7 +23,7 @@ from collections.abc import Callable
 
 from mavfi_cli.autonomy.pilot import Pilot
 from mavfi_cli.autonomy.trajectory import without_waypoint
-from mavfi_cli.companion.protection import NoProtection, Response, Verdict
+from mavfi_cli.companion.protection import Decision, NoProtection, Response
 from mavfi_cli.core.states import Message
 from mavfi_cli.core.types import CollisionReport, Stage, Trajectory, VehicleState
 from mavfi_cli.fi.source.activation import Follower
@@ -56,17 +56,17 @@ class Recovery:
         self._looked: tuple[Trajectory | None, int] = (None, -1)
         self.state: VehicleState | None = None
 
-    def recover(self, withheld: Message, verdict: Verdict) -> None:
+    def recover(self, withheld: Message, decision: Decision) -> None:
         """Request what a withheld message needs; a command is recomputed by its sender."""
         self._follower.withheld(withheld)
         if isinstance(withheld, Trajectory):
             self._pilot.reject_plan()
         elif isinstance(withheld, CollisionReport):
-            if verdict.blames(Stage.PERCEPTION):
+            if decision.blames(Stage.PERCEPTION):
                 self._recompute_perception()
-        elif verdict.response is Response.RECOMPUTE and verdict.blames(Stage.PLANNING):
+        elif decision.response is Response.RECOMPUTE and decision.blames(Stage.PLANNING):
             self._pilot.want_plan()
-        if verdict.response is Response.HOLD:
+        if decision.response is Response.HOLD:
             self._hold()
 
     def look_round(self, stamp_s: float, unharmed: Trajectory) -> None:
@@ -98,11 +98,11 @@ class Recovery:
         """
         active = self._pilot.active
         while (flown := active.trajectory) is not None:
-            verdict = self._protection.ahead(flown, active.waypoint, only, stamp_s)
-            alarm = verdict.alarm
-            if verdict.response is Response.HOLD:
+            decision = self._protection.ahead(flown, active.waypoint, only, stamp_s)
+            alarm = decision.alarm
+            if decision.response is Response.HOLD:
                 self._hold()
-            elif verdict.response is Response.RECOMPUTE and alarm is not None:
+            elif decision.response is Response.RECOMPUTE and alarm is not None:
                 if alarm.mended is not None:
                     self._replace(flown, alarm.mended)
                 else:

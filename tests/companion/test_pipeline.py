@@ -10,7 +10,7 @@ from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import ATTEMPTS, Companion
-from mavfi_cli.companion.protection import PASSED, NoProtection, Response, Verdict
+from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
 from mavfi_cli.core.types import Briefing, DepthFrame, Stage, Trajectory, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm
@@ -58,7 +58,7 @@ class Told(NoProtection):
 
 def alarm(response, stage):
     found = Alarm(stage=stage, detector="told", score=9.0, threshold=1.0, states=())
-    return Verdict(response=response, alarm=found)
+    return Decision(response=response, alarm=found)
 
 
 @dataclass

@@ -5,7 +5,7 @@ import pytest
 
 from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams
-from mavfi_cli.companion.protection import PASSED, NoProtection, Response, Verdict
+from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
 from mavfi_cli.companion.recovery import Recovery
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.detect.gate import Alarm
@@ -31,11 +31,11 @@ def a_plan():
     )  # fmt: skip
 
 
-def verdict(response, stage=Stage.CONTROL, waypoint=None):
+def decision(response, stage=Stage.CONTROL, waypoint=None):
     alarm = Alarm(
         stage=stage, detector="told", score=9.0, threshold=1.0, states=(), waypoint=waypoint
     )
-    return Verdict(response=response, alarm=alarm)
+    return Decision(response=response, alarm=alarm)
 
 
 class Told(NoProtection):
@@ -49,7 +49,7 @@ class Told(NoProtection):
         self.looked.append((plan, only))
         if not self.rest:
             return PASSED
-        return verdict(Response.RECOMPUTE, waypoint=self.rest.pop(0))
+        return decision(Response.RECOMPUTE, waypoint=self.rest.pop(0))
 
 
 class Flying:
@@ -72,14 +72,14 @@ class Flying:
 @pytest.mark.parametrize(("stage", "looks"), [(Stage.PERCEPTION, 1), (Stage.CONTROL, 0)])
 def test_perception_looks_anew_only_where_the_alarm_is_its_own(stage, looks):
     flying = Flying()
-    flying.recovery.recover(REPORT, verdict(Response.RECOMPUTE, stage))
+    flying.recovery.recover(REPORT, decision(Response.RECOMPUTE, stage))
     assert flying.looks == looks
     assert flying.pilot.active.trajectory is flying.plan
 
 
 def test_a_withheld_plan_is_rejected():
     flying = Flying()
-    flying.recovery.recover(a_plan(), verdict(Response.RECOMPUTE, Stage.PLANNING))
+    flying.recovery.recover(a_plan(), decision(Response.RECOMPUTE, Stage.PLANNING))
     assert flying.pilot.counters.plans_rejected == 1
     assert flying.pilot.active.trajectory is flying.plan
 
@@ -87,7 +87,7 @@ def test_a_withheld_plan_is_rejected():
 @pytest.mark.parametrize("message", [REPORT, a_plan(), COMMAND], ids=["report", "plan", "command"])
 def test_to_hold_is_to_give_up_the_plan_and_hover(message):
     flying = Flying()
-    flying.recovery.recover(message, verdict(Response.HOLD))
+    flying.recovery.recover(message, decision(Response.HOLD))
     assert flying.pilot.active.trajectory is None
     assert flying.pilot.mode is PilotMode.WAITING
 

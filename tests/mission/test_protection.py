@@ -163,11 +163,11 @@ def test_a_plan_with_a_wrong_number_is_withheld_until_recomputing_has_confirmed_
 def test_a_flown_plan_gets_back_the_number_that_was_accepted(name):
     gate = protection(replace(EXTENDED, name=name))
     gate.plan(FIRST, 0.0)
-    verdict = gate.ahead(replace(FIRST, trajectory_seq=1025), 0, None, 0.1)
-    assert verdict.withheld
-    assert verdict.blames(Stage.PLANNING)
-    assert verdict.alarm.mended.trajectory_seq == 1
-    assert gate.ahead(verdict.alarm.mended, 0, None, 0.2) is PASSED
+    decision = gate.ahead(replace(FIRST, trajectory_seq=1025), 0, None, 0.1)
+    assert decision.withheld
+    assert decision.blames(Stage.PLANNING)
+    assert decision.alarm.mended.trajectory_seq == 1
+    assert gate.ahead(decision.alarm.mended, 0, None, 0.2) is PASSED
 
 
 def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
