@@ -10,8 +10,7 @@ from typing import Any
 
 from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
 from mavfi_cli.autonomy.orders import PlanFailure, PlanRequest
-from mavfi_cli.autonomy.planners import Planner
-from mavfi_cli.autonomy.planners.base import PlanningParams
+from mavfi_cli.autonomy.planners.base import Planner, PlanningParams
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import (
     Briefing,

@@ -17,7 +17,7 @@ import numpy as np
 
 from mavfi_cli.autonomy.orders import PilotMode
 from mavfi_cli.autonomy.pilot import TURN_S
-from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.autonomy.planners.base import Planner
 from mavfi_cli.companion.injection import NoInjection, injection_of
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import protection_of
