@@ -1,5 +1,6 @@
 """Bad input gets one clear line on stderr and exit code 1; nothing is flown, nothing is left."""
 
+import contextlib
 import resource
 import socket
 import subprocess
@@ -182,18 +183,20 @@ def test_an_autopilot_that_refuses_to_arm_in_its_own_words(command_line, autopil
 # The disk ------------------------------------------------------------------------------------
 
 
-@pytest.fixture
+@contextlib.contextmanager
 def full_disk():
-    """The system refuses to let any file grow beyond 256 KiB."""
+    """The system refuses to let any file of this process grow beyond 256 KiB."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 18, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.usefixtures("full_disk")
 def test_a_full_disk_in_flight(command_line):
-    code, out, err = command_line(*SHORT_LINE, "--quiet")
+    with full_disk():
+        code, out, err = command_line(*SHORT_LINE, "--quiet")
     assert (code, out) == (1, "")
     (line,) = err.splitlines()
     assert line.startswith("error: runs/farm-5-001/flight.tlog: cannot write: File too large")
