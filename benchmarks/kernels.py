@@ -19,7 +19,7 @@ import numpy as np
 from mavfi_cli import autonomy
 from mavfi_cli.autonomy import collision, planners, planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
-from mavfi_cli.autonomy.orders import PlanRequest
+from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.frames import quaternion_from_euler
 from mavfi_cli.core.types import DepthFrame, Trajectory

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sitl.control.cascade import control_step
-from sitl.vehicle.profile_files import load_profile, profile_names
+from sitl.vehicle.profile import load_profile, profile_names
 from sitl.vehicle.vehicle import Quadrotor
 
 STEPS = 500

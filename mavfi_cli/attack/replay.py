@@ -16,7 +16,7 @@ from mavfi_cli.attack.kernels.inputs import INPUTS
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.workers import one_processor
 from mavfi_cli.core.errors import BuildMismatch, RecordError
-from mavfi_cli.core.sources import own_digest
+from mavfi_cli.core.files import own_digest
 from mavfi_cli.fi.tracer import record
 
 # A replay must repeat these entries; durations are not among them.

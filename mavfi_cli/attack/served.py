@@ -15,8 +15,8 @@ import sys
 import time
 from typing import Any
 
-from mavfi_cli.core.channel import receive, send
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.core.processes import receive, send
 from mavfi_cli.fi.tracer import linux
 
 CHANNEL = 3  # file descriptor of the program's end of the socket

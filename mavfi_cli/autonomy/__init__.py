@@ -9,6 +9,18 @@ Importing this package is cheap. Each kernel module imports numba or a native li
 
 from __future__ import annotations
 
+OUR_PLANNERS = ("rrtstar", "rrt", "rrtconnect")
+
+
+def canonical_planner(name: str) -> str:
+    """Return the canonical name of a planner, under which records and groups list it.
+
+    For our own planners, case, hyphens, underscores and the star of RRT* do not matter. Any other
+    name is returned unchanged.
+    """
+    plain = name.lower().replace("*", "star").replace("-", "").replace("_", "")
+    return plain if plain in OUR_PLANNERS else name
+
 
 def is_compiled() -> bool:
     """Return True if all kernels are compiled. Otherwise `warm_up` takes many seconds."""

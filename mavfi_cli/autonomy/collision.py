@@ -174,7 +174,7 @@ def _within(vector: FloatArray, limit: float) -> FloatArray:
     return vector if largest * norm <= limit else unit * (limit / norm)
 
 
-class SphereProbe:
+class _SphereProbe:
     """A sphere to test for contact at points of a map."""
 
     def __init__(self, snapshot: MapSnapshot, radius_m: float) -> None:
@@ -199,8 +199,8 @@ def _first_contact(
     full radius, and within two radii of the start, points are tested with the body's radius only.
     """
     padding_m = 0.5 * params.spacing_m
-    probe = SphereProbe(snapshot, math.hypot(params.radius_m, padding_m))
-    body: SphereProbe | None = None
+    probe = _SphereProbe(snapshot, math.hypot(params.radius_m, padding_m))
+    body: _SphereProbe | None = None
     escaping = True
     for index, point in enumerate(points):
         if not probe.touches(point):
@@ -210,7 +210,7 @@ def _first_contact(
             return index
         if float(np.linalg.norm(point - points[0])) > 2.0 * params.radius_m:
             return index
-        body = body or SphereProbe(snapshot, math.hypot(params.body_radius_m, padding_m))
+        body = body or _SphereProbe(snapshot, math.hypot(params.body_radius_m, padding_m))
         if body.touches(point):
             return index
     return None

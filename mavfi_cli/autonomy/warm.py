@@ -8,7 +8,7 @@ import numpy as np
 
 from mavfi_cli.autonomy import collision, planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
-from mavfi_cli.autonomy.orders import PlanRequest
+from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.planners import find, names
 from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.types import DepthFrame, Trajectory

@@ -12,7 +12,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.autonomy.planner_names import canonical
+from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.campaign.factors import MISSION, NAMES
 from mavfi_cli.campaign.specification import LISTS, Axes, Keep, Spec
 from mavfi_cli.core.config import (
@@ -113,7 +113,9 @@ class _Reader:
         if name in LISTS:
             return values
         if name == "planner":  # one planner is one setting, however it is written
-            values = tuple(canonical(each) if isinstance(each, str) else each for each in values)
+            values = tuple(
+                canonical_planner(each) if isinstance(each, str) else each for each in values
+            )
         if not values:
             raise self._error("an empty list of values", f"{prefix}{name}")
         if len({repr(each) for each in values}) < len(values):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
-from mavfi_cli.autonomy.orders import PlanFailure, PlanRequest
+from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.planners.base import Planner, PlanningParams
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import (

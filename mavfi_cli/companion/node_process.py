@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
-from mavfi_cli.core.channel import receive, send
+from mavfi_cli.core.processes import receive, send
 
 Run = Callable[[Any, float], Any]
 

@@ -19,8 +19,7 @@ import numpy as np
 
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot, empty_snapshot
-from mavfi_cli.autonomy.orders import PilotMode, PlanRequest
-from mavfi_cli.autonomy.pilot import Pilot, PilotParams
+from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams, PlanRequest
 from mavfi_cli.autonomy.planners.base import Planner
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
 from mavfi_cli.autonomy.trajectory import waypoint_index

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mavfi_cli.core.sources import folder_digest
+from mavfi_cli.core.files import folder_digest
 
 F = TypeVar("F", bound=Callable[..., Any])
 _BLAS = "scipy.linalg.cython_blas"

@@ -1,15 +1,22 @@
-"""Write files atomically: a kill leaves the old file or the new one, never a partial one."""
+"""Files: atomic writes, and digests of source code.
+
+A kill leaves the old file or the new one, never a partial one.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from mavfi_cli.core.errors import RecordError
+
+PACKAGE = Path(__file__).parents[1]
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -68,3 +75,22 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
         return None
     return value
+
+
+@cache
+def folder_digest(folder: Path, *, deep: bool = False) -> str:
+    """Return the SHA-256 of names and contents of all Python sources in a folder.
+
+    `deep` includes its subfolders.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py") if deep else folder.glob("*.py")):
+        digest.update(str(path.relative_to(folder)).encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def own_digest() -> str:
+    """Return the SHA-256 of all sources of mavfi, including the simulated vehicle."""
+    parts = [folder_digest(each, deep=True) for each in (PACKAGE, PACKAGE.parent / "sitl")]
+    return hashlib.sha256("".join(parts).encode()).hexdigest()

@@ -64,9 +64,7 @@ _TRACEBACK = 8000  # characters of a traceback that are reported, the last ones
 _LONGEST_WAIT_S = 3600.0
 
 
-class Module(Protocol):
-    """What a module has that workers run."""
-
+class _Module(Protocol):
     def prepare(self) -> None:
         """Load everything, once; starts no thread."""
 
@@ -163,7 +161,7 @@ def main() -> NoReturn:
     """Load the module, then fork a guard for every order until the client closes its end."""
     call_this_process(SERVER)
     control = socket.socket(fileno=int(sys.argv[1]))
-    module = cast(Module, importlib.import_module(sys.argv[2]))
+    module = cast(_Module, importlib.import_module(sys.argv[2]))
     module.prepare()
     gc.collect()
     if (count := threads()) > 1:
@@ -185,8 +183,7 @@ def main() -> NoReturn:
 # The guard ----------------------------------------------------------------------------------------
 
 
-def _guard(order: Mapping[str, Any], channel: socket.socket, module: Module) -> NoReturn:
-    """The whole life of a guard."""
+def _guard(order: Mapping[str, Any], channel: socket.socket, module: _Module) -> NoReturn:
     call_this_process(GUARD)
     become_reaper()
     begun_s, guard = time.monotonic(), os.getpid()
@@ -251,7 +248,7 @@ def _last_words(reading: int) -> Any:
 # The worker ---------------------------------------------------------------------------------------
 
 
-def _work(order: Mapping[str, Any], module: Module, guard: int, writing: int) -> NoReturn:
+def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -> NoReturn:
     """The whole life of a worker, in a process group of its own."""
     code, report = 1, {}
     try:

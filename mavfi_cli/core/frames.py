@@ -34,12 +34,10 @@ def wrap_angle(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def enu_yaw_from_ned(heading_rad: float) -> float:
-    """Convert an NED heading, rad, to an ENU yaw in [-pi, pi), rad, or back."""
-    return wrap_angle(math.pi / 2.0 - heading_rad)
+def ned_yaw_from_enu(yaw_rad: float) -> float:
+    """Convert an ENU yaw, rad, to an NED heading in [-pi, pi), rad, or back."""
+    return wrap_angle(math.pi / 2.0 - yaw_rad)
 
-
-ned_yaw_from_enu = enu_yaw_from_ned
 
 _HALF_SQRT2 = math.sqrt(0.5)
 

@@ -1,12 +1,15 @@
-"""Processes: how one is bound to its parent, found, and ended with all that it started."""
+"""Processes: how one is bound to its parent, found, ended, and sent values."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import os
+import pickle
 import signal
+import socket
 from pathlib import Path
+from typing import Any
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 # What ps calls them.
@@ -19,6 +22,8 @@ ONE_THREAD = {
 """Environment of a process that forks itself. Its libraries then start no threads."""
 
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
+
+_LENGTH = 8
 
 
 def become_reaper() -> None:
@@ -69,3 +74,32 @@ def _children() -> list[int]:
         with contextlib.suppress(OSError):
             found += map(int, (task / "children").read_text().split())
     return found
+
+
+def send(connection: socket.socket, value: Any) -> None:
+    """Send one value."""
+    data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
+    connection.sendall(len(data).to_bytes(_LENGTH, "little") + data)
+
+
+def receive(connection: socket.socket) -> Any:
+    """Receive one value.
+
+    Raises:
+        EOFError: The other end has closed.
+    """
+    size = int.from_bytes(_exactly(connection, _LENGTH), "little")
+    return pickle.loads(_exactly(connection, size))
+
+
+def _exactly(connection: socket.socket, size: int) -> bytearray:
+    """Receive into a single buffer, so that a node's memory is the same in every run."""
+    data = bytearray(size)
+    view, filled = memoryview(data), 0
+    while filled < size:
+        count = connection.recv_into(view[filled:])
+        if not count:
+            raise EOFError
+        filled += count
+    view.release()
+    return data

@@ -28,7 +28,7 @@ def _spawn_key(name: str) -> tuple[int, ...]:
     return tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
 
 
-def seed_sequence(root_seed: int, stream: Stream, *detail: str | int) -> np.random.SeedSequence:
+def _seed_sequence(root_seed: int, stream: Stream, *detail: str | int) -> np.random.SeedSequence:
     """Return the seed sequence of a stream. `detail` names a sub-stream (kernel, invocation)."""
     name = "/".join([stream.value, *(str(part) for part in detail)])
     return np.random.SeedSequence(root_seed, spawn_key=_spawn_key(name))
@@ -36,10 +36,10 @@ def seed_sequence(root_seed: int, stream: Stream, *detail: str | int) -> np.rand
 
 def generator(root_seed: int, stream: Stream, *detail: str | int) -> np.random.Generator:
     """Return a new PCG64 generator of one stream."""
-    return np.random.Generator(np.random.PCG64(seed_sequence(root_seed, stream, *detail)))
+    return np.random.Generator(np.random.PCG64(_seed_sequence(root_seed, stream, *detail)))
 
 
 def derive(root_seed: int, stream: Stream, *detail: str | int) -> int:
     """Return a positive 31-bit seed for a consumer that takes an int (OMPL, a child process)."""
-    state = seed_sequence(root_seed, stream, *detail).generate_state(1, np.uint32)
+    state = _seed_sequence(root_seed, stream, *detail).generate_state(1, np.uint32)
     return int(state[0] & 0x7FFF_FFFF) or 1

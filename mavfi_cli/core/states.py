@@ -13,7 +13,6 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import WAYPOINT_FIELDS, CollisionReport, Command, Stage, Trajectory
 
 Message = CollisionReport | Trajectory | Command
@@ -62,7 +61,6 @@ def _element(
     """Return reader and writer of row `index` of an array or of one of its columns."""
 
     def place(index: int) -> int | tuple[int, int]:
-        """Return the index into the array."""
         return index if column is None else (index, column)
 
     def read(message: Message, index: int) -> Scalar:
@@ -155,18 +153,6 @@ def _control() -> list[State]:
 
 STATES: tuple[State, ...] = (*_perception(), *_planning(), *_control())
 BY_NAME: dict[str, State] = {state.name: state for state in STATES}
-
-
-def find(name: str) -> State:
-    """Return the state of that name.
-
-    Raises:
-        UnknownName: No state has this name. Suggests the nearest.
-    """
-    try:
-        return BY_NAME[name]
-    except KeyError:
-        raise UnknownName("state", name, BY_NAME) from None
 
 
 def of_stage(stage: Stage) -> tuple[State, ...]:

@@ -1,35 +1,144 @@
-"""Encodes and decodes MAVLink frames, on pymavlink's `common` dialect.
+"""Encodes, decodes and signs MAVLink frames, on pymavlink's `common` dialect.
 
 This module implements the frame layer (markers, lengths, checksum, signature), because pymavlink's
 generic parser is slower and loses the frames after a false marker in noise. Message classes,
-layouts and constructors are pymavlink's.
-Source of the frame layout: https://mavlink.io/en/guide/serialization.html.
+layouts and constructors are pymavlink's. The caller supplies the clock of signatures.
+Sources: https://mavlink.io/en/guide/serialization.html for frames, and
+https://mavlink.io/en/guide/message_signing.html for signatures: a block of link id (1 byte),
+timestamp (6 bytes, 10 us units since 2015-01-01 UTC) and the first 6 bytes of
+SHA-256(key + frame + link id + timestamp).
 """
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import itertools
 import re
 import struct
 from collections.abc import Callable, Sequence
 from operator import attrgetter, itemgetter
+from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import common as dialect
 
-from mavfi_cli.link.signing import SIGNATURE_LENGTH, Signing
+from mavfi_cli.core.errors import ConfigError
+
+SIGNATURE_LENGTH = 13  # bytes: link id, timestamp, truncated digest
+EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC, start of signing time
+UNITS_PER_S = 100_000  # one unit is 10 us
+NEW_STREAM_SLACK = 60 * UNITS_PER_S  # maximum lag of a new stream's timestamp
+
+_TIMESTAMP_END = 2**48
+_RADIO_STATUS = 109  # sent by telemetry radios, which hold no key; the guide says to accept it
+
+MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
+
+_MARKER = re.compile(rb"[\xfd\xfe]")
+_SIGNED = 0x01
+_HEADER = struct.Struct("<BBBBBBBHB")
+_INCOMPLETE = -1
+
+_KINDS: dict[int, _Kind] = {}
+
+
+def key_from_passphrase(passphrase: str) -> bytes:
+    """Return the 32-byte key of a passphrase, its SHA-256, as ground stations compute it."""
+    return hashlib.sha256(passphrase.encode()).digest()
+
+
+def key_from_file(path: Path) -> bytes:
+    """Return the key of the passphrase in a file, without the white space around it.
+
+    Raises:
+        ConfigError: The file cannot be read or is empty.
+    """
+    try:
+        passphrase = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        problem = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(f"cannot read the passphrase: {problem}", path=path) from None
+    if not passphrase:
+        raise ConfigError("holds no passphrase", path=path)
+    return key_from_passphrase(passphrase)
+
+
+class Signing:
+    """Key, outgoing timestamp, and the newest timestamp of every received stream.
+
+    Args:
+        key: 32 secret bytes, see `key_from_passphrase`.
+        clock: Function of seconds since 1970 (`time.time`, or a fixed epoch plus simulated time).
+        link_id: Id of this channel among those of the sender, 0..255.
+        accept_unsigned: Accept frames without a signature. Wrong signatures are always rejected.
+
+    Raises:
+        ValueError: The key does not have 32 bytes, or the link id is out of range.
+    """
+
+    def __init__(
+        self,
+        key: bytes,
+        clock: Callable[[], float],
+        *,
+        link_id: int = 0,
+        accept_unsigned: bool = False,
+    ) -> None:
+        if len(key) != 32:
+            raise ValueError(f"a signing key has 32 bytes, not {len(key)}")
+        if not 0 <= link_id <= 255:
+            raise ValueError(f"a signing link id lies in 0..255, not {link_id}")
+        self._key = key
+        self._clock = clock
+        self._link_id = link_id
+        self._accept_unsigned = accept_unsigned
+        self._next_timestamp = 0
+        self._streams: dict[tuple[int, int, int], int] = {}
+
+    def sign(self, frame: bytes) -> bytes:
+        """Return the 13-byte signature block of a frame (header to CRC, signed flag set)."""
+        timestamp = max(self._now(), self._next_timestamp) % _TIMESTAMP_END
+        self._next_timestamp = timestamp + 1
+        block = bytes([self._link_id]) + timestamp.to_bytes(6, "little")
+        return block + self._digest(frame + block)
+
+    def accept_plain(self, message_id: int) -> bool:
+        """Return True if a frame without signature is accepted."""
+        return self._accept_unsigned or message_id == _RADIO_STATUS
+
+    def accept(self, frame: bytes, system: int, component: int) -> bool:
+        """Return True if a signed frame is authentic and not a replay.
+
+        Only authentic frames update the timestamps, so an attacker cannot block a stream.
+        """
+        if not hmac.compare_digest(self._digest(frame[:-6]), frame[-6:]):
+            return False
+        timestamp = int.from_bytes(frame[-12:-6], "little")
+        stream = (frame[-13], system, component)
+        newest = self._streams.get(stream)
+        if newest is None:
+            if timestamp + NEW_STREAM_SLACK < max(self._now(), self._next_timestamp):
+                return False
+        elif timestamp <= newest:
+            return False
+        self._streams[stream] = timestamp
+        self._next_timestamp = max(self._next_timestamp, timestamp)
+        return True
+
+    def _now(self) -> int:
+        return max(0, int((self._clock() - EPOCH_UNIX_S) * UNITS_PER_S))
+
+    def _digest(self, data: bytes) -> bytes:
+        return hashlib.sha256(self._key + data).digest()[:6]
+
 
 __all__ = ["MAX_FRAME_LENGTH", "Codec", "Message", "Signing", "dialect"]
 
 Message = Any  # an instance of one of pymavlink's generated message classes
 
-MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
 
 _V1, _V2 = 0xFE, 0xFD
-_MARKER = re.compile(rb"[\xfd\xfe]")
-_SIGNED = 0x01
-_HEADER = struct.Struct("<BBBBBBBHB")
-_INCOMPLETE = -1
 
 
 def _slow_crc(data: bytes, initial: int = 0xFFFF) -> int:
@@ -123,9 +232,6 @@ def _writer(cls: Any) -> Callable[[Message], Sequence[Any]]:
         return flat
 
     return values
-
-
-_KINDS: dict[int, _Kind] = {}
 
 
 def _kind(message_id: int) -> _Kind | None:

@@ -1,15 +1,20 @@
 """MAVLink's command protocol: sends a command, awaits its acknowledgement, repeats it.
 
-The caller supplies the time. An acknowledgement names the command only, so the same command is
-never pending twice for one component. Source: https://mavlink.io/en/services/command.html.
+`Requests` repeats a session's commands until telemetry shows their effect. The caller supplies the
+time. An acknowledgement names the command only, so the same command is never pending twice for one
+component. Source: https://mavlink.io/en/services/command.html.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from enum import Enum
+from typing import NoReturn
 
+from mavfi_cli.core.errors import CommandRefused
 from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.telemetry import Telemetry
 
 TIMEOUT_S = 0.5
 PROGRESS_TIMEOUT_S = 5.0  # after MAV_RESULT_IN_PROGRESS
@@ -30,10 +35,16 @@ _RESULTS = {
 # Refusals that may be temporary.
 _PASSING = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_FAILED)
 
+_SETTLE_S = 0.5  # wait for status texts after a refusal
+_EFFECT_S = 3.0  # wait for the effect of an accepted command
+_MODE_TRIES = 5
+_MODE_PATIENCE_S = 1.5  # wait for a mode change; HEARTBEAT arrives once a second
+_LOOK_INTERVAL_S = 0.2
+_HOME_INTERVAL_S = 1.0
+_WARNING = dialect.MAV_SEVERITY_WARNING
 
-class CommandState(Enum):
-    """State of a command."""
 
+class _CommandState(Enum):
     PENDING = "pending"
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -55,8 +66,8 @@ class Ticket:
         self.component = component
         self.parameters = parameters
         self.refusals_left = refusals
-        self.verdict = CommandState.PENDING
-        self.result = CommandState.UNANSWERED.value
+        self.verdict = _CommandState.PENDING
+        self.result = _CommandState.UNANSWERED.value
         self.sent = 0
         self.sent_since_answer = 0
         self.due_s = -1.0
@@ -64,7 +75,7 @@ class Ticket:
     @property
     def pending(self) -> bool:
         """True until the command is accepted, refused or given up."""
-        return self.verdict is CommandState.PENDING
+        return self.verdict is _CommandState.PENDING
 
 
 class CommandChannel:
@@ -101,7 +112,7 @@ class CommandChannel:
         ticket = Ticket(command, padded, component, refusals)
         lane = self._lanes.setdefault((component, command), deque())
         if len(lane) >= _MAX_WAITING:
-            ticket.verdict = CommandState.UNANSWERED
+            ticket.verdict = _CommandState.UNANSWERED
         else:
             lane.append(ticket)
         return ticket
@@ -121,12 +132,12 @@ class CommandChannel:
         if message.result == dialect.MAV_RESULT_IN_PROGRESS:
             ticket.due_s = self._now_s + PROGRESS_TIMEOUT_S
         elif message.result == dialect.MAV_RESULT_ACCEPTED:
-            self._close(lane, CommandState.ACCEPTED)
+            self._close(lane, _CommandState.ACCEPTED)
         elif message.result in _PASSING and ticket.refusals_left > 0:
             ticket.refusals_left -= 1
             ticket.due_s = self._now_s + REFUSAL_PAUSE_S
         else:
-            self._close(lane, CommandState.REFUSED)
+            self._close(lane, _CommandState.REFUSED)
 
     def poll(self, stamp_s: float, system: int) -> list[Message]:
         """Return the commands that are due at `stamp_s`, addressed to `system`."""
@@ -138,7 +149,7 @@ class CommandChannel:
                 if ticket.sent_since_answer < TRIES:
                     due.append(self._send(ticket, system))
                     break
-                self._close(lane, CommandState.UNANSWERED)
+                self._close(lane, _CommandState.UNANSWERED)
         return due
 
     def _send(self, ticket: Ticket, system: int) -> Message:
@@ -151,5 +162,129 @@ class CommandChannel:
         )
 
     @staticmethod
-    def _close(lane: deque[Ticket], verdict: CommandState) -> None:
+    def _close(lane: deque[Ticket], verdict: _CommandState) -> None:
         lane.popleft().verdict = verdict
+
+
+class Requests:
+    """Requests of one phase of the session at a time.
+
+    Args:
+        commands: Channel to the autopilot.
+        telemetry: Telemetry that shows the effect of commands.
+
+    Attributes:
+        now_s: Present stamp. Set it before any request.
+    """
+
+    def __init__(self, commands: CommandChannel, telemetry: Telemetry) -> None:
+        self._commands = commands
+        self._telemetry = telemetry
+        self.now_s = 0.0
+        self._look: Ticket | None = None
+        self._next_look_s = -math.inf
+        self._home: Ticket | None = None
+        self._next_home_s = -math.inf
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a phase and forget the requests of the last one."""
+        self._ticket: Ticket | None = None  # the command that the phase depends on
+        self._decided_s: float | None = None
+        self._mode_since_s, self._mode_tries = -math.inf, 0
+        self._texts_before = self._telemetry.texts.total
+
+    @property
+    def asked(self) -> bool:
+        """True once this phase has sent a command."""
+        return self._ticket is not None
+
+    def refuse(self, command: str, result: str) -> NoReturn:
+        """Give up a request and quote the autopilot's texts since the start of the phase.
+
+        Raises:
+            CommandRefused: Always.
+        """
+        texts = self._telemetry.texts
+        texts.expire(self.now_s, 0.0)
+        said = (each for each in texts.since(self._texts_before) if each.severity <= _WARNING)
+        raise CommandRefused(command, result, dict.fromkeys(text.text for text in said))
+
+    def insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
+        """Send a command until it is accepted. Return True from then on.
+
+        If an accepted command shows no effect, further calls send it again.
+
+        Raises:
+            CommandRefused: The command was refused permanently.
+        """
+        if self._ticket is None:
+            self._ticket = self._commands.submit(command, *parameters, unused=unused, refusals=2)
+            self._decided_s = None
+        ticket = self._ticket
+        if ticket.pending:
+            return False
+        if self._decided_s is None:
+            self._decided_s = self.now_s
+        waited_s = self.now_s - self._decided_s
+        if ticket.verdict is _CommandState.ACCEPTED:
+            if waited_s >= _EFFECT_S:
+                self._ticket = None
+            return True
+        if waited_s >= _SETTLE_S:
+            self.refuse(name, ticket.result)
+        return False
+
+    def mode(self, mode: str) -> bool:
+        """Request a mode until HEARTBEAT shows it. An acknowledgement alone does not count.
+
+        Raises:
+            CommandRefused: The mode did not change after the maximum number of requests.
+        """
+        if self._telemetry.mode == mode:
+            return True
+        pending = self._ticket is not None and self._ticket.pending
+        if not pending and self.now_s - self._mode_since_s >= _MODE_PATIENCE_S:
+            if self._mode_tries >= _MODE_TRIES:
+                result = self._ticket.result if self._ticket is not None else ""
+                self.refuse(f"mode {mode}", f"{result}, mode stays {self._telemetry.mode}")
+            self._mode_tries += 1
+            self._mode_since_s = self.now_s
+            enabled = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+            if self._telemetry.armed:
+                enabled |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+            self._ticket = self._commands.submit(
+                dialect.MAV_CMD_DO_SET_MODE,
+                enabled,
+                *self._telemetry.autopilot.mode_parameters(mode),
+            )
+        self.look_at_heartbeat()
+        return False
+
+    def look_at_heartbeat(self) -> None:
+        """Request a HEARTBEAT now instead of waiting up to a second for the next."""
+        if self.now_s >= self._next_look_s and not (self._look and self._look.pending):
+            self._next_look_s = self.now_s + _LOOK_INTERVAL_S
+            self._look = self._commands.submit(
+                dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HEARTBEAT
+            )
+
+    def home(self) -> None:
+        """Request HOME_POSITION once a second."""
+        if self.now_s >= self._next_home_s and not (self._home and self._home.pending):
+            self._next_home_s = self.now_s + _HOME_INTERVAL_S
+            self._home = self._commands.submit(
+                dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HOME_POSITION
+            )
+
+    def streams(self, state_rate_hz: float) -> None:
+        """Request the message streams of a flight: the state at this rate, the others slower."""
+        state_us = 1e6 / state_rate_hz
+        for message_id, interval_us in (
+            (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, state_us),
+            (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, state_us),
+            (dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 2e5),
+            (dialect.MAVLINK_MSG_ID_SYS_STATUS, 5e5),
+            (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 5e5),
+        ):
+            self._commands.submit(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)

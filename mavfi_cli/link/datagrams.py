@@ -8,9 +8,7 @@ from collections import deque
 from typing import Any
 
 from mavfi_cli.core.errors import LinkLost
-from mavfi_cli.link.endpoint import Endpoint
-from mavfi_cli.link.streams import bind
-from mavfi_cli.link.waiting import readable
+from mavfi_cli.link.endpoint import Endpoint, SocketOwner, bind, readable
 
 MAX_PEERS = 64
 MAX_WAITING = 4096  # maximum unread datagrams per peer; the oldest are dropped first
@@ -19,7 +17,7 @@ _CHUNK = 1 << 16
 _MARKERS = (0xFD, 0xFE)
 
 
-def split_frames(data: bytes) -> list[bytes]:
+def _split_frames(data: bytes) -> list[bytes]:
     """Combine well-formed frames into datagrams that fit an Ethernet packet."""
     if len(data) <= _MTU_PAYLOAD:
         return [data]
@@ -36,7 +34,7 @@ def split_frames(data: bytes) -> list[bytes]:
     return datagrams
 
 
-class UdpTransport:
+class _UdpTransport(SocketOwner):
     """A UDP socket with one peer.
 
     A connected socket receives from that peer only. A bound socket sends to the last sender of
@@ -46,24 +44,15 @@ class UdpTransport:
     datagram = True
 
     def __init__(self, opened: socket.socket, url: str, *, peer: Any = None) -> None:
-        opened.settimeout(0.0)
-        self._socket = opened
+        super().__init__(opened, url)
         self._peer = peer
         self._follow = peer is None
-        self.url = url
-
-    @property
-    def port(self) -> int:
-        """Local port. The system chooses it if the URL says 0."""
-        return int(self._socket.getsockname()[1])
 
     def send(self, data: bytes) -> None:
-        """Send whole frames; see `Transport`."""
         if self._peer is not None:
             _send(self._socket, data, self._peer if self._follow else None)
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         data = self._pull()
         if not data and timeout_s > 0 and readable(self._socket.fileno(), timeout_s):
             data = self._pull()
@@ -78,14 +67,6 @@ class UdpTransport:
         if self._follow and data[:1] and data[0] in _MARKERS:
             self._peer = sender
         return data
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait on."""
-        return self._socket.fileno()
-
-    def close(self) -> None:
-        """Close it. May be called repeatedly."""
-        self._socket.close()
 
 
 def _receive(opened: socket.socket) -> tuple[bytes, Any] | None:
@@ -102,7 +83,7 @@ def _receive(opened: socket.socket) -> tuple[bytes, Any] | None:
 
 def _send(opened: socket.socket, data: bytes, peer: Any) -> None:
     """Send to `peer`, or to the connected address. Data that cannot be sent is lost."""
-    for datagram in split_frames(data):
+    for datagram in _split_frames(data):
         for _attempt in range(2):  # the first may report the refusal of an earlier datagram
             try:
                 if peer is None:
@@ -114,32 +95,31 @@ def _send(opened: socket.socket, data: bytes, peer: Any) -> None:
                 continue
 
 
-def bound(endpoint: Endpoint, where: tuple[int, str]) -> UdpTransport:
+def bound(endpoint: Endpoint, where: tuple[int, str]) -> _UdpTransport:
     """Open a transport that waits for its peer on a port.
 
     Raises:
         EndpointError: The port is in use.
     """
-    return UdpTransport(_bound_socket(endpoint, where), endpoint.url)
+    return _UdpTransport(_bound_socket(endpoint, where), endpoint.url)
 
 
-def connected(endpoint: Endpoint, where: tuple[int, str]) -> UdpTransport:
+def connected(endpoint: Endpoint, where: tuple[int, str]) -> _UdpTransport:
     """Open a transport to the endpoint, resolved to family and address `where`."""
     family, address = where
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.connect((address, endpoint.port))
-    return UdpTransport(opened, endpoint.url, peer=(address, endpoint.port))
+    return _UdpTransport(opened, endpoint.url, peer=(address, endpoint.port))
 
 
 def _bound_socket(endpoint: Endpoint, where: tuple[int, str]) -> socket.socket:
     family, address = where
     opened = socket.socket(family, socket.SOCK_DGRAM)
     bind(opened, endpoint, address)
-    opened.settimeout(0.0)
     return opened
 
 
-class UdpListener:
+class UdpListener(SocketOwner):
     """A port on which every sender of MAVLink becomes a peer. All peers share one socket.
 
     There are at most MAX_PEERS. A further peer replaces the one that has been silent longest.
@@ -149,17 +129,11 @@ class UdpListener:
     """
 
     def __init__(self, endpoint: Endpoint, where: tuple[int, str]) -> None:
-        self.url = endpoint.url
-        self._socket = _bound_socket(endpoint, where)
-        self._peers: dict[Any, UdpPeer] = {}  # the one silent longest comes first
-        self._fresh: list[UdpPeer] = []
+        super().__init__(_bound_socket(endpoint, where), endpoint.url)
+        self._peers: dict[Any, _UdpPeer] = {}  # the one silent longest comes first
+        self._fresh: list[_UdpPeer] = []
 
-    @property
-    def port(self) -> int:
-        """Bound port. The system chooses it if the URL says 0."""
-        return int(self._socket.getsockname()[1])
-
-    def accept_ready(self) -> list[UdpPeer]:
+    def accept_ready(self) -> list[_UdpPeer]:
         """Return the peers that appeared since the last call."""
         self.pump()
         fresh, self._fresh = [peer for peer in self._fresh if not peer.lost], []
@@ -180,11 +154,11 @@ class UdpListener:
             self._peers[sender] = peer
             peer.waiting.append(data)
 
-    def _welcome(self, sender: Any) -> UdpPeer:
+    def _welcome(self, sender: Any) -> _UdpPeer:
         if len(self._peers) >= MAX_PEERS:
             oldest = next(iter(self._peers))
             self._peers.pop(oldest).lost = True
-        peer = UdpPeer(self, sender)
+        peer = _UdpPeer(self, sender)
         self._fresh.append(peer)
         return peer
 
@@ -196,20 +170,14 @@ class UdpListener:
         """Drop a peer. It counts as a new peer if it sends again."""
         self._peers.pop(address, None)
 
-    def fileno(self) -> int:
-        """Return the descriptor to wait on."""
-        return self._socket.fileno()
-
     def close(self) -> None:
-        """Close it. May be called repeatedly."""
+        """Close it and its peers. May be called repeatedly."""
         for peer in self._peers.values():
             peer.lost = True
-        self._socket.close()
+        super().close()
 
 
-class UdpPeer:
-    """One peer of a UDP listener."""
-
+class _UdpPeer:
     datagram = True
 
     def __init__(self, listener: UdpListener, address: Any) -> None:
@@ -220,13 +188,11 @@ class UdpPeer:
         self.lost = False
 
     def send(self, data: bytes) -> None:
-        """Send whole frames; see `Transport`."""
         if self.lost:
             raise LinkLost(f"{self.url}: this peer was dropped")
         self._listener.send_to(data, self._address)
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         deadline_s = time.monotonic() + timeout_s if timeout_s > 0 else 0.0
         while not self.waiting:
             if self.lost:
@@ -238,10 +204,8 @@ class UdpPeer:
         return self.waiting.popleft() if self.waiting else b""
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on."""
         return self._listener.fileno()
 
     def close(self) -> None:
-        """Close it. May be called repeatedly."""
         self.lost = True
         self._listener.forget(self._address)

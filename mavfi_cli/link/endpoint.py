@@ -1,9 +1,12 @@
-"""Parses endpoint URLs and checks which of them need signing."""
+"""Parses endpoint URLs, checks which of them need signing, and waits for descriptors."""
 
 from __future__ import annotations
 
+import errno
 import ipaddress
+import math
 import re
+import select
 import socket
 from dataclasses import dataclass
 from enum import Enum
@@ -123,3 +126,60 @@ def check_reach(endpoint: Endpoint, address: str, *, signed: bool, allow_unsigne
         f"{address} is beyond this machine, where MAVLink signing is required: "
         "give a signing passphrase, or allow unsigned links by name",
     )
+
+
+def _wait_for(descriptor: int, events: int, timeout_s: float) -> bool:
+    """Return True if a poll event or an error occurs within `timeout_s`; inf never times out."""
+    poller = select.poll()
+    poller.register(descriptor, events)
+    return bool(poller.poll(None if math.isinf(timeout_s) else max(0.0, timeout_s) * 1e3))
+
+
+def readable(descriptor: int, timeout_s: float) -> bool:
+    """Return True if there are bytes or an error to read within `timeout_s`."""
+    return _wait_for(descriptor, select.POLLIN, timeout_s)
+
+
+def writable(descriptor: int, timeout_s: float) -> bool:
+    """Return True if a write can make progress within `timeout_s`."""
+    return _wait_for(descriptor, select.POLLOUT, timeout_s)
+
+
+class SocketOwner:
+    """Owner of a socket that never blocks.
+
+    Attributes:
+        url: URL of the endpoint, for messages to people.
+    """
+
+    def __init__(self, opened: socket.socket, url: str) -> None:
+        opened.settimeout(0.0)
+        self._socket = opened
+        self.url = url
+
+    @property
+    def port(self) -> int:
+        """Local port. The system chooses it if the URL says 0."""
+        return int(self._socket.getsockname()[1])
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Close it. May be called repeatedly."""
+        self._socket.close()
+
+
+def bind(listening: socket.socket, endpoint: Endpoint, address: str) -> None:
+    """Bind the socket, or close it and raise EndpointError."""
+    try:
+        listening.bind((address, endpoint.port))
+    except OSError as error:
+        listening.close()
+        reason = {
+            errno.EADDRINUSE: f"port {endpoint.port} is in use",
+            errno.EADDRNOTAVAIL: f"{address} is not an address of this machine",
+            errno.EACCES: f"port {endpoint.port} needs privileges",
+        }.get(error.errno or 0, error.strerror or str(error))
+        raise EndpointError(endpoint.url, reason) from None

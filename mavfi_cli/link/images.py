@@ -1,4 +1,4 @@
-"""Receives depth frames over MAVLink's image transmission protocol with loss and reordering.
+"""Starts the camera and receives its depth frames, in spite of loss and reordering.
 
 A frame consists of CAMERA_IMAGE_CAPTURED (stamp, index, and `depth8:crc32=%08x` of the pixels in
 `file_url`), DATA_TRANSMISSION_HANDSHAKE (size), and ENCAPSULATED_DATA packets. A packet gives its
@@ -8,6 +8,7 @@ Source of the protocol: https://mavlink.io/en/services/image_transmission.html.
 
 from __future__ import annotations
 
+import math
 import re
 import zlib
 from collections import deque
@@ -19,8 +20,10 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.frames import rotation_matrix
 from mavfi_cli.core.types import DepthFrame, FloatArray, VehicleState
-from mavfi_cli.link.camera import hfov_of
 from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.commands import CommandChannel, Ticket
+
+_CAMERA = dialect.MAV_COMP_ID_CAMERA
 
 MAX_PIXELS = 1 << 20
 DEPTH_UNIT_M = 0.1
@@ -32,8 +35,65 @@ _STRAY = 8  # messages that a packet comes off its due time before it is taken f
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
 _LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
 _REMEMBERED = 64  # indices of frames that are done with
-_DATA_AT, _DATA_BYTES = 2, 253  # in the payload of ENCAPSULATED_DATA, behind `seqnr`
+
 _CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
+
+_DEPTH_M = np.arange(256, dtype=np.float64) * DEPTH_UNIT_M
+
+
+class CameraClient:
+    """Client of the camera component (MAV_COMP_ID_CAMERA) of one system.
+
+    Args:
+        commands: Command channel of that system.
+
+    Attributes:
+        heard: True once the camera has sent a HEARTBEAT.
+    """
+
+    def __init__(self, commands: CommandChannel) -> None:
+        self._commands = commands
+        self.heard = False
+
+    def handle(self, message: Message) -> None:
+        """Request the camera's information at its first HEARTBEAT."""
+        if isinstance(message, dialect.MAVLink_heartbeat_message) and not self.heard:
+            self.heard = True
+            self._commands.submit(
+                dialect.MAV_CMD_REQUEST_MESSAGE,
+                dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION,
+                component=_CAMERA,
+            )
+
+    def start(self, interval_s: float) -> Ticket:
+        """Request a frame every `interval_s` without end. The ticket holds the answer."""
+        return self._commands.submit(
+            dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
+            component=_CAMERA, unused=math.nan, refusals=3,
+        )  # fmt: skip
+
+    def stop(self) -> Ticket:
+        """Request the end of the frames."""
+        return self._commands.submit(
+            dialect.MAV_CMD_IMAGE_STOP_CAPTURE, 0.0, component=_CAMERA, unused=math.nan
+        )
+
+
+def _hfov_of(message: Message) -> float | None:
+    """Return the horizontal field of view in a camera's message, rad; None if there is none.
+
+    CAMERA_INFORMATION gives 2 atan(sensor width / 2 focal length), CAMERA_FOV_STATUS degrees.
+    """
+    if isinstance(message, dialect.MAVLink_camera_information_message):
+        if message.focal_length > 0.0 and 0.0 < message.sensor_size_h < math.inf:
+            return 2.0 * math.atan(message.sensor_size_h / (2.0 * message.focal_length))
+        return None
+    if isinstance(message, dialect.MAVLink_camera_fov_status_message) and 0 < message.hfov < 180:
+        return math.radians(message.hfov)
+    return None
+
+
+_DATA_AT, _DATA_BYTES = 2, 253  # in the payload of ENCAPSULATED_DATA, behind `seqnr`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +203,7 @@ class ImageReceiver:
         return [] if handler is None else handler(self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
-        hfov_rad = hfov_of(message)
+        hfov_rad = _hfov_of(message)
         if hfov_rad is not None:
             self.hfov_rad = hfov_rad
         return []
@@ -290,7 +350,6 @@ def _shape_of(message: Message) -> _Shape | None:
     return _Shape(columns=columns, rows=rows, packets=message.packets, payload=payload)
 
 
-_DEPTH_M = np.arange(256, dtype=np.float64) * DEPTH_UNIT_M
 _DEPTH_M[NOTHING] = np.inf
 
 

@@ -6,24 +6,124 @@ Lockstep, real time and tests drive it the same way. Call `handle` with every re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 from mavfi_cli.core.errors import LinkError, NoAutopilot
+from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
-from mavfi_cli.link.camera import CameraClient
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.commands import CommandChannel
-from mavfi_cli.link.replies import Replies
-from mavfi_cli.link.requests import Requests
-from mavfi_cli.link.setpoint import Target
+from mavfi_cli.link.commands import CommandChannel, Requests
+from mavfi_cli.link.images import CameraClient
 from mavfi_cli.link.telemetry import LandedState, Telemetry
-from mavfi_cli.link.texts import Text
+from mavfi_cli.link.texts import text_messages
 
+_IGNORED = (
+    dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
+    | dialect.POSITION_TARGET_TYPEMASK_Y_IGNORE
+    | dialect.POSITION_TARGET_TYPEMASK_Z_IGNORE
+    | dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+)
+_NO_ACCELERATION = (
+    dialect.POSITION_TARGET_TYPEMASK_AX_IGNORE
+    | dialect.POSITION_TARGET_TYPEMASK_AY_IGNORE
+    | dialect.POSITION_TARGET_TYPEMASK_AZ_IGNORE
+)
+_NO_YAW = dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+_LARGEST_FLOAT32 = 3.4028234663852886e38
+
+_HEARTBEAT_INTERVAL_S = 1.0
+_MAX_ANSWERS = 64  # maximum replies per tick; further requests are ignored
 _HEIGHT_REACHED_M = 0.3  # tolerance below the take-off height
 _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the vehicle itself
-_WARNING = dialect.MAV_SEVERITY_WARNING
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Target:
+    """A setpoint for the autopilot. The default holds position and heading."""
+
+    velocity_enu_mps: tuple[float, ...] = (0.0, 0.0, 0.0)
+    yaw_enu_rad: float | None = None  # None: keep the heading
+    acceleration_enu_mps2: tuple[float, ...] | None = None  # feed-forward
+
+    def message(self, stamp_s: float, system: int, component: int) -> Message:
+        """Return the message for one stamp.
+
+        A value beyond float32 becomes infinity, as in a C++ companion, and NaN stays NaN. The
+        autopilot decides how to handle a corrupted command.
+        """
+        mask, yaw, ax, ay, az = _IGNORED, 0.0, 0.0, 0.0, 0.0
+        east, north, up = map(_float32, self.velocity_enu_mps)
+        if self.acceleration_enu_mps2 is None:
+            mask |= _NO_ACCELERATION
+        else:
+            ay, ax, az = map(_float32, self.acceleration_enu_mps2)
+        if self.yaw_enu_rad is None:
+            mask |= _NO_YAW
+        else:
+            yaw = ned_yaw_from_enu(self.yaw_enu_rad)
+        return dialect.MAVLink_set_position_target_local_ned_message(
+            round(stamp_s * 1e3) & 0xFFFF_FFFF, system, component, dialect.MAV_FRAME_LOCAL_NED,
+            mask, 0.0, 0.0, 0.0, north, east, -up, ax, ay, -az, yaw, 0.0,
+        )  # fmt: skip
+
+
+def _float32(value: float) -> float:
+    number = float(value)
+    return math.copysign(math.inf, number) if abs(number) > _LARGEST_FLOAT32 else number
+
+
+class _Replies:
+    """Collects replies until `take` returns them at the next tick."""
+
+    def __init__(self) -> None:
+        self._answers: list[Message] = []
+        self._next_heartbeat_s = -math.inf
+        self._texts = 0
+
+    def handle(self, message: Message, now_s: float) -> None:
+        """Handle a message. Replies to our own requests need no reply."""
+        if len(self._answers) >= _MAX_ANSWERS:
+            return
+        if _asks_time(message):
+            own_ns = round(now_s * 1e9)
+            self._answers.append(dialect.MAVLink_timesync_message(own_ns, message.ts1))
+        elif _pings(message):
+            asker = (message.get_srcSystem(), message.get_srcComponent())
+            self._answers.append(
+                dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
+            )
+
+    def announce(self, severity: int, text: str) -> None:
+        """Broadcast a STATUSTEXT, mainly for ground stations."""
+        self._texts = self._texts % 0xFFFF + 1
+        self._answers += text_messages(severity, text.encode("ascii", "replace"), self._texts)
+
+    def take(self, stamp_s: float) -> list[Message]:
+        """Return the collected replies and texts, and our own HEARTBEAT once a second."""
+        out, self._answers = self._answers, []
+        if stamp_s >= self._next_heartbeat_s:
+            self._next_heartbeat_s = stamp_s + _HEARTBEAT_INTERVAL_S
+            out.append(_heartbeat())
+        return out
+
+
+def _asks_time(message: Message) -> bool:
+    return isinstance(message, dialect.MAVLink_timesync_message) and message.tc1 == 0
+
+
+def _pings(message: Message) -> bool:
+    asked = isinstance(message, dialect.MAVLink_ping_message)
+    return asked and message.target_system == message.target_component == 0
+
+
+def _heartbeat() -> Message:
+    return dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0,
+        dialect.MAV_STATE_ACTIVE, 3,
+    )  # fmt: skip
 
 
 class Phase(Enum):
@@ -88,55 +188,18 @@ class OffboardSession:
         self._commands = CommandChannel(self._settings.system, self._settings.component)
         self.camera = CameraClient(self._commands)
         self._requests = Requests(self._commands, self.telemetry)
-        self._target = Target()
-        self._replies = Replies()
+        self._target = _Target()
+        self._replies = _Replies()
         self._now_s = 0.0
         self._phase_since_s: float | None = None
         self._ground_m: float | None = None
         self._was_up = False
         self._down_since_s: float | None = None
 
-    # State for the mission ----------------------------------------------------------------------
-
     @property
     def state(self) -> VehicleState | None:
         """Newest vehicle state in ENU; None before position and attitude are known."""
         return self.telemetry.state
-
-    @property
-    def armed(self) -> bool:
-        """True if HEARTBEAT says armed."""
-        return self.telemetry.armed
-
-    @property
-    def mode(self) -> str:
-        """Name of the flight mode in HEARTBEAT; "" before the first."""
-        return self.telemetry.mode
-
-    @property
-    def landed_state(self) -> LandedState:
-        """Landed state in EXTENDED_SYS_STATE."""
-        return self.telemetry.landed_state
-
-    @property
-    def failsafe(self) -> bool:
-        """True once the autopilot has stopped following us without a request."""
-        return self.failsafe_text is not None
-
-    @property
-    def collision_text(self) -> str | None:
-        """Text that reported a collision; None without one."""
-        return self.telemetry.collision_text
-
-    @property
-    def link_lost(self) -> bool:
-        """True if no HEARTBEAT of the autopilot has arrived for three seconds."""
-        return self.telemetry.link_lost
-
-    @property
-    def texts(self) -> Sequence[Text]:
-        """Newest STATUSTEXTs of the autopilot, oldest first."""
-        return self.telemetry.texts.texts
 
     def state_at(self, stamp_s: float) -> VehicleState | None:
         """Return the state at a stamp, exact or interpolated; None outside the last ten seconds."""
@@ -157,24 +220,20 @@ class OffboardSession:
             yaw_enu_rad: Yaw, counter-clockwise from east; None keeps the heading.
             acceleration_enu_mps2: Feed-forward acceleration (3,), m/s^2; None for none.
         """
-        vx, vy, vz = velocity_enu_mps
-        acceleration = None
-        if acceleration_enu_mps2 is not None:
-            ax, ay, az = acceleration_enu_mps2
-            acceleration = (ax, ay, az)
-        self._target = Target(
-            velocity_enu_mps=(vx, vy, vz),
+        acceleration = acceleration_enu_mps2
+        self._target = _Target(
+            velocity_enu_mps=tuple(velocity_enu_mps),
             yaw_enu_rad=yaw_enu_rad,
-            acceleration_enu_mps2=acceleration,
+            acceleration_enu_mps2=None if acceleration is None else tuple(acceleration),
         )
 
     def hold(self) -> None:
         """Hold position and heading from the next tick on."""
-        self._target = Target()
+        self._target = _Target()
 
     def announce(self, text: str) -> None:
         """Send a STATUSTEXT with severity WARNING to ground stations."""
-        self._replies.announce(_WARNING, text)
+        self._replies.announce(dialect.MAV_SEVERITY_WARNING, text)
 
     def request_land(self) -> None:
         """Land at the present position and disarm. Before arming, end the session at once."""

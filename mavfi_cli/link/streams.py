@@ -1,21 +1,20 @@
-"""Byte-stream transports: TCP client, TCP server and inherited socket pair."""
+"""Byte-stream transports: TCP client, TCP server, inherited socket pair and serial port."""
 
 from __future__ import annotations
 
 import errno
 import socket
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
-from mavfi_cli.link.endpoint import Endpoint
-from mavfi_cli.link.waiting import readable, writable
+from mavfi_cli.link.endpoint import Endpoint, SocketOwner, bind, readable, writable
 
 CONNECT_TIMEOUT_S = 5.0
 SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
 _CHUNK = 1 << 16
 
 
-class StreamTransport:
+class _StreamTransport(SocketOwner):
     """A connected stream socket with one peer.
 
     Args:
@@ -28,14 +27,11 @@ class StreamTransport:
     datagram = False
 
     def __init__(self, connection: socket.socket, url: str, *, patient: bool = True) -> None:
-        connection.settimeout(0.0)
-        self._socket = connection
+        super().__init__(connection, url)
         self._patient = patient
         self._unsent = b""
-        self.url = url
 
     def send(self, data: bytes) -> None:
-        """Send whole frames; see `Transport`."""
         if self._unsent:
             self._unsent = self._push(self._unsent)
             if self._unsent:
@@ -59,7 +55,6 @@ class StreamTransport:
             self._lost(error.strerror or str(error))
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         data = self._pull()
         if data is None and timeout_s > 0.0 and readable(self._socket.fileno(), timeout_s):
             data = self._pull()
@@ -79,16 +74,8 @@ class StreamTransport:
     def _lost(self, why: str) -> NoReturn:
         raise LinkLost(f"{self.url}: {why}")
 
-    def fileno(self) -> int:
-        """Return the descriptor to wait on."""
-        return self._socket.fileno()
 
-    def close(self) -> None:
-        """Close it. May be called repeatedly."""
-        self._socket.close()
-
-
-def inherited(endpoint: Endpoint) -> StreamTransport:
+def inherited(endpoint: Endpoint) -> _StreamTransport:
     """Open the transport of a stream socket inherited from the parent process.
 
     Raises:
@@ -107,10 +94,10 @@ def inherited(endpoint: Endpoint) -> StreamTransport:
     if connection.type != socket.SOCK_STREAM:
         connection.detach()
         raise EndpointError(endpoint.url, "not a stream socket")
-    return StreamTransport(connection, endpoint.url)
+    return _StreamTransport(connection, endpoint.url)
 
 
-def connected(endpoint: Endpoint, where: tuple[int, str]) -> StreamTransport:
+def connected(endpoint: Endpoint, where: tuple[int, str]) -> _StreamTransport:
     """Connect a TCP client to the endpoint, resolved to family and address `where`.
 
     Raises:
@@ -125,7 +112,7 @@ def connected(endpoint: Endpoint, where: tuple[int, str]) -> StreamTransport:
     except OSError as error:
         connection.close()
         raise EndpointError(endpoint.url, f"cannot connect: {_reason(error)}") from None
-    return StreamTransport(connection, endpoint.url)
+    return _StreamTransport(connection, endpoint.url)
 
 
 def _reason(error: OSError) -> str:
@@ -134,7 +121,7 @@ def _reason(error: OSError) -> str:
     return (error.strerror or str(error)).lower()
 
 
-class TcpListener:
+class TcpListener(SocketOwner):
     """Accepts TCP clients. Each becomes a transport of its own.
 
     Raises:
@@ -143,28 +130,22 @@ class TcpListener:
 
     def __init__(self, endpoint: Endpoint, where: tuple[int, str]) -> None:
         family, address = where
-        self.url = endpoint.url
-        self._socket = socket.socket(family, socket.SOCK_STREAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bind(self._socket, endpoint, address)
-        self._socket.listen()
-        self._socket.settimeout(0.0)
+        listening = socket.socket(family, socket.SOCK_STREAM)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bind(listening, endpoint, address)
+        listening.listen()
+        super().__init__(listening, endpoint.url)
 
-    @property
-    def port(self) -> int:
-        """Bound port. The system chooses it if the URL says 0."""
-        return int(self._socket.getsockname()[1])
-
-    def accept_ready(self) -> list[StreamTransport]:
+    def accept_ready(self) -> list[_StreamTransport]:
         """Return the clients since the last call. Slow readers among them lose frames."""
         return self.accept_clients(patient=False)
 
-    def accept_clients(self, *, patient: bool) -> list[StreamTransport]:
-        """Return the clients since the last call; see `StreamTransport` for `patient`."""
+    def accept_clients(self, *, patient: bool) -> list[_StreamTransport]:
+        """Return the clients since the last call; see `_StreamTransport` for `patient`."""
         clients = []
         while (connection := self._accept()) is not None:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            clients.append(StreamTransport(connection, self.url, patient=patient))
+            clients.append(_StreamTransport(connection, self.url, patient=patient))
         return clients
 
     def _accept(self) -> socket.socket | None:
@@ -172,28 +153,6 @@ class TcpListener:
             return self._socket.accept()[0]
         except OSError:  # no client is waiting, or it has disconnected already
             return None
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait on."""
-        return self._socket.fileno()
-
-    def close(self) -> None:
-        """Close it. May be called repeatedly."""
-        self._socket.close()
-
-
-def bind(listening: socket.socket, endpoint: Endpoint, address: str) -> None:
-    """Bind the socket, or close it and raise EndpointError."""
-    try:
-        listening.bind((address, endpoint.port))
-    except OSError as error:
-        listening.close()
-        reason = {
-            errno.EADDRINUSE: f"port {endpoint.port} is in use",
-            errno.EADDRNOTAVAIL: f"{address} is not an address of this machine",
-            errno.EACCES: f"port {endpoint.port} needs privileges",
-        }.get(error.errno or 0, error.strerror or str(error))
-        raise EndpointError(endpoint.url, reason) from None
 
 
 class TcpServerEnd:
@@ -203,7 +162,7 @@ class TcpServerEnd:
 
     def __init__(self, listener: TcpListener) -> None:
         self._listener = listener
-        self._client: StreamTransport | None = None
+        self._client: _StreamTransport | None = None
         self.url = listener.url
 
     @property
@@ -211,7 +170,7 @@ class TcpServerEnd:
         """Bound port. The system chooses it if the URL says 0."""
         return self._listener.port
 
-    def _serve(self) -> StreamTransport | None:
+    def _serve(self) -> _StreamTransport | None:
         if self._client is None:
             clients = self._listener.accept_clients(patient=True)
             self._client = clients[0] if clients else None
@@ -228,11 +187,9 @@ class TcpServerEnd:
     def receive(self, timeout_s: float) -> bytes:
         """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
         client = self._serve()
-        if client is None:
-            if timeout_s > 0 and readable(self._listener.fileno(), timeout_s):
-                client = self._serve()
-            return client.receive(0.0) if client is not None else b""
-        return client.receive(timeout_s)
+        if client is None and timeout_s > 0 and readable(self._listener.fileno(), timeout_s):
+            client, timeout_s = self._serve(), 0.0
+        return b"" if client is None else client.receive(timeout_s)
 
     def fileno(self) -> int:
         """Return the descriptor to wait on."""
@@ -243,3 +200,69 @@ class TcpServerEnd:
         self._listener.close()
         if self._client is not None:
             self._client.close()
+
+
+class SerialPort:
+    """A serial line to one peer, 8N1 without flow control.
+
+    Raises:
+        EndpointError: The device does not exist, may not be opened, or is in use.
+    """
+
+    datagram = False
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        import serial
+
+        self.url = endpoint.url
+        self._failures: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+        try:
+            self._port: Any = serial.Serial(
+                endpoint.device,
+                endpoint.baud,
+                timeout=0,
+                write_timeout=SEND_TIMEOUT_S,
+                exclusive=True,
+            )
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise EndpointError(endpoint.url, _serial_reason(error, endpoint)) from None
+
+    def send(self, data: bytes) -> None:
+        """Send whole frames; see `Transport`."""
+        try:
+            self._port.write(data)
+        except self._failures as error:
+            self._lost(error)
+
+    def receive(self, timeout_s: float) -> bytes:
+        """Return the next bytes, or b"" after `timeout_s`; see `Transport`."""
+        try:
+            if not readable(self._port.fileno(), timeout_s):
+                return b""
+            return bytes(self._port.read(_CHUNK))
+        except self._failures as error:
+            self._lost(error)
+
+    def _lost(self, error: Exception) -> NoReturn:
+        raise LinkLost(f"{self.url}: the serial device failed: {error}") from None
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        return int(self._port.fileno())
+
+    def close(self) -> None:
+        """Close it. May be called repeatedly."""
+        self._port.close()
+
+
+def _serial_reason(error: Exception, endpoint: Endpoint) -> str:
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        return f"no such device {endpoint.device}"
+    if number == errno.EACCES:
+        return f"no permission to open {endpoint.device}"
+    if number in (errno.EBUSY, errno.EAGAIN) or "lock" in str(error):
+        return f"{endpoint.device} is in use"
+    if number == errno.ENOTTY:
+        return f"{endpoint.device} is not a serial device"
+    return str(error)

@@ -1,19 +1,176 @@
-"""Newest telemetry of one autopilot, updated message by message."""
+"""Newest telemetry of one autopilot, updated message by message.
+
+Autopilots differ in mode numbers and take-off procedure. Sources: PX4's px4_custom_mode.h (main
+mode in bits 16..23, sub mode in bits 24..31) and ArduCopter's mode numbers; both confirmed with
+messages of PX4 1.17 and ArduCopter 4.5.
+"""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
 from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
 from mavfi_cli.core.types import FloatArray, VehicleState
-from mavfi_cli.link.autopilots import PX4, AutopilotProfile, autopilot_of
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.history import StateHistory
 from mavfi_cli.link.texts import TextCollector
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AutopilotProfile:
+    """Modes and command conventions of one autopilot."""
+
+    name: str
+    modes: dict[str, int]  # mode name -> HEARTBEAT.custom_mode
+    offboard_mode: str  # mode in which it follows our setpoints
+    land_mode: str
+    arming_modes: tuple[str, ...]  # modes that allow arming; the session requests the first
+    takeoff_amsl: bool  # NAV_TAKEOFF altitude is above sea level instead of above home
+    unused: float  # value of an unused command parameter
+    early_setpoints: bool  # requires setpoints before the mode; False: they would abort take-off
+
+    def mode_name(self, custom_mode: int) -> str:
+        """Return the name of a HEARTBEAT.custom_mode, or "mode N" if it is unknown."""
+        for name, number in self.modes.items():
+            if number == custom_mode:
+                return name
+        return f"mode {custom_mode}"
+
+    def mode_parameters(self, name: str) -> tuple[float, float]:
+        """Return parameters 2 and 3 of MAV_CMD_DO_SET_MODE for a mode of `modes`."""
+        number = self.modes[name]
+        if self is PX4:
+            return float(number >> 16 & 0xFF), float(number >> 24)
+        return float(number), 0.0
+
+
+def _px4(main: int, sub: int = 0) -> int:
+    return main << 16 | sub << 24
+
+
+PX4 = AutopilotProfile(
+    name="PX4",
+    modes={
+        "MANUAL": _px4(1),
+        "ALTCTL": _px4(2),
+        "POSCTL": _px4(3),
+        "AUTO.READY": _px4(4, 1),
+        "AUTO.TAKEOFF": _px4(4, 2),
+        "AUTO.LOITER": _px4(4, 3),
+        "AUTO.MISSION": _px4(4, 4),
+        "AUTO.RTL": _px4(4, 5),
+        "AUTO.LAND": _px4(4, 6),
+        "ACRO": _px4(5),
+        "OFFBOARD": _px4(6),
+        "STABILIZED": _px4(7),
+    },
+    offboard_mode="OFFBOARD",
+    land_mode="AUTO.LAND",
+    arming_modes=("AUTO.LOITER", "AUTO.TAKEOFF", "POSCTL"),
+    takeoff_amsl=True,
+    unused=math.nan,
+    early_setpoints=True,
+)
+
+ARDUCOPTER = AutopilotProfile(
+    name="ArduCopter",
+    modes={
+        "STABILIZE": 0,
+        "ACRO": 1,
+        "ALT_HOLD": 2,
+        "AUTO": 3,
+        "GUIDED": 4,
+        "LOITER": 5,
+        "RTL": 6,
+        "CIRCLE": 7,
+        "LAND": 9,
+        "BRAKE": 17,
+        "SMART_RTL": 21,
+    },
+    offboard_mode="GUIDED",
+    land_mode="LAND",
+    arming_modes=("GUIDED",),
+    takeoff_amsl=False,
+    unused=0.0,
+    early_setpoints=False,
+)
+
+
+def _autopilot_of(mav_autopilot: int) -> AutopilotProfile:
+    """Return the entry for a HEARTBEAT.autopilot. An unknown autopilot is treated as PX4."""
+    return ARDUCOPTER if mav_autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA else PX4
+
+
+_REORDERED_MS = 1000  # older by less: a late packet; older by more: a restarted clock
+
+
+class _StateHistory:
+    """The newest states in order of their stamps.
+
+    Args:
+        capacity: Minimum number of states to keep.
+    """
+
+    def __init__(self, capacity: int = 512) -> None:
+        self._capacity = capacity
+        self._stamps_ms: list[int] = []
+        self._states: list[VehicleState] = []
+
+    def add(self, state: VehicleState) -> bool:
+        """Append a state. Return False if it is not newer than the newest."""
+        stamp_ms = round(state.stamp_s * 1e3)
+        if self._stamps_ms and stamp_ms <= self._stamps_ms[-1]:
+            if stamp_ms > self._stamps_ms[-1] - _REORDERED_MS:
+                return False
+            self._stamps_ms.clear()
+            self._states.clear()
+        self._stamps_ms.append(stamp_ms)
+        self._states.append(state)
+        if len(self._states) >= 2 * self._capacity:
+            del self._stamps_ms[: -self._capacity]
+            del self._states[: -self._capacity]
+        return True
+
+    def at(self, stamp_s: float) -> VehicleState | None:
+        """Return the state at a stamp, interpolated if needed; None outside the history."""
+        stamp_ms = round(stamp_s * 1e3)
+        index = bisect_left(self._stamps_ms, stamp_ms)
+        if index == len(self._stamps_ms):
+            return None
+        if self._stamps_ms[index] == stamp_ms:
+            return self._states[index]
+        if index == 0:
+            return None
+        return _between(self._states[index - 1], self._states[index], stamp_s)
+
+
+def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> VehicleState:
+    """Interpolate position and velocity linearly, the quaternion by normalised shortest lerp."""
+    share = (stamp_s - before.stamp_s) / (after.stamp_s - before.stamp_s)
+    sign = -1.0 if float(np.dot(before.quaternion, after.quaternion)) < 0.0 else 1.0
+    quaternion = (1.0 - share) * before.quaternion + share * sign * after.quaternion
+    norm = float(np.linalg.norm(quaternion))
+    quaternion = quaternion / norm if norm > 0.0 else before.quaternion
+    return VehicleState(
+        stamp_s=stamp_s,
+        position_enu_m=_mix(before.position_enu_m, after.position_enu_m, share),
+        velocity_enu_mps=_mix(before.velocity_enu_mps, after.velocity_enu_mps, share),
+        quaternion=quaternion,
+        yaw_rad=yaw_from_quaternion(quaternion),
+    )
+
+
+def _mix(
+    before: np.typing.NDArray[np.float64], after: np.typing.NDArray[np.float64], share: float
+) -> np.typing.NDArray[np.float64]:
+    mixed: np.typing.NDArray[np.float64] = (1.0 - share) * before + share * after
+    return mixed
+
 
 HEARTBEAT_LOSS_S = 3.0
 _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
@@ -64,7 +221,7 @@ class Telemetry:
         self.texts = TextCollector()
         self.collision_text: str | None = None
         self.heartbeat_s = -math.inf
-        self.history = StateHistory()
+        self.history = _StateHistory()
         self._quaternion: FloatArray | None = None  # body FLU -> ENU
 
     @property
@@ -102,7 +259,7 @@ class Telemetry:
     def _adopt(self, message: Message) -> None:
         if message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
             self.system = message.get_srcSystem()
-            self.autopilot = autopilot_of(message.autopilot)
+            self.autopilot = _autopilot_of(message.autopilot)
 
     def _heartbeat(self, message: Message) -> None:
         self.heartbeat_s = self.now_s

@@ -1,24 +1,15 @@
 """Transports, opened by URL, that carry bytes to and from one peer.
 
-This module chooses the class for a URL. `streams`, `datagrams` and `serial_port` implement them.
+This module chooses the class for a URL. `streams` and `datagrams` implement them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.endpoint import Endpoint, UrlScheme, check_reach, parse_endpoint, resolve
-
-__all__ = [
-    "EndpointError",
-    "LinkLost",
-    "Listener",
-    "Transport",
-    "open_listener",
-    "open_transport",
-]
 
 
 class Transport(Protocol):
@@ -82,7 +73,7 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
     # Each scheme's module is imported on first use to keep the import of this module cheap.
     endpoint = parse_endpoint(url)
     if endpoint.scheme is UrlScheme.SERIAL:
-        from mavfi_cli.link.serial_port import SerialPort
+        from mavfi_cli.link.streams import SerialPort
 
         return SerialPort(endpoint)
     if endpoint.scheme in (UrlScheme.UDP_IN, UrlScheme.UDP_OUT):
@@ -138,9 +129,55 @@ class _OnePeer:
         return fresh
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on."""
         return self._transport.fileno()
 
     def close(self) -> None:
-        """Close it. May be called repeatedly."""
         self._transport.close()
+
+
+class _MemoryTransport:
+    """One end of a link in memory; made in pairs by `memory_pair`.
+
+    Nobody else runs while one end waits. So an end that has nothing to receive first has its
+    `on_wait` called, in which the other end can act, and never sleeps.
+
+    Attributes:
+        on_wait: called when `receive` finds nothing, before it returns.
+    """
+
+    datagram = False
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.on_wait: Callable[[], None] = lambda: None
+        self._peer: _MemoryTransport | None = None  # None once either end has closed
+        self._arrived: list[bytes] = []
+
+    def send(self, data: bytes) -> None:
+        if self._peer is None:
+            raise LinkLost(f"{self.url}: the peer closed the connection")
+        self._peer._arrived.append(data)
+
+    def receive(self, timeout_s: float) -> bytes:
+        if not self._arrived and self._peer is not None:
+            self.on_wait()
+        if not self._arrived and self._peer is None:
+            raise LinkLost(f"{self.url}: the peer closed the connection")
+        data = b"".join(self._arrived)
+        self._arrived.clear()
+        return data
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        if self._peer is not None:
+            self._peer._peer = None
+            self._peer = None
+
+
+def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
+    """Both ends of a new link; messages to people name it by its URL."""
+    ours, theirs = _MemoryTransport(url), _MemoryTransport(url)
+    ours._peer, theirs._peer = theirs, ours
+    return ours, theirs

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.autonomy.orders import PilotMode
-from mavfi_cli.autonomy.pilot import TURN_S
+from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
 from mavfi_cli.autonomy.planners.base import Planner
 from mavfi_cli.companion.injection import NoInjection, injection_of
 from mavfi_cli.companion.pipeline import Companion
@@ -26,9 +25,9 @@ from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
-from mavfi_cli.link.recorded import RecordedLink
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
+from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission.briefing import require_flyable
 from mavfi_cli.mission.flight_logger import FlightLogger
@@ -351,11 +350,13 @@ class Flight:
         session, companion = self._session, self.companion
         if self._interrupts:
             self.end(Outcome.INTERRUPTED)
-        elif session.collision_text is not None:
-            self.end(Outcome.COLLISION, session.collision_text.removeprefix("Collision: "))
-        elif session.failsafe:
-            self.end(Outcome.FAILSAFE, session.failsafe_text or "")
-        elif session.link_lost:
+        elif session.telemetry.collision_text is not None:
+            self.end(
+                Outcome.COLLISION, session.telemetry.collision_text.removeprefix("Collision: ")
+            )
+        elif session.failsafe_text is not None:
+            self.end(Outcome.FAILSAFE, session.failsafe_text)
+        elif session.telemetry.link_lost:
             self.end(Outcome.LINK_LOST, "no heartbeat for 3 s")
         elif companion is not None and companion.mode is PilotMode.ARRIVED:
             self.end(Outcome.SUCCESS)

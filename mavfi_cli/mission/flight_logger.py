@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mavfi_cli.autonomy.orders import PilotMode
+from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.types import VehicleState

@@ -48,7 +48,7 @@ _WHEELS = {
     "pyserial": "serial",
 }  # fmt: skip
 _LOAD_VEHICLE = """
-from sitl.vehicle.profile_files import load_profile
+from sitl.vehicle.profile import load_profile
 from sitl.vehicle.vehicle import Quadrotor
 import numpy, sys
 vehicle = Quadrotor(load_profile("solo"), position_enu_m=numpy.zeros(3), yaw_enu_rad=0.0)

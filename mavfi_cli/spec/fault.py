@@ -156,7 +156,7 @@ def parse_trigger(text: str) -> Trigger:
         UnknownName: The kind of trigger or the phase does not exist.
         FaultSpecError: The number is missing or invalid.
     """
-    from mavfi_cli.autonomy.orders import PilotMode
+    from mavfi_cli.autonomy.pilot import PilotMode
 
     kind, _, value = text.partition("=")
     if not value and kind.replace(".", "", 1).isdigit():

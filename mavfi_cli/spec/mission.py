@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mavfi_cli.autonomy.planner_names import canonical
+from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
@@ -84,7 +84,7 @@ class MissionConfig:
     world_seed: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "planner", canonical(self.planner))
+        object.__setattr__(self, "planner", canonical_planner(self.planner))
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
             if value is None:

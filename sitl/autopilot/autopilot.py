@@ -8,14 +8,29 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect
+from mavfi_cli.link.texts import text_messages
 from sitl.autopilot import services
-from sitl.autopilot.commander import GPS_FIX_US, Commander, Result
-from sitl.autopilot.commands import VehicleCommand, acknowledge, execute, from_int, from_long
-from sitl.autopilot.flight_modes import External, Hold, Land, Return, Sticks, Takeoff
-from sitl.autopilot.guidance import Guidance, Situation, climbs
-from sitl.autopilot.link import Link
-from sitl.autopilot.modes import FlightMode, mode_from_custom
+from sitl.autopilot.commander import (
+    GPS_FIX_US,
+    Commander,
+    FlightMode,
+    Result,
+    Severity,
+)
+from sitl.autopilot.commands import acknowledge, execute
+from sitl.autopilot.flight_modes import (
+    External,
+    Guidance,
+    Hold,
+    Land,
+    Return,
+    Situation,
+    Sticks,
+    Takeoff,
+    climbs,
+)
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import (
     Setpoint,
@@ -24,18 +39,14 @@ from sitl.autopilot.setpoint import (
     local_setpoint,
     no_setpoint,
 )
-from sitl.autopilot.snapshot import Snapshot
-from sitl.autopilot.streams import Preset
-from sitl.autopilot.telemetry_status import consumed_mah
-from sitl.autopilot.text import Severity, text_messages
-from sitl.autopilot.truth import StateEstimate, Vector
+from sitl.autopilot.streams import Link, Preset
+from sitl.autopilot.telemetry import Snapshot
 from sitl.geodesy import Origin
+from sitl.vehicle.vehicle import Truth
 
 COMPONENT = 1
 _BUTTONS_CENTRED = (0, 0, 500, 0)
 _STRAIGHT_DOWN_MPS = 0.3
-
-Handler = Callable[[Any, Link], None]
 
 
 class Autopilot:
@@ -51,9 +62,7 @@ class Autopilot:
         origin: Geographic origin of the local frame.
     """
 
-    def __init__(
-        self, truth: StateEstimate, *, system_id: int = 1, origin: Origin | None = None
-    ) -> None:
+    def __init__(self, truth: Truth, *, system_id: int = 1, origin: Origin | None = None) -> None:
         self.system_id = system_id
         self.parameters = Parameters(system_id)
         self.commander = Commander(self.parameters)
@@ -67,7 +76,15 @@ class Autopilot:
         self.setpoint: Setpoint = no_setpoint()
         self.motors_on = False
         self._links: list[Link] = []
-        self._handlers = self._handler_table()
+        self._handlers: dict[int, Callable[[Any, Link], None]] = {
+            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: self._on_local_target,
+            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: self._on_global_target,
+            dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
+            dialect.MAVLINK_MSG_ID_COMMAND_LONG: self._on_command,
+            dialect.MAVLINK_MSG_ID_COMMAND_INT: self._on_command,
+            dialect.MAVLINK_MSG_ID_SET_MODE: self._on_set_mode,
+            dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: self._on_manual_control,
+        }
         self._offboard: Setpoint = no_setpoint()
         self._sticks = _BUTTONS_CENTRED
         self._takeoff_down_m = math.nan
@@ -114,10 +131,17 @@ class Autopilot:
 
     def handle(self, message: Any, link: Link) -> None:
         """Handle a message of a client. Messages for other systems are ignored."""
-        handler = self._handlers.get(message.get_msgId())
-        if handler is not None:
-            handler(message, link)
-            self._flush_texts()
+        number = message.get_msgId()
+        if number in self._handlers:
+            self._handlers[number](message, link)
+        elif number in services.ANY_TARGET or (
+            number in services.ADDRESSED and self._is_for_me(message)
+        ):
+            service = services.ANY_TARGET.get(number) or services.ADDRESSED[number]
+            service(self, message, link)
+        else:
+            return
+        self._flush_texts()
 
     def enter_mode(self, mode: FlightMode | None) -> Result:
         """Change the mode on a user's request. Entering the present mode restarts it."""
@@ -159,7 +183,7 @@ class Autopilot:
 
     # Updates over time.
 
-    def observe(self, stamp_us: int, truth: StateEstimate) -> None:
+    def observe(self, stamp_us: int, truth: Truth) -> None:
         """Take the vehicle's state at a stamp and update the commander."""
         now = self.snapshot
         self._elapsed_s = elapsed_s = (stamp_us - now.stamp_us) * 1e-6
@@ -167,7 +191,7 @@ class Autopilot:
         now.stamp_us, now.truth = stamp_us, truth
         if has_fix_now:
             self.set_home(np.array(truth.position_ned_m))
-        now.consumed_mah += consumed_mah(truth.battery_current_a, elapsed_s)
+        now.consumed_mah += max(truth.battery_current_a, 0.0) * elapsed_s / 3.6
         wants_up = self.motors_on and climbs(self.setpoint, truth)
         self.commander.update(stamp_us, truth, wants_up=wants_up)
         self._flush_texts()
@@ -260,46 +284,12 @@ class Autopilot:
         self.commander.texts = []
         for severity, text in texts:
             self._text_id = self._text_id % 0xFFFF + 1
-            for message in text_messages(severity, text, self._text_id):
+            # The TAB tells clients of the events interface that the text arrives there, too.
+            data = text.encode("ascii", "replace") + b"\t"
+            for message in text_messages(severity, data, self._text_id):
                 self.broadcast(message)
 
-    # Dispatch.
-
-    def _handler_table(self) -> dict[int, Handler]:
-        def addressed(service: Callable[[Autopilot, Any, Link], None]) -> Handler:
-            """Wrap a service so that it ignores messages for other components."""
-
-            def handler(message: Any, link: Link) -> None:
-                """Serve a message addressed to us."""
-                if self._is_for_me(message):
-                    service(self, message, link)
-
-            return handler
-
-        targeted = {
-            dialect.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: services.param_request_list,
-            dialect.MAVLINK_MSG_ID_PARAM_REQUEST_READ: services.param_request_read,
-            dialect.MAVLINK_MSG_ID_PARAM_SET: services.param_set,
-            dialect.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: services.mission_request_list,
-            dialect.MAVLINK_MSG_ID_MISSION_COUNT: services.mission_count,
-            dialect.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: services.mission_clear_all,
-            dialect.MAVLINK_MSG_ID_MISSION_REQUEST: services.mission_request,
-            dialect.MAVLINK_MSG_ID_MISSION_REQUEST_INT: services.mission_request,
-            dialect.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: services.file_transfer,
-            dialect.MAVLINK_MSG_ID_LOG_REQUEST_LIST: services.log_request_list,
-        }
-        return {
-            **{number: addressed(service) for number, service in targeted.items()},
-            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: self._on_local_target,
-            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: self._on_global_target,
-            dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
-            dialect.MAVLINK_MSG_ID_COMMAND_LONG: self._on_command_long,
-            dialect.MAVLINK_MSG_ID_COMMAND_INT: self._on_command_int,
-            dialect.MAVLINK_MSG_ID_SET_MODE: self._on_set_mode,
-            dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: self._on_manual_control,
-            dialect.MAVLINK_MSG_ID_TIMESYNC: lambda m, link: services.timesync(self, m, link),
-            dialect.MAVLINK_MSG_ID_PING: lambda m, link: services.ping(self, m, link),
-        }
+    # Messages.
 
     def _is_for_me(self, message: Any, *, anybody: bool = True) -> bool:
         systems = (self.system_id, 0) if anybody else (self.system_id,)
@@ -327,26 +317,17 @@ class Autopilot:
         if self._is_for_me(message):
             self.commander.say(Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported")
 
-    def _on_command_long(self, message: Any, link: Link) -> None:
+    def _on_command(self, message: Any, link: Link) -> None:
         if self._is_for_me(message, anybody=False):
-            execute(self, from_long(message), link)
-
-    def _on_command_int(self, message: Any, link: Link) -> None:
-        if self._is_for_me(message, anybody=False):
-            execute(self, from_int(message), link)
+            execute(self, message, link)
 
     def _on_set_mode(self, message: Any, link: Link) -> None:
         """Handle SET_MODE, the predecessor of DO_SET_MODE, with one answer."""
         if message.target_system != self.system_id:
             return
-        mode = mode_from_custom(message.custom_mode) if message.base_mode & 1 else None
-        command = VehicleCommand(
-            number=dialect.MAV_CMD_DO_SET_MODE, p1=1.0, p2=0.0, p3=0.0, p4=0.0,
-            latitude_deg=math.nan, longitude_deg=math.nan, altitude_m=math.nan,
-            above_home=False, system=message.get_srcSystem(),
-            component=message.get_srcComponent(),
-        )  # fmt: skip
-        link.send(acknowledge(command, self.enter_mode(mode)))
+        mode = FlightMode.from_custom(message.custom_mode) if message.base_mode & 1 else None
+        result = self.enter_mode(mode)
+        link.send(acknowledge(message, dialect.MAV_CMD_DO_SET_MODE, result))
 
     def _on_manual_control(self, message: Any, _link: Link) -> None:
         if message.target == self.system_id:

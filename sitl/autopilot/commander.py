@@ -5,23 +5,109 @@ Texts, results and delays are those observed in messages of PX4 v1.17.
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import Enum, IntEnum
 
-from sitl.autopilot.landing import LandDetector
-from sitl.autopilot.modes import FlightMode
+from mavfi_cli.link.codec import dialect
 from sitl.autopilot.parameters import Parameters
-from sitl.autopilot.text import Severity
-from sitl.autopilot.truth import StateEstimate
+from sitl.vehicle.vehicle import Truth
 
 GPS_FIX_US = 2_500_000  # first fix and home position after boot
 POSITION_US = 3_060_000  # global position fused
 READY_US = 4_000_000  # pre-arm checks pass
-
 _CONTROL_BACK_US = 1_000_000  # time for which a lost setpoint source must be back
-_RETRIED_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RTL)  # ended by disarming
-_UNARMABLE = (FlightMode.LAND, FlightMode.RTL)
-_OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
-_OBL_TERMINATE = 6
+_STILL_MPS = 0.5
+
+# MAV_MODE_FLAG.
+_CUSTOM_MODE_ENABLED = 0x01
+_AUTO_ENABLED = 0x04
+_GUIDED_ENABLED = 0x08
+_STABILIZE_ENABLED = 0x10
+_MANUAL_INPUT_ENABLED = 0x40
+_SAFETY_ARMED = 0x80
+
+
+class FlightMode(Enum):
+    """A flight mode: PX4's main mode, its sub mode, and the name that PX4's texts use.
+
+    custom_mode = main << 16 | sub << 24 (PX4's px4_custom_mode.h, confirmed with v1.17).
+    """
+
+    MANUAL = (1, 0, "Manual")
+    POSCTL = (3, 0, "Position")
+    TAKEOFF = (4, 2, "Takeoff")
+    LOITER = (4, 3, "Hold")
+    RTL = (4, 5, "Return")
+    LAND = (4, 6, "Land")
+    OFFBOARD = (6, 0, "Offboard")
+
+    def __init__(self, main: int, sub: int, label: str) -> None:
+        self.main = main
+        self.sub = sub
+        self.label = label
+        self.custom_mode = main << 16 | sub << 24
+
+    @classmethod
+    def from_numbers(cls, main: int, sub: int) -> FlightMode | None:
+        """Return the mode of param2 and param3 of a DO_SET_MODE; None if there is none.
+
+        The sub mode is used for AUTO only. AUTO without a sub mode is LOITER.
+        """
+        auto = main == cls.LOITER.main
+        numbers = (main, (sub or cls.LOITER.sub) if auto else 0)
+        return next((mode for mode in cls if (mode.main, mode.sub) == numbers), None)
+
+    @classmethod
+    def from_custom(cls, custom_mode: int) -> FlightMode | None:
+        """Return the mode of a SET_MODE's custom_mode; None if there is none."""
+        return cls.from_numbers(custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF)
+
+    def base_mode(self, *, armed: bool) -> int:
+        """Return HEARTBEAT.base_mode as in PX4 v1.17."""
+        flags = _CUSTOM_MODE_ENABLED | (_SAFETY_ARMED if armed else 0)
+        if self.main == FlightMode.LOITER.main:
+            return flags | _AUTO_ENABLED | _GUIDED_ENABLED | _STABILIZE_ENABLED
+        if self is FlightMode.OFFBOARD:
+            return flags | _STABILIZE_ENABLED
+        stabilized = _STABILIZE_ENABLED if self is FlightMode.POSCTL else 0
+        return flags | _MANUAL_INPUT_ENABLED | stabilized
+
+
+class Severity(IntEnum):
+    """Used levels of MAV_SEVERITY."""
+
+    EMERGENCY = 0
+    CRITICAL = 2
+    WARNING = 4
+    INFO = 6
+
+
+class _LandDetector:
+    """Detects landing, with PX4's LNDMC_TRIG_TIME as hysteresis."""
+
+    __slots__ = ("_settled_since_us", "landed")
+
+    def __init__(self) -> None:
+        self.landed = True
+        self._settled_since_us: int | None = None
+
+    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool, trigger_s: float) -> bool:
+        """Take the newest state. Return True if `landed` has changed."""
+        if self.landed:
+            self.landed = truth.on_ground
+            self._settled_since_us = None
+            return not self.landed
+        if not truth.on_ground or wants_up or not _is_still(truth):
+            self._settled_since_us = None
+            return False
+        if self._settled_since_us is None:
+            self._settled_since_us = stamp_us
+        self.landed = stamp_us - self._settled_since_us >= trigger_s * 1e6
+        return self.landed
+
+
+def _is_still(truth: Truth) -> bool:
+    velocity = truth.velocity_ned_mps
+    return bool(abs(velocity[0]) + abs(velocity[1]) + abs(velocity[2]) < _STILL_MPS)
 
 
 class Result(IntEnum):
@@ -34,23 +120,10 @@ class Result(IntEnum):
     FAILED = 4
 
 
-class SystemStatus(IntEnum):
-    """Used values of MAV_STATE."""
-
-    UNINIT = 0
-    STANDBY = 3
-    ACTIVE = 4
-    CRITICAL = 5
-    FLIGHT_TERMINATION = 8
-
-
-class FlightState(IntEnum):
-    """MAV_LANDED_STATE."""
-
-    ON_GROUND = 1
-    IN_AIR = 2
-    TAKEOFF = 3
-    LANDING = 4
+_RETRIED_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RTL)  # ended by disarming
+_UNARMABLE = (FlightMode.LAND, FlightMode.RTL)
+_OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
+_OBL_TERMINATE = 6
 
 
 class Commander:
@@ -65,7 +138,7 @@ class Commander:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
-        self._detector = LandDetector()
+        self._detector = _LandDetector()
         self.stamp_us = 0
         self.user_mode = FlightMode.LOITER
         self.failsafe: FlightMode | None = None
@@ -116,23 +189,30 @@ class Commander:
         )
 
     @property
-    def system_status(self) -> SystemStatus:
+    def system_status(self) -> int:
         """HEARTBEAT.system_status."""
+        status: int = dialect.MAV_STATE_UNINIT
         if self.terminated:
-            return SystemStatus.FLIGHT_TERMINATION
-        if self.failsafe is not None:
-            return SystemStatus.CRITICAL
-        if self.armed:
-            return SystemStatus.ACTIVE
-        return SystemStatus.STANDBY if self.can_arm else SystemStatus.UNINIT
+            status = dialect.MAV_STATE_FLIGHT_TERMINATION
+        elif self.failsafe is not None:
+            status = dialect.MAV_STATE_CRITICAL
+        elif self.armed:
+            status = dialect.MAV_STATE_ACTIVE
+        elif self.can_arm:
+            status = dialect.MAV_STATE_STANDBY
+        return status
 
     @property
-    def landed_state(self) -> FlightState:
+    def landed_state(self) -> int:
         """EXTENDED_SYS_STATE.landed_state."""
+        state: int = dialect.MAV_LANDED_STATE_IN_AIR
         if self.landed:
-            return FlightState.ON_GROUND
-        special = {FlightMode.TAKEOFF: FlightState.TAKEOFF, FlightMode.LAND: FlightState.LANDING}
-        return special.get(self.mode, FlightState.IN_AIR)
+            state = dialect.MAV_LANDED_STATE_ON_GROUND
+        elif self.mode is FlightMode.TAKEOFF:
+            state = dialect.MAV_LANDED_STATE_TAKEOFF
+        elif self.mode is FlightMode.LAND:
+            state = dialect.MAV_LANDED_STATE_LANDING
+        return state
 
     def is_available(self, mode: FlightMode) -> bool:
         """Return True if the mode has its inputs: setpoints for OFFBOARD, sticks for POSCTL."""
@@ -203,7 +283,7 @@ class Commander:
 
     # Updates over time.
 
-    def update(self, stamp_us: int, truth: StateEstimate, *, wants_up: bool) -> None:
+    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool) -> None:
         """Advance to a stamp with the newest state of the vehicle.
 
         Args:

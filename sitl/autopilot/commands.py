@@ -10,12 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.commander import Result
-from sitl.autopilot.link import Link
-from sitl.autopilot.modes import FlightMode, mode_from_numbers
-from sitl.autopilot.snapshot import int32
-from sitl.autopilot.streams import BUILDERS
-from sitl.autopilot.text import Severity
+from sitl.autopilot.commander import FlightMode, Result, Severity
+from sitl.autopilot.streams import Link
+from sitl.autopilot.telemetry import BUILDERS, int32
 
 if TYPE_CHECKING:
     from sitl.autopilot.autopilot import Autopilot
@@ -27,10 +24,10 @@ _FARTHEST_M = 1e6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VehicleCommand:
+class _Command:
     """A command from either message. Missing parameters are NaN."""
 
-    number: int
+    message: Any
     p1: float
     p2: float
     p3: float
@@ -39,27 +36,21 @@ class VehicleCommand:
     longitude_deg: float  # p6
     altitude_m: float  # p7
     above_home: bool  # altitude above home; otherwise above sea level
-    system: int  # system id of the sender
-    component: int
 
 
-def from_long(message: Any) -> VehicleCommand:
-    """Convert a COMMAND_LONG to the common form."""
-    return VehicleCommand(
-        number=message.command, p1=message.param1, p2=message.param2, p3=message.param3,
-        p4=message.param4, latitude_deg=message.param5, longitude_deg=message.param6,
-        altitude_m=message.param7, above_home=False,
-        system=message.get_srcSystem(), component=message.get_srcComponent(),
-    )  # fmt: skip
+_Handler = Callable[["Autopilot", _Command, Link], Result | None]
 
 
-def from_int(message: Any) -> VehicleCommand:
-    """Convert a COMMAND_INT to the common form."""
-    return VehicleCommand(
-        number=message.command, p1=message.param1, p2=message.param2, p3=message.param3,
-        p4=message.param4, latitude_deg=_degrees(message.x), longitude_deg=_degrees(message.y),
-        altitude_m=message.z, above_home=message.frame in _RELATIVE_FRAMES,
-        system=message.get_srcSystem(), component=message.get_srcComponent(),
+def _command_of(message: Any) -> _Command:
+    if message.get_type() == "COMMAND_LONG":
+        place, above_home = (message.param5, message.param6, message.param7), False
+    else:
+        place = (_degrees(message.x), _degrees(message.y), message.z)
+        above_home = message.frame in _RELATIVE_FRAMES
+    return _Command(
+        message=message, p1=message.param1, p2=message.param2, p3=message.param3,
+        p4=message.param4, latitude_deg=place[0], longitude_deg=place[1], altitude_m=place[2],
+        above_home=above_home,
     )  # fmt: skip
 
 
@@ -67,10 +58,10 @@ def _degrees(value: int) -> float:
     return math.nan if value == _INT_UNSET else value * 1e-7
 
 
-def acknowledge(command: VehicleCommand, result: Result) -> Any:
-    """Return the COMMAND_ACK to the sender."""
+def acknowledge(message: Any, number: int, result: Result) -> Any:
+    """Return the COMMAND_ACK of a command number to the sender of a message."""
     return dialect.MAVLink_command_ack_message(
-        command.number, int(result), 0, 0, command.system, command.component
+        number, int(result), 0, 0, message.get_srcSystem(), message.get_srcComponent()
     )
 
 
@@ -79,15 +70,17 @@ def _whole(value: float) -> int | None:
     return int(value) if math.isfinite(value) and value == int(value) else None
 
 
-def execute(autopilot: Autopilot, command: VehicleCommand, link: Link) -> None:
-    """Execute a command and acknowledge it."""
-    handler = _HANDLERS.get(command.number)
-    result = Result.UNSUPPORTED if handler is None else handler(autopilot, command, link)
+def execute(autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Execute a COMMAND_LONG or COMMAND_INT and acknowledge it."""
+    handler = _HANDLERS.get(message.command)
+    result: Result | None = Result.UNSUPPORTED
+    if handler is not None:
+        result = handler(autopilot, _command_of(message), link)
     if result is not None:
-        link.send(acknowledge(command, result))
+        link.send(acknowledge(message, message.command, result))
 
 
-def _arm_disarm(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Result | None:
+def _arm_disarm(autopilot: Autopilot, command: _Command, _link: Link) -> Result | None:
     force = _whole(command.p2) == _FORCE_MAGIC
     if command.p1 == 1.0:
         return autopilot.commander.request_arm(force=force)
@@ -97,16 +90,16 @@ def _arm_disarm(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> R
     return None
 
 
-def _set_mode(autopilot: Autopilot, command: VehicleCommand, link: Link) -> Result:
+def _set_mode(autopilot: Autopilot, command: _Command, link: Link) -> Result:
     """Answer twice like PX4: its receiver acknowledges first, then its commander decides."""
-    link.send(acknowledge(command, Result.ACCEPTED))
+    link.send(acknowledge(command.message, dialect.MAV_CMD_DO_SET_MODE, Result.ACCEPTED))
     base, main, sub = (_whole(value) for value in (command.p1, command.p2, command.p3))
     if base is None or not base & 1 or main is None:
         return Result.TEMPORARILY_REJECTED
-    return autopilot.enter_mode(mode_from_numbers(main, sub or 0))
+    return autopilot.enter_mode(FlightMode.from_numbers(main, sub or 0))
 
 
-def _takeoff(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Result:
+def _takeoff(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
     height = autopilot.parameters.effective("MIS_TAKEOFF_ALT")
     home_down = float(autopilot.snapshot.home_ned_m[2])
     target = home_down - height
@@ -121,7 +114,7 @@ def _takeoff(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Resu
     return autopilot.take_off(target)
 
 
-def _down(autopilot: Autopilot, command: VehicleCommand) -> float:
+def _down(autopilot: Autopilot, command: _Command) -> float:
     """Return a command's height as local down, m; NaN if it has none."""
     if not abs(command.altitude_m) < _FARTHEST_M:
         return math.nan
@@ -130,15 +123,11 @@ def _down(autopilot: Autopilot, command: VehicleCommand) -> float:
     return autopilot.snapshot.origin.altitude_amsl_m - command.altitude_m
 
 
-def _mode_command(mode: FlightMode) -> Callable[[Autopilot, VehicleCommand, Link], Result]:
-    def handler(autopilot: Autopilot, _command: VehicleCommand, _link: Link) -> Result:
-        """Enter the mode and return the result."""
-        return autopilot.enter_mode(mode)
-
-    return handler
+def _mode_command(mode: FlightMode) -> _Handler:
+    return lambda autopilot, _command, _link: autopilot.enter_mode(mode)
 
 
-def _reposition(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Result:
+def _reposition(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
     target = np.array(autopilot.snapshot.truth.position_ned_m)
     latitude, longitude = command.latitude_deg, command.longitude_deg
     if math.isfinite(latitude) and math.isfinite(longitude):
@@ -152,20 +141,20 @@ def _reposition(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> R
     return autopilot.go_to(target, yaw)
 
 
-def _change_speed(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Result:
+def _change_speed(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
     if not 0.0 < command.p2 < _FARTHEST_M:
         return Result.DENIED
     autopilot.set_parameter("MPC_XY_CRUISE", command.p2)
     return Result.ACCEPTED
 
 
-def _terminate(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Result:
+def _terminate(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
     if command.p1 > 0.5:
         autopilot.commander.terminate("Flight termination active")
     return Result.ACCEPTED
 
 
-def _set_home(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Result:
+def _set_home(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
     place = np.array(autopilot.snapshot.truth.position_ned_m)
     if command.p1 != 1.0:
         latitude, longitude = command.latitude_deg, command.longitude_deg
@@ -179,17 +168,13 @@ def _set_home(autopilot: Autopilot, command: VehicleCommand, _link: Link) -> Res
     return Result.ACCEPTED
 
 
-def _get_home(autopilot: Autopilot, _command: VehicleCommand, link: Link) -> Result:
-    return _send_one(autopilot, dialect.MAVLINK_MSG_ID_HOME_POSITION, link)
+def _send(number: int) -> _Handler:
+    return lambda autopilot, _command, link: _send_one(autopilot, number, link)
 
 
-def _request_message(autopilot: Autopilot, command: VehicleCommand, link: Link) -> Result:
+def _request_message(autopilot: Autopilot, command: _Command, link: Link) -> Result:
     number = _whole(command.p1)
     return Result.DENIED if number is None else _send_one(autopilot, number, link)
-
-
-def _request_version(autopilot: Autopilot, _command: VehicleCommand, link: Link) -> Result:
-    return _send_one(autopilot, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION, link)
 
 
 def _send_one(autopilot: Autopilot, number: int, link: Link) -> Result:
@@ -202,7 +187,7 @@ def _send_one(autopilot: Autopilot, number: int, link: Link) -> Result:
     return Result.ACCEPTED
 
 
-def _set_interval(autopilot: Autopilot, command: VehicleCommand, link: Link) -> Result:
+def _set_interval(autopilot: Autopilot, command: _Command, link: Link) -> Result:
     number = _whole(command.p1)
     if number is None or not math.isfinite(command.p2):
         return Result.FAILED
@@ -210,7 +195,7 @@ def _set_interval(autopilot: Autopilot, command: VehicleCommand, link: Link) -> 
     return Result.ACCEPTED if known else Result.FAILED
 
 
-def _get_interval(_autopilot: Autopilot, command: VehicleCommand, link: Link) -> Result:
+def _get_interval(_autopilot: Autopilot, command: _Command, link: Link) -> Result:
     number = _whole(command.p1)
     if number is None or not 0 <= number <= 0xFFFF:
         return Result.FAILED
@@ -220,15 +205,11 @@ def _get_interval(_autopilot: Autopilot, command: VehicleCommand, link: Link) ->
     return Result.ACCEPTED
 
 
-def _prearm_checks(_autopilot: Autopilot, _command: VehicleCommand, _link: Link) -> Result:
-    return Result.ACCEPTED
+def _always(result: Result) -> _Handler:
+    return lambda _autopilot, _command, _link: result
 
 
-def _mission_start(_autopilot: Autopilot, _command: VehicleCommand, _link: Link) -> Result:
-    return Result.DENIED  # there is no mission
-
-
-_HANDLERS: dict[int, Callable[[Autopilot, VehicleCommand, Link], Result | None]] = {
+_HANDLERS: dict[int, _Handler] = {
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
@@ -238,11 +219,11 @@ _HANDLERS: dict[int, Callable[[Autopilot, VehicleCommand, Link], Result | None]]
     dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_DO_SET_HOME: _set_home,
-    dialect.MAV_CMD_GET_HOME_POSITION: _get_home,
+    dialect.MAV_CMD_GET_HOME_POSITION: _send(dialect.MAVLINK_MSG_ID_HOME_POSITION),
     dialect.MAV_CMD_REQUEST_MESSAGE: _request_message,
-    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _request_version,
+    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _send(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION),
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
-    dialect.MAV_CMD_RUN_PREARM_CHECKS: _prearm_checks,
-    dialect.MAV_CMD_MISSION_START: _mission_start,
+    dialect.MAV_CMD_RUN_PREARM_CHECKS: _always(Result.ACCEPTED),
+    dialect.MAV_CMD_MISSION_START: _always(Result.DENIED),  # there is no mission
 }

@@ -8,25 +8,101 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum, auto
+from typing import Protocol
 
 import numpy as np
 
-from sitl.autopilot.guidance import (
-    ALL_AXES,
-    HORIZONTAL,
-    Anchor,
-    Situation,
-    approach,
-    limit_velocity,
-)
+from mavfi_cli.core.frames import Vector
+from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint
-from sitl.autopilot.truth import Vector
+from sitl.vehicle.vehicle import Truth
+
+_POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4
+_CLIMB_MPS = 0.3  # minimum climb speed of a setpoint that leaves the ground
+_CLIMB_M = 0.3
+_STOPPED_MPS = 0.3
+
+_HORIZONTAL = slice(0, 2)
+_ALL_AXES = slice(0, 3)
 
 _TAKEOFF_FIRST_MPS = 0.4
 _TAKEOFF_NEAR_M = 0.2
 _ARRIVED_M = 0.5
 _STICK_INVALID = 32767
+
+
+@dataclass(slots=True, kw_only=True)
+class Situation:
+    """Inputs of a flight mode at one tick."""
+
+    truth: Truth
+    dt_s: float
+    parameters: Parameters
+    landed: bool
+    spooled_up: bool  # armed for long enough to take off
+    home_ned_m: Vector  # (3,)
+    heading_rad: float
+
+
+class Guidance(Protocol):
+    """Guidance of a flight mode from one entry to its end."""
+
+    def fly(self, now: Situation, out: Setpoint) -> None:
+        """Write the setpoint of this tick into `out`, which holds NaN."""
+
+
+def climbs(out: Setpoint, truth: Truth) -> bool:
+    """Return True if a setpoint climbs; NaN does not."""
+    lift = out[2] - truth.position_ned_m[2]
+    return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M)
+
+
+def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:
+    """Return a velocity (n,) towards a point at a distance `delta` (n,) that allows a stop there.
+
+    It is the minimum of the limit, sqrt(2 a d) with half the acceleration, and the position loop.
+    """
+    distance = math.sqrt(float(delta @ delta))
+    if distance < 1e-6:
+        return np.zeros_like(delta)
+    stopping = math.sqrt(acceleration_mps2 * distance)
+    return delta * (min(speed_mps, stopping, _POSITION_GAIN_PER_S * distance) / distance)
+
+
+def _limit_velocity(out: Setpoint, parameters: Parameters) -> None:
+    """Limit the velocity of a setpoint to MPC_XY_VEL_MAX and MPC_Z_VEL_MAX_*, in place."""
+    speed = math.hypot(out[3], out[4])
+    fastest = parameters.effective("MPC_XY_VEL_MAX")
+    if speed > fastest:
+        out[3:5] *= fastest / speed
+    up, down = parameters.effective("MPC_Z_VEL_MAX_UP"), parameters.effective("MPC_Z_VEL_MAX_DN")
+    if out[5] < -up:
+        out[5] = -up
+    elif out[5] > down:
+        out[5] = down
+
+
+class _Anchor:
+    """A position hold that brakes first, then keeps the point of rest."""
+
+    __slots__ = ("_axes", "_place")
+
+    def __init__(self, axes: slice, place: Vector | None = None) -> None:
+        self._axes = axes
+        self._place = place
+
+    def hold(self, now: Situation, out: Setpoint) -> None:
+        """Write position, or zero velocity while braking, for the anchor's axes."""
+        axes = self._axes
+        if self._place is None:
+            velocity = now.truth.velocity_ned_mps[axes]
+            if float(velocity @ velocity) > _STOPPED_MPS**2:
+                out[3:6][axes] = 0.0
+                return
+            self._place = np.array(now.truth.position_ned_m[axes])
+        out[0:3][axes] = self._place
 
 
 class Hold:
@@ -35,7 +111,7 @@ class Hold:
     def __init__(self, target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> None:
         self._target = target_ned_m
         self._yaw_rad = yaw_rad
-        self._anchor = Anchor(ALL_AXES, target_ned_m)
+        self._anchor = _Anchor(_ALL_AXES, target_ned_m)
 
     def fly(self, now: Situation, out: Setpoint) -> None:
         """Fly straight to a distant position, otherwise hold."""
@@ -54,7 +130,7 @@ class Takeoff:
     def __init__(self, target_down_m: float, finished: Callable[[], None]) -> None:
         self._target_down_m = target_down_m
         self._finished = finished
-        self._anchor = Anchor(HORIZONTAL)
+        self._anchor = _Anchor(_HORIZONTAL)
         self._climbing_s = 0.0
 
     def fly(self, now: Situation, out: Setpoint) -> None:
@@ -76,7 +152,7 @@ class Land:
     """AUTO.LAND: descends straight, slower near the ground."""
 
     def __init__(self, over: Vector | None = None) -> None:
-        self._anchor = Anchor(HORIZONTAL, over)
+        self._anchor = _Anchor(_HORIZONTAL, over)
 
     def fly(self, now: Situation, out: Setpoint) -> None:
         """Descend at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2."""
@@ -102,7 +178,7 @@ class Return:
         self._announce = announce
         self._leg: _Leg | None = None
         self._down_m = 0.0
-        self._anchor = Anchor(HORIZONTAL)
+        self._anchor = _Anchor(_HORIZONTAL)
         self._landing: Land | None = None
 
     def fly(self, now: Situation, out: Setpoint) -> None:
@@ -160,7 +236,7 @@ class External:
         for axis in range(3):
             if math.isnan(out[axis]) and math.isnan(out[3 + axis]):
                 out[3 + axis] = 0.0
-        limit_velocity(out, now.parameters)
+        _limit_velocity(out, now.parameters)
 
 
 class Sticks:
@@ -180,7 +256,7 @@ class Sticks:
         lift = 0.0 if z == _STICK_INVALID else _stick(2 * z - 1000)
         out[5] = -lift * value("MPC_Z_VEL_MAX_UP" if lift > 0.0 else "MPC_Z_VEL_MAX_DN")
         out[10] = _stick(r) * math.radians(value("MPC_MAN_Y_MAX"))
-        limit_velocity(out, now.parameters)
+        _limit_velocity(out, now.parameters)
 
 
 def _stick(value: int) -> float:
@@ -189,7 +265,7 @@ def _stick(value: int) -> float:
 
 def _go(now: Situation, out: Setpoint, delta: Vector) -> None:
     value = now.parameters.effective
-    out[3:5] = approach(
+    out[3:5] = _approach(
         delta[:2], speed_mps=value("MPC_XY_CRUISE"), acceleration_mps2=value("MPC_ACC_HOR")
     )
     _go_vertical(now, out, float(delta[2]))
@@ -198,4 +274,4 @@ def _go(now: Situation, out: Setpoint, delta: Vector) -> None:
 def _go_vertical(now: Situation, out: Setpoint, delta_m: float) -> None:
     name = "MPC_Z_V_AUTO_UP" if delta_m < 0.0 else "MPC_Z_V_AUTO_DN"
     limit = now.parameters.effective(name)
-    out[5] = approach(np.array([delta_m]), speed_mps=limit, acceleration_mps2=3.0)[0]
+    out[5] = _approach(np.array([delta_m]), speed_mps=limit, acceleration_mps2=3.0)[0]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.link import Link
 from sitl.autopilot.parameters import HASH_INDEX, HASH_NAME, SetResult
+from sitl.autopilot.streams import Link
 
 if TYPE_CHECKING:
     from sitl.autopilot.autopilot import Autopilot
 
-PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
+_PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
 
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
@@ -21,14 +22,14 @@ _MISSION_UNSUPPORTED = 3
 _MISSION_INVALID_SEQUENCE = 13
 
 
-def param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
+def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
     """Start to list all parameters: the hash first, then a few per tick."""
     link.send(autopilot.parameters.hash_message())
     link.parameters_left.clear()
     link.parameters_left.extend(range(len(autopilot.parameters)))
 
 
-def param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
+def _param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Send one parameter by index, or by name if the index is -1; no answer if unknown."""
     if message.param_index < 0:
         if message.param_id == HASH_NAME:
@@ -43,7 +44,7 @@ def param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
         link.send(autopilot.parameters.message(index))
 
 
-def param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
+def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Store a value, answer on this link, and broadcast a change to all."""
     if message.param_id == HASH_NAME:
         link.parameters_left.clear()  # the client's cache is valid and needs no list
@@ -60,11 +61,11 @@ def param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 def list_parameters(autopilot: Autopilot, link: Link) -> None:
     """Send the next few parameters of a list in progress."""
-    for _ in range(min(PARAMETERS_A_TICK, len(link.parameters_left))):
+    for _ in range(min(_PARAMETERS_A_TICK, len(link.parameters_left))):
         link.send(autopilot.parameters.message(link.parameters_left.popleft()))
 
 
-def mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> None:
+def _mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer that there are no mission items."""
     link.send(
         dialect.MAVLink_mission_count_message(
@@ -73,18 +74,18 @@ def mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> Non
     )
 
 
-def mission_count(_autopilot: Autopilot, message: Any, link: Link) -> None:
+def _mission_count(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Accept an empty upload, which clears the mission, and reject any other."""
     empty = message.count == 0
     _mission_ack(message, link, _MISSION_ACCEPTED if empty else _MISSION_UNSUPPORTED)
 
 
-def mission_clear_all(_autopilot: Autopilot, message: Any, link: Link) -> None:
+def _mission_clear_all(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Acknowledge, as there is nothing to clear."""
     _mission_ack(message, link, _MISSION_ACCEPTED)
 
 
-def mission_request(_autopilot: Autopilot, message: Any, link: Link) -> None:
+def _mission_request(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer that the item does not exist."""
     _mission_ack(message, link, _MISSION_INVALID_SEQUENCE)
 
@@ -97,7 +98,7 @@ def _mission_ack(message: Any, link: Link, result: int) -> None:
     )
 
 
-def file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
+def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer with a NAK, as there are no files, to stop the client's retries."""
     request = bytes(message.payload)
     sequence, session, opcode = struct.unpack_from("<HBB", request)
@@ -112,20 +113,43 @@ def file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
     )
 
 
-def log_request_list(_autopilot: Autopilot, _message: Any, link: Link) -> None:
+def _log_request_list(_autopilot: Autopilot, _message: Any, link: Link) -> None:
     """Answer that there are no logs."""
     link.send(dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
 
 
-def timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
+def _timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer a request (tc1 = 0) with the boot clock, ns."""
     if message.tc1 == 0:
         now_ns = max(autopilot.snapshot.stamp_us * 1000, 1)
         link.send(dialect.MAVLink_timesync_message(now_ns, message.ts1))
 
 
-def ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
+def _ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Echo a broadcast ping with the sender's ids."""
     if message.target_system == 0 and message.target_component == 0:
         system, component = message.get_srcSystem(), message.get_srcComponent()
         link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, system, component))
+
+
+Service = Callable[["Autopilot", Any, Link], None]
+
+ADDRESSED: Mapping[int, Service] = {
+    dialect.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: _param_request_list,
+    dialect.MAVLINK_MSG_ID_PARAM_REQUEST_READ: _param_request_read,
+    dialect.MAVLINK_MSG_ID_PARAM_SET: _param_set,
+    dialect.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: _mission_request_list,
+    dialect.MAVLINK_MSG_ID_MISSION_COUNT: _mission_count,
+    dialect.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: _mission_clear_all,
+    dialect.MAVLINK_MSG_ID_MISSION_REQUEST: _mission_request,
+    dialect.MAVLINK_MSG_ID_MISSION_REQUEST_INT: _mission_request,
+    dialect.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: _file_transfer,
+    dialect.MAVLINK_MSG_ID_LOG_REQUEST_LIST: _log_request_list,
+}
+"""Services by message id, for messages that name the autopilot as their target."""
+
+ANY_TARGET: Mapping[int, Service] = {
+    dialect.MAVLINK_MSG_ID_TIMESYNC: _timesync,
+    dialect.MAVLINK_MSG_ID_PING: _ping,
+}
+"""Services by message id, for messages whatever their target is."""

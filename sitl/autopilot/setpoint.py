@@ -10,11 +10,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mavfi_cli.core.frames import Vector
 from sitl.geodesy import Origin
 
-Setpoint = NDArray[np.float64]
+Setpoint = Vector
 
 _LOCAL_NED = 1
 _BODY_NED = 8

@@ -2,48 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Mapping
 from enum import Enum
 from typing import Any
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot import telemetry_motion as motion
-from sitl.autopilot import telemetry_status as status
-from sitl.autopilot.snapshot import Snapshot
-
-Builder = Callable[[Snapshot], Any]
+from sitl.autopilot.telemetry import BUILDERS, Builder, Snapshot
 
 TICK_US = 20_000  # period of the control loop, which is the highest rate of any stream
-
-BUILDERS: Mapping[int, Builder] = {
-    dialect.MAVLINK_MSG_ID_HEARTBEAT: status.heartbeat,
-    dialect.MAVLINK_MSG_ID_SYS_STATUS: status.sys_status,
-    dialect.MAVLINK_MSG_ID_SYSTEM_TIME: status.system_time,
-    dialect.MAVLINK_MSG_ID_PING: status.ping_request,
-    dialect.MAVLINK_MSG_ID_GPS_RAW_INT: motion.gps_raw_int,
-    dialect.MAVLINK_MSG_ID_ATTITUDE: motion.attitude,
-    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: motion.global_position_int,
-    dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: motion.servo_output_raw,
-    dialect.MAVLINK_MSG_ID_MISSION_CURRENT: status.mission_current,
-    dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: status.gps_global_origin,
-    dialect.MAVLINK_MSG_ID_VFR_HUD: motion.vfr_hud,
-    dialect.MAVLINK_MSG_ID_ATTITUDE_TARGET: motion.attitude_target,
-    dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: motion.position_target_local_ned,
-    dialect.MAVLINK_MSG_ID_HIGHRES_IMU: motion.highres_imu,
-    dialect.MAVLINK_MSG_ID_TIMESYNC: status.timesync_request,
-    dialect.MAVLINK_MSG_ID_ALTITUDE: motion.altitude,
-    dialect.MAVLINK_MSG_ID_BATTERY_STATUS: status.battery_status,
-    dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION: status.autopilot_version,
-    dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: status.estimator_status,
-    dialect.MAVLINK_MSG_ID_VIBRATION: status.vibration,
-    dialect.MAVLINK_MSG_ID_HOME_POSITION: status.home_position,
-    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: status.extended_sys_state,
-    dialect.MAVLINK_MSG_ID_ODOMETRY: motion.odometry,
-    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: motion.attitude_quaternion,
-    # Last, because it ends the tick's batch on a lockstep link.
-    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: motion.local_position_ned,
-}
-"""Every message that can be streamed or requested, in the order of sending."""
 
 _SLOW: Mapping[str, float] = {
     "HEARTBEAT": 1.0,
@@ -97,7 +64,7 @@ class _Stream:
         self.due_us = 0
 
 
-class Streams:
+class _Streams:
     """The streams of one link.
 
     Args:
@@ -156,3 +123,24 @@ class Streams:
 
     def _choose_active(self) -> None:
         self._active = tuple(s for s in self._streams.values() if s.interval_us)
+
+
+class Link:
+    """The autopilot's end of one connection, without a socket.
+
+    Attributes:
+        streams: Telemetry streams of this client.
+        outbox: Pending messages, oldest first.
+        parameters_left: Indices of parameters still to be listed.
+    """
+
+    __slots__ = ("outbox", "parameters_left", "streams")
+
+    def __init__(self, preset: Preset) -> None:
+        self.streams = _Streams(preset)
+        self.outbox: list[Any] = []
+        self.parameters_left: deque[int] = deque()
+
+    def send(self, message: Any) -> None:
+        """Queue a message for this client."""
+        self.outbox.append(message)

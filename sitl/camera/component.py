@@ -7,22 +7,20 @@ stamp. The same stamps and messages give the same bytes.
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect
-from sitl.camera import messages
-from sitl.camera.depth import render_depth
-from sitl.camera.geometry import CameraPose, Optics, camera_pose
-from sitl.camera.schedule import PeriodicSchedule
+from sitl.camera.depth import CameraPose, Image, Optics, camera_pose, render_depth
 from sitl.geodesy import Origin
 
-Vector = NDArray[np.float64]
-Message = Any  # a message of pymavlink's `common` dialect
+_SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding errors
 
 COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
 MAX_RATE_HZ = 50.0  # one frame per control tick
@@ -36,6 +34,40 @@ _LEGACY_REQUESTS: dict[int, int] = {
     dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION,
     dialect.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS: (dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS),
 }
+
+_PAYLOAD_BYTES = 253
+_PIXEL_PITCH_MM = 0.01  # arbitrary: field of view = 2 atan(sensor / 2 / focal length)
+_UNKNOWN = 0x7FFF_FFFF
+_IMAGE_MODE = 0
+
+
+@dataclass(slots=True, kw_only=True)
+class PeriodicSchedule:
+    """Due at the first poll and then every `interval_s` in phase with it.
+
+    A late poll does not shift the phase. Missed times are skipped.
+    """
+
+    interval_s: float
+    _first_s: float | None = None
+    _count: int = 0
+
+    def due(self, stamp_s: float) -> bool:
+        """Return True if it is due at a stamp, and advance to the next time."""
+        if self._first_s is None:
+            self._first_s = stamp_s
+        elapsed_s = stamp_s - self._first_s + _SLACK_S
+        if elapsed_s < self._count * self.interval_s:
+            return False
+        self._count = int(elapsed_s / self.interval_s) + 1
+        return True
+
+    def restart(self) -> None:
+        """Make it due at the next poll."""
+        self._first_s, self._count = None, 0
+
+
+Message = Any  # a message of pymavlink's `common` dialect
 
 
 class Camera:
@@ -126,7 +158,7 @@ class Camera:
             self._reboot()
         self._stamp_s = stamp_s
         self._pose = camera_pose(self.optics, stamp_s, position_enu_m, quaternion_flu_enu)
-        due = [messages.heartbeat()] if self._heartbeat.due(stamp_s) else []
+        due = [_heartbeat()] if self._heartbeat.due(stamp_s) else []
         for message_id, stream in self._streams.items():
             answer = self._request(message_id) if stream.due(stamp_s) else None
             if answer is not None:
@@ -136,8 +168,8 @@ class Camera:
         return due
 
     def idle(self) -> list[Message]:
-        """Return a heartbeat to send while there is no pose."""
-        return [messages.heartbeat()]
+        """Return the messages to send while there is no pose."""
+        return [_heartbeat()]
 
     def _reboot(self) -> None:
         self._heartbeat.restart()
@@ -154,7 +186,7 @@ class Camera:
             optics.rows,
             optics.hfov_rad,
         )
-        frame = messages.frame_messages(image, self.images, pose, self._origin)
+        frame = _frame_messages(image, self.images, pose, self._origin)
         self.images += 1
         if self._frames_left:
             self._frames_left -= 1
@@ -183,16 +215,16 @@ class Camera:
         """Return the present message with an id; None if the camera does not send it."""
         stamp_s = self._stamp_s
         if message_id == dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION:
-            return messages.information(self.optics, stamp_s)
+            return _information(self.optics, stamp_s)
         if message_id == dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS:
-            return messages.settings(stamp_s)
+            return _settings(stamp_s)
         if message_id == dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION:
-            return messages.storage_information(stamp_s)
+            return _storage_information(stamp_s)
         if message_id == dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS:
             interval_s = None if self._frames is None else self._frames.interval_s
-            return messages.capture_status(stamp_s, interval_s=interval_s, images=self.images)
+            return _capture_status(stamp_s, interval_s=interval_s, images=self.images)
         if message_id == dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS and self._pose is not None:
-            return messages.fov_status(self.optics, self._pose, self._origin)
+            return _fov_status(self.optics, self._pose, self._origin)
         return None
 
     def _start_capture(self, message: Message) -> int:
@@ -234,3 +266,97 @@ def _whole(value: float) -> int | None:
     if math.isnan(value):
         return 0
     return round(value) if abs(value) < 2**31 else None
+
+
+_VENDOR, _MODEL = b"mavfi", b"depth8"
+
+
+def _boot_ms(stamp_s: float) -> int:
+    """Convert a stamp to MAVLink's milliseconds since boot."""
+    return round(stamp_s * 1000.0) & 0xFFFF_FFFF
+
+
+def _heartbeat() -> Message:
+    return dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_CAMERA, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
+    )
+
+
+def _information(optics: Optics, stamp_s: float) -> Message:
+    """Return CAMERA_INFORMATION. Focal length and sensor size give the exact field of view."""
+    sensor_mm = (optics.columns * _PIXEL_PITCH_MM, optics.rows * _PIXEL_PITCH_MM)
+    return dialect.MAVLink_camera_information_message(
+        _boot_ms(stamp_s), list(_VENDOR.ljust(32, b"\0")), list(_MODEL.ljust(32, b"\0")), 1,
+        optics.focal_px * _PIXEL_PITCH_MM, *sensor_mm, optics.columns, optics.rows, 0,
+        dialect.CAMERA_CAP_FLAGS_CAPTURE_IMAGE, 0, b"",
+    )  # fmt: skip
+
+
+def _settings(stamp_s: float) -> Message:
+    """Return CAMERA_SETTINGS: photo mode, no zoom, no focus."""
+    return dialect.MAVLink_camera_settings_message(
+        _boot_ms(stamp_s), _IMAGE_MODE, math.nan, math.nan
+    )
+
+
+def _storage_information(stamp_s: float) -> Message:
+    """Return STORAGE_INFORMATION without storage, as frames are sent at once."""
+    return dialect.MAVLink_storage_information_message(
+        _boot_ms(stamp_s), 1, 0, dialect.STORAGE_STATUS_NOT_SUPPORTED, 0.0, 0.0, 0.0, 0.0, 0.0
+    )
+
+
+def _capture_status(stamp_s: float, *, interval_s: float | None, images: int) -> Message:
+    """Return CAMERA_CAPTURE_STATUS. An interval of None means idle."""
+    image_status = 0 if interval_s is None else 3  # idle, or interval set and capturing
+    return dialect.MAVLink_camera_capture_status_message(
+        _boot_ms(stamp_s), image_status, 0, interval_s or 0.0, 0, 0.0, images
+    )
+
+
+def _fov_status(optics: Optics, pose: CameraPose, origin: Origin) -> Message:
+    """Return CAMERA_FOV_STATUS. The geographic position of the image centre is unknown."""
+    return dialect.MAVLink_camera_fov_status_message(
+        _boot_ms(pose.stamp_s), *_geodetic_e7_mm(pose, origin), _UNKNOWN, _UNKNOWN, _UNKNOWN,
+        pose.quaternion_frd_ned, math.degrees(optics.hfov_rad), math.degrees(optics.vfov_rad),
+    )  # fmt: skip
+
+
+def _frame_messages(image: Image, index: int, pose: CameraPose, origin: Origin) -> list[Message]:
+    """Return the messages of one frame (rows, columns) in the order of sending.
+
+    CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels), DATA_TRANSMISSION_HANDSHAKE
+    (size) and ENCAPSULATED_DATA (253 bytes each). This is MAVLink's image transmission protocol
+    (https://mavlink.io/en/services/image_transmission.html).
+    """
+    rows, columns = image.shape
+    pixels = image.tobytes()
+    captured = dialect.MAVLink_camera_image_captured_message(
+        _boot_ms(pose.stamp_s), 0, 0, *_geodetic_e7_mm(pose, origin),
+        _int32(pose.position_enu_m[2] * 1e3), pose.quaternion_frd_ned, index, 1,
+        b"depth8:crc32=%08x" % zlib.crc32(pixels),
+    )  # fmt: skip
+    packets = -(-len(pixels) // _PAYLOAD_BYTES)
+    handshake = dialect.MAVLink_data_transmission_handshake_message(
+        dialect.MAVLINK_DATA_STREAM_IMG_RAW8U, len(pixels), columns, rows, packets, _PAYLOAD_BYTES,
+        100,
+    )  # fmt: skip
+    padded = pixels.ljust(packets * _PAYLOAD_BYTES, b"\0")
+    data = [
+        dialect.MAVLink_encapsulated_data_message(
+            number, padded[number * _PAYLOAD_BYTES : (number + 1) * _PAYLOAD_BYTES]
+        )
+        for number in range(packets)
+    ]
+    return [captured, handshake, *data]
+
+
+def _geodetic_e7_mm(pose: CameraPose, origin: Origin) -> tuple[int, int, int]:
+    east, north, up = (float(c) for c in pose.position_enu_m)
+    latitude, longitude = origin.geodetic(north, east)
+    altitude = _int32((origin.altitude_amsl_m + up) * 1e3)
+    return _int32(latitude * 1e7), _int32(longitude * 1e7), altitude
+
+
+def _int32(value: float) -> int:
+    return max(-(2**31), min(2**31 - 1, round(float(value))))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sitl.control import layout
-from sitl.control.attitude import THRUST_RESERVE
-from sitl.vehicle.model import INFLOW_SLOPE
+from mavfi_cli.core.frames import Vector
+from sitl.control import cascade
+from sitl.control.cascade import THRUST_RESERVE
+from sitl.vehicle.physics import INFLOW_SLOPE
 from sitl.vehicle.profile import GRAVITY_MPS2, LEVEL_SHARE, VehicleProfile
 
 RATE_DAMPING = 0.75
@@ -18,17 +18,17 @@ CLIMB_SHARE = 0.6  # fraction of the spare thrust for climb acceleration
 TILT_TO_RATE = 0.36  # tilt gain / natural frequency of the rate loop
 
 
-def gains_for(profile: VehicleProfile, dt_s: float) -> NDArray[np.float64]:
-    """Return the gain array (layout.GAINS_SIZE,) for a vehicle and a step of `dt_s`.
+def gains_for(profile: VehicleProfile, dt_s: float) -> Vector:
+    """Return the gain array (cascade.GAINS_SIZE,) for a vehicle and a step of `dt_s`.
 
     The rate loop is designed as a second-order system with the motor's lag tau: torque
     I (P e - D w') gives tau s^2 + (1 + D) s + P. The outer gains follow from its natural frequency.
     """
-    gains = np.zeros(layout.GAINS_SIZE)
-    gains[layout.G_DT] = dt_s
-    gains[layout.G_MASS] = profile.total_mass_kg
-    gains[layout.G_GRAVITY] = GRAVITY_MPS2
-    gains[layout.G_INERTIA : layout.G_INERTIA + 3] = profile.inertia_kgm2
+    gains = np.zeros(cascade.GAINS_SIZE)
+    gains[cascade.G_DT] = dt_s
+    gains[cascade.G_MASS] = profile.total_mass_kg
+    gains[cascade.G_GRAVITY] = GRAVITY_MPS2
+    gains[cascade.G_INERTIA : cascade.G_INERTIA + 3] = profile.inertia_kgm2
     _inner(gains, profile)
     _outer(gains, profile)
     _drag(gains, profile)
@@ -36,48 +36,48 @@ def gains_for(profile: VehicleProfile, dt_s: float) -> NDArray[np.float64]:
     return gains
 
 
-def _inner(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+def _inner(gains: Vector, profile: VehicleProfile) -> None:
     hover_n = profile.total_mass_kg * GRAVITY_MPS2 / 4.0
     lag_s = profile.rotor.time_constant_s(hover_n)
     natural = RATE_BANDWIDTH_PER_LAG / lag_s
     p = lag_s * natural**2
     d = max(2.0 * RATE_DAMPING * natural * lag_s - 1.0, 0.0)
     yaw_p = 0.3 / lag_s
-    gains[layout.G_RATE_P : layout.G_RATE_P + 3] = (p, p, yaw_p)
-    gains[layout.G_RATE_D : layout.G_RATE_D + 3] = (d, d, 0.0)
-    gains[layout.G_RATE_I : layout.G_RATE_I + 3] = (0.5 * p, 0.5 * p, 0.5 * yaw_p)
-    gains[layout.G_TILT_P] = TILT_TO_RATE * natural
-    gains[layout.G_TILT_RATE_LIMIT] = math.radians(profile.limits.tilt_rate_degps)
-    gains[layout.G_HEADING_P] = 0.4 * yaw_p
-    gains[layout.G_HEADING_MODEL_P] = 3.0
-    gains[layout.G_YAW_RATE_LIMIT] = math.radians(profile.limits.yaw_rate_degps)
+    gains[cascade.G_RATE_P : cascade.G_RATE_P + 3] = (p, p, yaw_p)
+    gains[cascade.G_RATE_D : cascade.G_RATE_D + 3] = (d, d, 0.0)
+    gains[cascade.G_RATE_I : cascade.G_RATE_I + 3] = (0.5 * p, 0.5 * p, 0.5 * yaw_p)
+    gains[cascade.G_TILT_P] = TILT_TO_RATE * natural
+    gains[cascade.G_TILT_RATE_LIMIT] = math.radians(profile.limits.tilt_rate_degps)
+    gains[cascade.G_HEADING_P] = 0.4 * yaw_p
+    gains[cascade.G_HEADING_MODEL_P] = 3.0
+    gains[cascade.G_YAW_RATE_LIMIT] = math.radians(profile.limits.yaw_rate_degps)
     authority = 0.2 * hover_n * 4.0 * profile.rotor.torque_per_thrust_m
-    gains[layout.G_YAW_ACCELERATION] = min(authority / profile.inertia_kgm2[2], 4.0)
+    gains[cascade.G_YAW_ACCELERATION] = min(authority / profile.inertia_kgm2[2], 4.0)
 
 
-def _outer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+def _outer(gains: Vector, profile: VehicleProfile) -> None:
     limits = profile.limits
     tangent = math.tan(math.radians(limits.tilt_deg))
-    tilt_lag_s = 1.0 / gains[layout.G_TILT_P]
+    tilt_lag_s = 1.0 / gains[cascade.G_TILT_P]
     lift_lag_s = profile.rotor.time_constant_s(profile.total_mass_kg * GRAVITY_MPS2 / 4.0)
-    gains[layout.G_POSITION_P : layout.G_POSITION_P + 3] = (1.0, 1.0, 1.2)
-    gains[layout.G_MODEL_P : layout.G_MODEL_P + 3] = (3.5, 3.5, 4.0)
-    gains[layout.G_MODEL_LAG : layout.G_MODEL_LAG + 3] = (tilt_lag_s, tilt_lag_s, lift_lag_s)
-    gains[layout.G_VELOCITY_P : layout.G_VELOCITY_P + 3] = (2.2, 2.2, 4.0)
-    gains[layout.G_VELOCITY_I : layout.G_VELOCITY_I + 3] = (0.8, 0.8, 2.0)
-    gains[layout.G_INTEGRAL_LIMIT : layout.G_INTEGRAL_LIMIT + 3] = (4.0, 4.0, 5.0)
-    gains[layout.G_ACCELERATION_LIMIT] = LEVEL_SHARE * GRAVITY_MPS2 * tangent
+    gains[cascade.G_POSITION_P : cascade.G_POSITION_P + 3] = (1.0, 1.0, 1.2)
+    gains[cascade.G_MODEL_P : cascade.G_MODEL_P + 3] = (3.5, 3.5, 4.0)
+    gains[cascade.G_MODEL_LAG : cascade.G_MODEL_LAG + 3] = (tilt_lag_s, tilt_lag_s, lift_lag_s)
+    gains[cascade.G_VELOCITY_P : cascade.G_VELOCITY_P + 3] = (2.2, 2.2, 4.0)
+    gains[cascade.G_VELOCITY_I : cascade.G_VELOCITY_I + 3] = (0.8, 0.8, 2.0)
+    gains[cascade.G_INTEGRAL_LIMIT : cascade.G_INTEGRAL_LIMIT + 3] = (4.0, 4.0, 5.0)
+    gains[cascade.G_ACCELERATION_LIMIT] = LEVEL_SHARE * GRAVITY_MPS2 * tangent
     spare_mps2 = THRUST_RESERVE * profile.max_thrust_n / profile.total_mass_kg - GRAVITY_MPS2
-    gains[layout.G_ACCELERATION_LIMIT + 1] = min(
+    gains[cascade.G_ACCELERATION_LIMIT + 1] = min(
         limits.vertical_acceleration_mps2, CLIMB_SHARE * spare_mps2
     )
-    gains[layout.G_SPEED_LIMIT] = limits.horizontal_speed_mps
-    gains[layout.G_CLIMB_LIMIT] = limits.climb_mps
-    gains[layout.G_DESCENT_LIMIT] = limits.descent_mps
-    gains[layout.G_TILT_TANGENT] = tangent
+    gains[cascade.G_SPEED_LIMIT] = limits.horizontal_speed_mps
+    gains[cascade.G_CLIMB_LIMIT] = limits.climb_mps
+    gains[cascade.G_DESCENT_LIMIT] = limits.descent_mps
+    gains[cascade.G_TILT_TANGENT] = tangent
 
 
-def _drag(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+def _drag(gains: Vector, profile: VehicleProfile) -> None:
     """Set body drag and the thrust loss of climbing rotors: dT/dV = slope T / (J0 n D)."""
     rotor, mass_kg = profile.rotor, profile.total_mass_kg
     hover_n = mass_kg * GRAVITY_MPS2 / 4.0
@@ -85,19 +85,19 @@ def _drag(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
     inflow = 4.0 * hover_n * INFLOW_SLOPE
     inflow /= rotor.zero_thrust_advance_ratio * speed_hz * rotor.diameter_m
     linear = np.array(profile.drag.linear_nspm) + np.array([0.0, 0.0, inflow])
-    gains[layout.G_DRAG_LINEAR : layout.G_DRAG_LINEAR + 3] = linear / mass_kg
+    gains[cascade.G_DRAG_LINEAR : cascade.G_DRAG_LINEAR + 3] = linear / mass_kg
     quadratic = np.array(profile.drag.quadratic_ns2pm2)
-    gains[layout.G_DRAG_QUADRATIC : layout.G_DRAG_QUADRATIC + 3] = quadratic / mass_kg
+    gains[cascade.G_DRAG_QUADRATIC : cascade.G_DRAG_QUADRATIC + 3] = quadratic / mass_kg
 
 
-def _mixer(gains: NDArray[np.float64], profile: VehicleProfile) -> None:
+def _mixer(gains: Vector, profile: VehicleProfile) -> None:
     rotor = profile.rotor
     full_v = rotor.full_throttle_voltage_v
     torque_nm = rotor.max_thrust_n * rotor.torque_per_thrust_m
-    gains[layout.G_ROTOR_THRUST] = rotor.max_thrust_n
-    gains[layout.G_ROTOR_OFFSET] = rotor.arm_m / math.sqrt(2.0)
-    gains[layout.G_TORQUE_PER_THRUST] = rotor.torque_per_thrust_m
-    gains[layout.G_THROTTLE : layout.G_THROTTLE + 3] = (
+    gains[cascade.G_ROTOR_THRUST] = rotor.max_thrust_n
+    gains[cascade.G_ROTOR_OFFSET] = rotor.arm_m / math.sqrt(2.0)
+    gains[cascade.G_TORQUE_PER_THRUST] = rotor.torque_per_thrust_m
+    gains[cascade.G_THROTTLE : cascade.G_THROTTLE + 3] = (
         rotor.motor_no_load_current_a * rotor.motor_resistance_ohm / full_v,
         rotor.max_rpm / rotor.motor_kv_rpmpv / full_v,
         torque_nm / rotor.torque_constant_nmpa * rotor.motor_resistance_ohm / full_v,

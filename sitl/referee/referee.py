@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,17 +10,78 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import VehicleProcessError
-from sitl.referee.ground import GroundRule, LandingLimits
+from mavfi_cli.core.errors import RecordError, VehicleProcessError
+from mavfi_cli.core.files import write_atomically, write_json
+from mavfi_cli.core.frames import Vector
 from sitl.referee.sweep import clearance, sweep
-from sitl.referee.truth import TruthLog, save_truth
-from sitl.world import World
+from sitl.world.world import World
 
-Vector = NDArray[np.float64]
+# Columns of truth.npz, (n,) or (n, 3 or 4), one row per control tick.
+_COLUMNS = (
+    "stamp_s", "position_enu_m", "velocity_enu_mps",
+    "quaternion",  # w x y z, body FLU -> ENU
+    "clearance_m", "power_regression_w", "power_propeller_w", "armed", "on_ground",
+)  # fmt: skip
 
-_DEFAULT_LIMITS = LandingLimits()
+# Limits of a landing. PX4 lands at 0.7 m/s (MPC_LAND_SPEED). They allow a hard landing on level
+# legs, but neither a fall nor a touchdown at cruise speed.
+_SINK_MPS = 2.0
+_HORIZONTAL_MPS = 1.5
+_TILT_RAD = math.radians(35.0)
+_AIRBORNE_M = 0.3  # height of the lowest corner above which the vehicle is in the air
+
+
+@dataclass(slots=True, kw_only=True)
+class GroundRule:
+    """Classifies ground contacts from take-off to landing.
+
+    A vehicle in contact before its first take-off stands on the ground. A later contact is a crash
+    unless the flight controller was landing, taking off or disarmed, and the contact is within the
+    limits of a landing. The limits apply to the speed just before the contact.
+    """
+
+    half_m: tuple[float, float, float]  # half sides of the body box
+    _airborne: bool = False
+    _velocity_before_mps: Vector | None = None  # (3,) ENU
+
+    def crashed(
+        self,
+        position_enu_m: Vector,
+        quaternion_flu_enu: Vector,
+        velocity_enu_mps: Vector,
+        *,
+        on_ground: bool,
+        may_land: bool,
+    ) -> bool:
+        """Return True if the newest pose is a crash. Call it once per observation."""
+        lowest_m, tilt_rad = self._attitude(position_enu_m, quaternion_flu_enu)
+        before = self._velocity_before_mps
+        velocity = velocity_enu_mps if before is None else before
+        self._velocity_before_mps = velocity_enu_mps.copy()
+        if lowest_m > _AIRBORNE_M and not on_ground:
+            self._airborne = True
+            return False
+        if not self._airborne or not (on_ground or lowest_m <= 0.0):
+            return False
+        self._airborne = False
+        return not (may_land and _is_gentle(velocity, tilt_rad))
+
+    def _attitude(self, position: Vector, quaternion: Vector) -> tuple[float, float]:
+        """Return the height of the body's lowest corner, m, and the tilt of its up axis, rad."""
+        w, x, y, z = quaternion.tolist()
+        up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+        reach = sum(abs(u) * half for u, half in zip(up, self.half_m, strict=True))
+        return float(position[2]) - reach, math.acos(max(-1.0, min(1.0, up[2])))
+
+
+def _is_gentle(velocity_mps: Vector, tilt_rad: float) -> bool:
+    horizontal_mps = math.hypot(velocity_mps[0], velocity_mps[1])
+    return (
+        -velocity_mps[2] <= _SINK_MPS
+        and horizontal_mps <= _HORIZONTAL_MPS
+        and tilt_rad <= _TILT_RAD
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +100,7 @@ class Collision:
 
     @property
     def text(self) -> str:
-        """Return a short line for a status message."""
+        """Short line for a status message."""
         place = " ".join(f"{c:.1f}" for c in self.position_enu_m)
         return f"Collision: {self.what} at {place}"
 
@@ -51,7 +113,6 @@ class Referee:
         body_box_m: Length, width and height of the vehicle's body box, centred on its position.
         vehicle: Name of the vehicle, for the report.
         physics: Mass and thrust of the vehicle, for the report.
-        limits: Limits of a landing.
     """
 
     def __init__(
@@ -61,7 +122,6 @@ class Referee:
         *,
         vehicle: str = "",
         physics: Mapping[str, float] | None = None,
-        limits: LandingLimits = _DEFAULT_LIMITS,
     ) -> None:
         self.world = world
         self.vehicle = vehicle
@@ -69,11 +129,11 @@ class Referee:
         self.collision: Collision | None = None
         self.distance_m = 0.0
         self.min_clearance_m = math.inf
-        self.log = TruthLog()
         length, width, height = body_box_m
+        self._rows: list[tuple[float | Vector, ...]] = []
         self._half = np.array([length, width, height]) / 2.0
         self._boxes = np.array(world.boxes_enu_m)  # writable: one compiled signature
-        self._ground = GroundRule(half_m=(length / 2.0, width / 2.0, height / 2.0), limits=limits)
+        self._ground = GroundRule(half_m=(length / 2.0, width / 2.0, height / 2.0))
         self._stamp_s = 0.0
         self._position: Vector | None = None
         self._quaternion = level = np.array([1.0, 0.0, 0.0, 0.0])
@@ -116,68 +176,42 @@ class Referee:
         """
         position = np.array(position_enu_m, dtype=np.float64)
         quaternion = np.array(quaternion_flu_enu, dtype=np.float64)
-        found = self.judge(
-            stamp_s,
-            position,
-            quaternion,
-            velocity_enu_mps,
-            armed=armed,
-            on_ground=on_ground,
-            may_land=may_land,
+        velocity = np.array(velocity_enu_mps, dtype=np.float64)
+        if not math.isfinite(float(position.sum() + quaternion.sum())):
+            raise VehicleProcessError(f"at {stamp_s:.3f} s the vehicle's state is not finite")
+        may_land = may_land or not armed
+        crashed = self._ground.crashed(
+            position, quaternion, velocity, on_ground=on_ground, may_land=may_land
         )
-        gap, _ = clearance(position, quaternion, self._half, self._boxes)
-        self.log.append(
-            stamp_s,
-            position,
-            velocity_enu_mps,
-            quaternion,
-            gap,
-            power_regression_w,
-            power_propeller_w,
-            armed,
-            on_ground,
+        found = self._judge(stamp_s, position, quaternion, velocity, armed=armed, crashed=crashed)
+        gap_m, _ = clearance(position, quaternion, self._half, self._boxes)
+        powers = (power_regression_w, power_propeller_w)
+        self._rows.append(
+            (stamp_s, position, velocity, quaternion, gap_m, *powers, armed, on_ground)
         )
         return found
 
-    def judge(
+    def _judge(
         self,
         stamp_s: float,
-        position_enu_m: Vector,
-        quaternion_flu_enu: Vector,
-        velocity_enu_mps: Vector,
+        position: Vector,
+        quaternion: Vector,
+        velocity: Vector,
         *,
         armed: bool,
-        on_ground: bool,
-        may_land: bool = False,
+        crashed: bool,
     ) -> Collision | None:
-        """Check as `observe` without a log row, for the physics steps between control ticks."""
-        position = np.array(position_enu_m, dtype=np.float64)
-        quaternion = np.array(quaternion_flu_enu, dtype=np.float64)
-        if not math.isfinite(float(position.sum() + quaternion.sum())):
-            raise VehicleProcessError(f"at {stamp_s:.3f} s the vehicle's state is not finite")
         before, attitude_before, since = self._position, self._quaternion, self._stamp_s
         if before is None:
             before, attitude_before, since = position, quaternion, stamp_s
         self._position, self._quaternion, self._stamp_s = position, quaternion, stamp_s
         if armed:
             self.distance_m += math.dist(before, position)
-        crashed = self._ground.crashed(
-            position,
-            quaternion,
-            velocity_enu_mps,
-            on_ground=on_ground,
-            may_land=may_land or not armed,
-        )
         if self.collision is not None:
             return None
+        poses = (before, attitude_before, position, quaternion)
         share, box, self.min_clearance_m = sweep(
-            before,
-            attitude_before,
-            position,
-            quaternion,
-            self._half,
-            self._boxes,
-            self.min_clearance_m,
+            *poses, self._half, self._boxes, self.min_clearance_m
         )
         if box < 0 and not crashed:
             return None
@@ -186,44 +220,43 @@ class Referee:
         self.collision = Collision(
             stamp_s=since + share * (stamp_s - since),
             position_enu_m=(float(place[0]), float(place[1]), float(place[2])),
-            speed_mps=float(np.linalg.norm(velocity_enu_mps)),
+            speed_mps=float(np.linalg.norm(velocity)),
             box_index=int(box) if box >= 0 else None,
         )
         return self.collision
 
     def report(self, energies_j: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of the flight for JSON. An infinite clearance (no boxes) is None."""
-        world, hit = self.world, self.collision
-        least = self.min_clearance_m
+        hit, least = self.collision, self.min_clearance_m
         return {
             "collision": None
             if hit is None
             else {
-                "stamp_s": hit.stamp_s,
-                "what": hit.what,
-                "box_index": hit.box_index,
+                **dataclasses.asdict(hit),
                 "position_enu_m": list(hit.position_enu_m),
-                "speed_mps": hit.speed_mps,
+                "what": hit.what,
             },
             "min_clearance_m": least if math.isfinite(least) else None,
             "distance_m": self.distance_m,
             "energies_j": dict(energies_j or {}),
             "vehicle": self.vehicle,
             "physics": self.physics,
-            "world": {
-                "name": world.name,
-                "seed": world.seed,
-                "boxes": world.boxes_enu_m.tolist(),
-                "bounds": world.bounds_enu_m.tolist(),
-                "start": world.start_enu_m.tolist(),
-                "goal": world.goal_enu_m.tolist(),
-            },
+            "world": self.world.as_json(),
         }
 
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:
-        """Write `truth.npz` and `truth.json` into `folder`, each atomically.
+        """Write `truth.npz` and then `truth.json` into `folder`, each atomically.
 
         Raises:
-            RecordError: The folder cannot be written.
+            RecordError: The folder cannot be created or written (no space, no permission).
         """
-        save_truth(folder, self.log, self.report(energies_j))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordError(f"{folder}: cannot write the truth log: {error.strerror}") from None
+        columns = zip(*self._rows, strict=True)
+        arrays: dict[str, Any] = {
+            name: np.array(column) for name, column in zip(_COLUMNS, columns, strict=True)
+        }
+        write_atomically(folder / "truth.npz", lambda file: np.savez(file, **arrays))
+        write_json(folder / "truth.json", self.report(energies_j))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from typing import Any
 
-from mavfi_cli.link.codec import Codec, dialect
-from mavfi_cli.link.signing import Signing
+from mavfi_cli.link.codec import Codec, Signing, dialect
 from mavfi_cli.link.transport import Transport
 from sitl.autopilot.autopilot import COMPONENT
 from sitl.autopilot.streams import Preset
@@ -20,9 +18,8 @@ _FRAMES = (
     dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE,
     dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA,
 )
-
-
 _OVERHEARD = 100  # number of newest texts to keep
+_RECEIVES_A_TICK = 1000
 
 
 class Client:
@@ -69,15 +66,17 @@ class Client:
             data = self.transport.receive(timeout_s)
         return self._take(data) if data else []
 
-    def receive_some(self) -> bool:
-        """Handle one portion of the waiting bytes; False if there are none.
+    def drain(self) -> None:
+        """Handle the waiting bytes, up to a limit, so that a flood cannot stop the clock.
 
         Raises:
-            LinkLost: the peer is gone.
+            LinkLost: The peer is gone.
         """
-        data = self.transport.receive(0.0)
-        self._take(data)
-        return bool(data)
+        for _ in range(_RECEIVES_A_TICK):
+            data = self.transport.receive(0.0)
+            self._take(data)
+            if not data:
+                return
 
     def _take(self, data: bytes) -> list[Any]:
         with self._simulation.wall.measure("link"):
@@ -93,32 +92,26 @@ class Client:
     def send_tick(self) -> None:
         """Send everything due at this tick at once, the autopilot's streams last."""
         with self._simulation.wall.measure("link"):
-            self._send_tick()
-
-    def _send_tick(self) -> None:
-        encode = self._camera_codec.encode
-        camera = [
-            encode(message)
-            for message in (*self._camera_answers, *self._simulation.camera_due)
-            if self._wants_frames or message.get_msgId() not in _FRAMES
-        ]
-        self._camera_answers.clear()
-        messages = self._simulation.autopilot.collect(self._link)
-        encode = self._codec.encode
-        self._send(camera + [encode(message) for message in messages])
+            due = [
+                message
+                for message in self._simulation.camera_due
+                if self._wants_frames or message.get_msgId() not in _FRAMES
+            ]
+            self._send(due, self._simulation.autopilot.collect(self._link))
 
     def send_answers(self) -> None:
         """Send answers without waiting for the tick."""
-        frames = [self._camera_codec.encode(message) for message in self._camera_answers]
-        self._camera_answers.clear()
-        answers = self._simulation.autopilot.take_outbox(self._link)
-        self._send(frames + [self._codec.encode(message) for message in answers])
+        self._send([], self._simulation.autopilot.take_outbox(self._link))
 
-    def forward(self, frames: Iterable[bytes]) -> None:
-        """Send frames of other clients unchanged."""
-        self._send(list(frames))
+    def forward(self, frame: bytes) -> None:
+        """Send a frame of another client unchanged."""
+        self.transport.send(frame)
 
-    def _send(self, frames: list[bytes]) -> None:
+    def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> None:
+        """Send messages of both components; the camera's answers are the first."""
+        answers, self._camera_answers = self._camera_answers, []
+        frames = [self._camera_codec.encode(message) for message in answers + of_camera]
+        frames += [self._codec.encode(message) for message in of_autopilot]
         if frames:
             self.transport.send(b"".join(frames))
 

@@ -8,40 +8,57 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from mavfi_cli.core.errors import ConfigError, MavfiError
-from mavfi_cli.link.signing import Signing, key_from_passphrase
+from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.files import write_json
+from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import open_listener, open_transport
 from sitl.autopilot.streams import Preset
-from sitl.server.briefing import write_briefing
 from sitl.server.client import Client
-from sitl.server.lockstep import EmbeddedVehicle, run_lockstep
+from sitl.server.loops import Door, EmbeddedVehicle, Realtime, run_lockstep
 from sitl.server.options import Options, parse
-from sitl.server.realtime import Door, Realtime
 from sitl.server.simulation import Simulation
-from sitl.vehicle.profile_files import load_profile
+from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
-_WARM_TICKS = 2
+
+def _write_briefing(simulation: Simulation, folder: Path) -> None:
+    """Write goal, bounds and camera mounting to `folder`, before the first message is sent.
+
+    Raises:
+        RecordError: the file cannot be written.
+    """
+    world = simulation.referee.world
+    briefing = {
+        "start_enu_m": world.start_enu_m.tolist(),
+        "goal_enu_m": world.goal_enu_m.tolist(),
+        "bounds_enu_m": world.bounds_enu_m.tolist(),
+        "camera_offset_flu_m": [float(c) for c in simulation.camera.optics.mount_offset_flu_m],
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{folder}: {error.strerror or error}") from None
+    write_json(folder / "briefing.json", briefing)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `python -m sitl`; return the exit code. A known error is one line on stderr and 1."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
     try:
-        serve(options)
+        _serve(options)
     except MavfiError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the one boundary
         return 1
     return 0
 
 
-def serve(options: Options) -> None:
+def _serve(options: Options) -> None:
     """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
     stopped = _stop_on_signals()
     simulation = _simulation(options)
     if options.truth is not None:
-        write_briefing(simulation, options.truth)
-    run = _lockstep if options.lockstep_fd is not None else _realtime
+        _write_briefing(simulation, options.truth)
+    run = _lockstep if options.lockstep else _realtime
     try:
         run(options, simulation, stopped)
     finally:
@@ -60,14 +77,14 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> EmbeddedVehicle:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
     """
     simulation = _simulation(parse(arguments))
-    write_briefing(simulation, truth_folder)
+    _write_briefing(simulation, truth_folder)
     return EmbeddedVehicle(simulation, truth_folder)
 
 
 def warm_up() -> None:
     """Load and compile the code of a flight, which is the same for every world."""
     simulation = Simulation(load_world("dense", seed=1), load_profile("solo"))
-    for _ in range(_WARM_TICKS):
+    for _ in range(2):
         simulation.advance()
 
 
@@ -78,12 +95,13 @@ def _simulation(options: Options) -> Simulation:
         start_enu_m=options.start_enu_m,
         goal_enu_m=options.goal_enu_m,
     )
+    columns, rows = options.camera_size
     return Simulation(
         world,
         load_profile(options.vehicle),
         system_id=options.system_id,
-        camera_columns=options.camera_columns,
-        camera_rows=options.camera_rows,
+        camera_columns=columns,
+        camera_rows=rows,
         camera_rate_hz=options.camera_rate_hz,
     )
 
@@ -96,7 +114,7 @@ def _stop_on_signals() -> Callable[[], bool]:
 
 
 def _lockstep(options: Options, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    transport = open_transport(f"fd:{options.lockstep_fd}")
+    transport = open_transport(f"fd:{options.fd}")
     client = Client(simulation, transport, Preset.LOCKSTEP)
     try:
         run_lockstep(
@@ -111,7 +129,7 @@ def _lockstep(options: Options, simulation: Simulation, stopped: Callable[[], bo
 
 
 def _realtime(options: Options, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    key = _key(options)
+    key = None if options.key_file is None else key_from_file(options.key_file)
     doors: list[Door] = []
     server = Realtime(simulation, doors, speed=options.speed or 1.0)
     try:
@@ -128,18 +146,6 @@ def _realtime(options: Options, simulation: Simulation, stopped: Callable[[], bo
         server.run(stopped)
     finally:
         server.close()
-
-
-def _key(options: Options) -> bytes | None:
-    if options.key_file is None:
-        return None
-    try:
-        passphrase = options.key_file.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read the passphrase: {error}", path=options.key_file) from None
-    if not passphrase:
-        raise ConfigError("the passphrase is empty", path=options.key_file)
-    return key_from_passphrase(passphrase)
 
 
 def _signing_maker(key: bytes | None) -> Callable[[], Signing | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,14 +11,13 @@ from pathlib import Path
 
 from sitl.autopilot.streams import Preset
 
-DEFAULT_LINKS = (
+# As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
+_DEFAULT_LINKS = (
     "onboard=udpout:127.0.0.1:14540",
     "gcs=udpout:127.0.0.1:14550",
     "gcs=tcpin:127.0.0.1:5760",
 )
-"""As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls."""
-
-Triple = tuple[float, float, float]
+_Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,15 +27,15 @@ class Options:
     world: str
     seed: int
     vehicle: str
-    start_enu_m: Triple | None
-    goal_enu_m: Triple | None
-    links: tuple[tuple[Preset, str], ...]
-    lockstep_fd: int | None
+    start_enu_m: _Triple | None
+    goal_enu_m: _Triple | None
+    links: list[tuple[Preset, str]]
+    fd: int | None
+    lockstep: bool
     speed: float | None  # None: no limit, in lockstep only
     answer_limit_s: float
     truth: Path | None
-    camera_columns: int
-    camera_rows: int
+    camera_size: tuple[int, int]  # columns, rows
     camera_rate_hz: float
     system_id: int
     key_file: Path | None
@@ -45,25 +45,20 @@ class Options:
 def parse(arguments: Sequence[str]) -> Options:
     """Parse a command line; exit with code 2 if it is not valid."""
     parser = _parser()
-    given = parser.parse_args(arguments)
-    if given.lockstep and given.fd is None:
-        parser.error("--lockstep needs --fd")
-    columns, rows = given.camera_size
-    links = list(given.link or ([] if given.fd is not None else map(_link, DEFAULT_LINKS)))
-    if given.lockstep and links:
-        parser.error("--lockstep serves the companion on --fd only, without --link")
-    if given.fd is not None and not given.lockstep:
-        links.append((Preset.LOCKSTEP, f"fd:{given.fd}"))
-    speed = 1.0 if given.realtime else given.speed
-    return Options(
-        world=given.world, seed=given.seed, vehicle=given.vehicle,
-        start_enu_m=given.start, goal_enu_m=given.goal, links=tuple(links),
-        lockstep_fd=given.fd if given.lockstep else None,
-        speed=speed if speed is not None or given.lockstep else 1.0,
-        answer_limit_s=given.answer_limit, truth=given.truth,
-        camera_columns=columns, camera_rows=rows, camera_rate_hz=given.camera_rate,
-        system_id=given.sysid, key_file=given.key_file, allow_unsigned=given.allow_unsigned,
-    )  # fmt: skip
+    options = Options(**vars(parser.parse_args(arguments)))
+    links, speed = options.links, options.speed
+    if options.lockstep:
+        if options.fd is None:
+            parser.error("--lockstep needs --fd")
+        if links:
+            parser.error("--lockstep serves the companion on --fd only, without --link")
+    elif options.fd is not None:
+        links = [*links, (Preset.LOCKSTEP, f"fd:{options.fd}")]
+    elif not links:
+        links = [_link(link) for link in _DEFAULT_LINKS]
+    if speed is None and not options.lockstep:
+        speed = 1.0
+    return dataclasses.replace(options, links=links, speed=speed)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -76,33 +71,47 @@ def _parser() -> argparse.ArgumentParser:
     add("--world", default="dense", help="name, gen:density,size or TOML file (default: dense)")
     add("--seed", type=int, default=3, help="of the world (default: 3)")
     add("--vehicle", default="solo", help="profile name or TOML file (default: solo)")
-    add("--start", type=_triple, metavar="X,Y,Z", help="start, east,north,up in m; see --goal")
     add(
-        "--goal", type=_triple, metavar="X,Y,Z",
+        "--start",
+        dest="start_enu_m",
+        type=_triple,
+        metavar="X,Y,Z",
+        help="start, east,north,up in m; see --goal",
+    )
+    add(
+        "--goal", dest="goal_enu_m", type=_triple, metavar="X,Y,Z",
         help="goal, east,north,up in m; a generated world is made round start and goal: another "
         "place moves its bounds, and towers within 3 m of it are left out",
     )  # fmt: skip
     add(
-        "--link", type=_link, action="append", metavar="[PRESET=]URL",
+        "--link", dest="links", type=_link, action="append", default=[], metavar="[PRESET=]URL",
         help="endpoint, repeatable; presets: onboard, gcs, lockstep "
-        f"(default: {' '.join(DEFAULT_LINKS)})",
+        f"(default: {' '.join(_DEFAULT_LINKS)})",
     )  # fmt: skip
     add("--fd", type=int, metavar="N", help="inherited stream socket of a companion")
     add("--lockstep", action="store_true", help="wait for the companion on --fd at every tick")
     pace = parser.add_mutually_exclusive_group()
-    pace.add_argument("--realtime", action="store_true", help="as --speed 1")
+    pace.add_argument(
+        "--realtime", dest="speed", action="store_const", const=1.0, help="as --speed 1"
+    )
     pace.add_argument(
         "--speed", type=_positive, metavar="X",
         help="times real time (default: 1; in lockstep as fast as it goes)",
     )  # fmt: skip
     add(
-        "--answer-limit", type=_positive, default=120.0, metavar="S",
+        "--answer-limit", dest="answer_limit_s", type=_positive, default=120.0, metavar="S",
         help="in lockstep, how long the companion may think (default: 120)",
     )  # fmt: skip
     add("--truth", type=Path, metavar="DIR", help="save the referee's truth here at the end")
     add("--camera-size", type=_size, default=(64, 48), metavar="WxH", help="default: 64x48")
-    add("--camera-rate", type=_positive, default=10.0, metavar="HZ", help="default: 10")
-    add("--sysid", type=_system_id, default=1, help="MAVLink system id (default: 1)")
+    add(
+        "--camera-rate", dest="camera_rate_hz", type=_positive, default=10.0, metavar="HZ",
+        help="default: 10",
+    )  # fmt: skip
+    add(
+        "--sysid", dest="system_id", type=_system_id, default=1, metavar="SYSID",
+        help="MAVLink system id (default: 1)",
+    )  # fmt: skip
     add("--key-file", type=Path, metavar="FILE", help="file with the signing passphrase")
     add(
         "--allow-unsigned", action="store_true",
@@ -111,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _triple(text: str) -> Triple:
+def _triple(text: str) -> _Triple:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:

@@ -9,16 +9,14 @@ from typing import Any
 
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.frames import enu_from_ned, flu_enu_from_frd_ned
+from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.core.wall import WallClock
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.streams import TICK_US
-from sitl.autopilot.truth import StateEstimate, Vector
 from sitl.camera.component import Camera
-from sitl.referee import Referee
-from sitl.server.wreck import Wreck, has_come_down, wreck_of
+from sitl.referee.referee import Referee
 from sitl.vehicle.profile import VehicleProfile
-from sitl.vehicle.vehicle import Quadrotor
+from sitl.vehicle.vehicle import Quadrotor, Truth, wreck_of
 from sitl.world import World
 
 STEPS_A_TICK = 5
@@ -27,6 +25,7 @@ HOST_FILE = "host.json"
 
 _FARTHEST_M = 1e6
 _FASTEST_RADPS = 1e4
+_GROUND_M = 0.3  # highest centre of a fallen vehicle
 _STEP_S = TICK_US * 1e-6 / STEPS_A_TICK
 
 
@@ -78,7 +77,7 @@ class Simulation:
         )
         self.wall = WallClock()
         self.stamp_us = 0
-        self._wreck: Wreck | None = None
+        self._wreck: Truth | None = None
         self.camera_due: list[Any] = []
         self._look()
 
@@ -112,7 +111,7 @@ class Simulation:
 
     def _look(self) -> None:
         autopilot = self.autopilot
-        truth: StateEstimate = self._wreck or self.vehicle.truth
+        truth = self._wreck or self.vehicle.truth
         position = enu_from_ned(truth.position_ned_m)
         quaternion = flu_enu_from_frd_ned(truth.quaternion_frd_ned)
         with self.wall.measure("referee"):
@@ -121,12 +120,9 @@ class Simulation:
         with self.wall.measure("camera"):
             self.camera_due = self.camera.poll(self.stamp_us * 1e-6, position, quaternion)
 
-    def _judge(
-        self, truth: StateEstimate, position_enu_m: Vector, quaternion_flu_enu: Vector
-    ) -> None:
+    def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
         """Let the referee judge this tick; after a collision the vehicle falls and stays there."""
-        commander, powers = self.autopilot.commander, self.vehicle.truth
-        moves = self._wreck is None
+        commander = self.autopilot.commander
         collision = self.referee.observe(
             self.stamp_us * 1e-6,
             position_enu_m,
@@ -135,17 +131,21 @@ class Simulation:
             armed=commander.armed,
             on_ground=truth.on_ground,
             may_land=self.autopilot.may_touch_ground,
-            power_regression_w=powers.power_regression_w if moves else 0.0,
-            power_propeller_w=powers.power_propeller_w if moves else 0.0,
+            power_regression_w=truth.power_regression_w,
+            power_propeller_w=truth.power_propeller_w,
         )
         if collision is not None:
             commander.terminate(collision.text)
-        if moves and commander.terminated and has_come_down(truth):
+        if self._wreck is None and commander.terminated and _has_come_down(truth):
             self._wreck = wreck_of(truth)
         if not _is_believable(truth):
             raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")
 
 
-def _is_believable(truth: StateEstimate) -> bool:
+def _is_believable(truth: Truth) -> bool:
     place, rates = truth.position_ned_m, truth.rates_frd_radps
     return float(place @ place) < _FARTHEST_M**2 and float(rates @ rates) < _FASTEST_RADPS**2
+
+
+def _has_come_down(truth: Truth) -> bool:
+    return truth.on_ground or bool(truth.position_ned_m[2] > -_GROUND_M)

@@ -1,4 +1,4 @@
-"""Vehicle profiles. One TOML file describes one quadrotor completely."""
+"""Vehicle profiles. One TOML file describes one quadrotor, or scales a shipped one."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.config import read_toml, shipped_names, shipped_path, structure
+from mavfi_cli.core.errors import ConfigError, UnknownName
 
 AIR_DENSITY_KGPM3 = 1.225  # ISA at sea level
 GRAVITY_MPS2 = 9.80665
@@ -89,7 +91,7 @@ class Rotor:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drag:
+class _Drag:
     """Body drag along each body axis: F = -(linear v + quadratic v |v|)."""
 
     linear_nspm: Triple  # forward, right, down; N s/m
@@ -97,7 +99,7 @@ class Drag:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Gear:
+class _Gear:
     """Four landing legs on the diagonals."""
 
     leg_radius_m: float  # from the centre, horizontally
@@ -122,9 +124,7 @@ class Battery:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ControlLimits:
-    """Limits of the flight controller's setpoints."""
-
+class _ControlLimits:
     tilt_deg: float = 35.0
     horizontal_speed_mps: float = 12.0
     climb_mps: float = 3.0
@@ -165,10 +165,10 @@ class VehicleProfile:
     body_box_m: Triple  # length, width, height round the centre of mass, propellers included
     camera_mount_flu_m: Triple  # forward, left, up of the centre of mass
     rotor: Rotor
-    drag: Drag
-    gear: Gear
+    drag: _Drag
+    gear: _Gear
     battery: Battery
-    limits: ControlLimits
+    limits: _ControlLimits
     energy: EnergyRegression
 
     def __post_init__(self) -> None:
@@ -255,3 +255,121 @@ def _check_sign(key: str, value: float) -> None:
         raise ConfigError(f"must not be negative, is {value:g}", key=key)
     if value <= 0.0 and key not in _MAY_BE_ZERO:
         raise ConfigError(f"must be above zero, is {value:g}", key=key)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _StandIn:
+    """A profile with a `base`: a shipped quadrotor scaled to stand in for another vehicle.
+
+    Mass, rotor pull, hover power and battery become those of the other vehicle. Size, propellers
+    and drag stay those of the base. None keeps the value of the base.
+    """
+
+    name: str
+    base: str  # name of a shipped profile
+    description: str = ""
+    mass_kg: float | None = None  # ready to fly, without payload
+    extra_payload_kg: float = 0.0
+    rotor_pull_n: float | None = None  # static thrust of all rotors at full throttle
+    acceleration_mps2: float | None = None  # horizontal acceleration that the tilt limit must allow
+    hover_power_w: float | None = None  # electrical power of the rotors in hover at mass_kg
+    battery_wh: float | None = None
+    avionics_w: float | None = None  # power of everything except the rotors
+
+    def __post_init__(self) -> None:
+        for key in ("mass_kg", "rotor_pull_n", "hover_power_w", "battery_wh", "acceleration_mps2"):
+            value = getattr(self, key)
+            if value is not None and value <= 0.0:
+                raise ValueError(f"{key}: must be above zero, is {value:g}")
+
+    def profile(self, base: VehicleProfile) -> VehicleProfile:
+        """Return the scaled quadrotor.
+
+        - Inertia grows with mass_kg, because the shape stays the same. Payload adds none, because
+          it is at the centre of mass.
+        - The rotors turn faster for more pull. Thrust ~ n^2, so n grows with the square root of the
+          ratio. The motors' Kv grows with n, so that the voltage at full throttle stays within the
+          battery's.
+        - The drive's efficiency is set so that the base's propellers take hover_power_w.
+        - The tilt limit is raised if acceleration_mps2 needs it, to LARGEST_TILT_DEG at most.
+
+        Raises:
+            ConfigError: The profile cannot fly. Gives the numbers.
+            ValueError: The propellers take more shaft power than hover_power_w.
+        """
+        mass_kg = self.mass_kg or base.mass_kg
+        rotor = _with_pull(base, self.rotor_pull_n or base.max_thrust_n)
+        battery = base.battery
+        if self.battery_wh is not None:
+            nominal_v = battery.cells * battery.cell_nominal_v
+            battery = dataclasses.replace(battery, capacity_ah=self.battery_wh / nominal_v)
+        if self.avionics_w is not None:
+            battery = dataclasses.replace(battery, avionics_w=self.avionics_w)
+        if self.hover_power_w is not None:
+            share = rotor.hover_power_w(mass_kg) / self.hover_power_w
+            if share > 1.0:
+                raise ValueError(
+                    f"hover_power_w: {self.hover_power_w:g} W do not hover {mass_kg:g} kg: the "
+                    f"propellers of {self.base!r} take {rotor.hover_power_w(mass_kg):.1f} W"
+                )
+            battery = dataclasses.replace(battery, drive_efficiency=share)
+        grown = mass_kg / base.mass_kg
+        ixx, iyy, izz = base.inertia_kgm2
+        return dataclasses.replace(
+            base,
+            name=self.name,
+            description=self.description,
+            mass_kg=mass_kg,
+            extra_payload_kg=self.extra_payload_kg,
+            inertia_kgm2=(grown * ixx, grown * iyy, grown * izz),
+            rotor=rotor,
+            battery=battery,
+            limits=dataclasses.replace(base.limits, tilt_deg=self._tilt_deg(base)),
+        )
+
+    def _tilt_deg(self, base: VehicleProfile) -> float:
+        if self.acceleration_mps2 is None:
+            return base.limits.tilt_deg
+        tangent = self.acceleration_mps2 / (LEVEL_SHARE * GRAVITY_MPS2)
+        needed_deg = math.degrees(math.atan(tangent))
+        return min(max(needed_deg, base.limits.tilt_deg), LARGEST_TILT_DEG)
+
+
+def _with_pull(base: VehicleProfile, pull_n: float) -> Rotor:
+    faster = math.sqrt(pull_n / base.max_thrust_n)
+    return dataclasses.replace(
+        base.rotor,
+        max_rpm=faster * base.rotor.max_rpm,
+        motor_kv_rpmpv=faster * base.rotor.motor_kv_rpmpv,
+    )
+
+
+_PROFILES = Path(__file__).parent / "profiles"
+
+
+def profile_names() -> list[str]:
+    """Return the names of the shipped profiles."""
+    return shipped_names(_PROFILES)
+
+
+def load_profile(name_or_path: str) -> VehicleProfile:
+    """Load a shipped profile by name, or any profile by the path of its TOML file.
+
+    A file with a `base` scales a shipped profile.
+
+    Raises:
+        UnknownName: It is neither a shipped profile nor a TOML path.
+        ConfigError: The file cannot be read, or its vehicle cannot fly.
+    """
+    path = shipped_path("vehicle", name_or_path, _PROFILES)
+    data, text = read_toml(path)
+    if "base" not in data:
+        return structure(data, VehicleProfile, path=path, text=text)
+    stand_in = structure(data, _StandIn, path=path, text=text)
+    if stand_in.base not in profile_names():
+        error = UnknownName("vehicle", stand_in.base, profile_names())
+        raise ConfigError(str(error), path=path, key="base")
+    try:
+        return stand_in.profile(load_profile(stand_in.base))
+    except (ConfigError, ValueError) as problem:
+        raise ConfigError(str(problem), path=path) from None

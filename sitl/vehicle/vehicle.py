@@ -1,4 +1,4 @@
-"""A quadrotor with its flight controller, simulated at a fixed rate."""
+"""A quadrotor with its flight controller, energy and battery, simulated at a fixed rate."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mavfi_cli.core.compiled import compiled
-from mavfi_cli.core.frames import ned_from_enu, ned_yaw_from_enu
-from sitl.control.cascade import control_step
-from sitl.control.gains import gains_for
-from sitl.control.layout import (
+from mavfi_cli.core.frames import Vector, ned_from_enu, ned_yaw_from_enu
+from sitl.control.cascade import (
     M_ON_GROUND,
     M_POSITION,
     M_QUATERNION,
@@ -20,18 +17,13 @@ from sitl.control.layout import (
     M_VELOCITY,
     MEASUREMENT_SIZE,
     STATE_SIZE,
+    control_step,
 )
-from sitl.vehicle.energy import (
-    battery_current,
-    battery_parameters,
-    open_circuit_voltage,
-    regression_coefficients,
-    regression_power,
-)
-from sitl.vehicle.model import PLANET_RADIUS_M
+from sitl.control.gains import gains_for
 from sitl.vehicle.physics import (
     FOOT_M,
     FOOT_POUND_J,
+    PLANET_RADIUS_M,
     RAW_EULER,
     RAW_POSITION,
     RAW_POWER,
@@ -42,35 +34,187 @@ from sitl.vehicle.physics import (
     RAW_WOW,
     Physics,
 )
-from sitl.vehicle.profile import VehicleProfile
-from sitl.vehicle.truth import (
-    T_ACCELERATION,
-    T_COMMANDS,
-    T_CURRENT,
-    T_ENERGY_PROPELLER,
-    T_ENERGY_REGRESSION,
-    T_ON_GROUND,
-    T_POSITION,
-    T_POWER_PROPELLER,
-    T_POWER_REGRESSION,
-    T_QUATERNION,
-    T_RATES,
-    T_REMAINING,
-    T_RPM,
-    T_STAMP,
-    T_VELOCITY,
-    T_VOLTAGE,
-    TRUTH_SIZE,
-    Truth,
-)
+from sitl.vehicle.profile import Battery, EnergyRegression, VehicleProfile
 
-Vector = NDArray[np.float64]
+T_STAMP = 0
+T_POSITION = 1
+T_VELOCITY = 4
+T_ACCELERATION = 7
+T_QUATERNION = 10
+T_RATES = 14
+T_COMMANDS = 17
+T_RPM = 21
+T_ON_GROUND = 25
+T_VOLTAGE = 26
+T_CURRENT = 27
+T_REMAINING = 28
+T_POWER_REGRESSION = 29
+T_POWER_PROPELLER = 30
+T_ENERGY_REGRESSION = 31
+T_ENERGY_PROPELLER = 32
+TRUTH_SIZE = 33
+
+KMH_PER_MPS = 3.6
+GRAMS_PER_KG = 1000.0
+SECONDS_PER_HOUR = 3600.0
+
+# Remaining charge at a lithium cell's empty, nominal, middle and full voltage. The middle
+# voltage lies 30 % of the way from nominal to full: 3.85 V for an ordinary 4.2 V cell.
+_KNEES = np.array([0.0, 0.1, 0.5, 1.0])
+_MIDDLE = 0.3
 
 PHYSICS_DT_S = 0.004
 
 
+class Truth:
+    """Read-only view of the newest state. It is updated in place, so copy values to keep them.
+
+    The position is that of the centre of mass in the NED frame at the world origin on the ground.
+    """
+
+    __slots__ = (
+        "acceleration_ned_mps2",
+        "flat",
+        "motor_commands",
+        "motor_rpm",
+        "position_ned_m",
+        "quaternion_frd_ned",
+        "rates_frd_radps",
+        "velocity_ned_mps",
+    )
+
+    def __init__(self, flat: Vector) -> None:
+        view = flat.view()
+        view.flags.writeable = False
+        self.flat = view  # (TRUTH_SIZE,) all values in the order of the T_ constants
+        self.position_ned_m = view[T_POSITION : T_POSITION + 3]  # (3,)
+        self.velocity_ned_mps = view[T_VELOCITY : T_VELOCITY + 3]  # (3,)
+        self.acceleration_ned_mps2 = view[T_ACCELERATION : T_ACCELERATION + 3]  # (3,)
+        self.quaternion_frd_ned = view[T_QUATERNION : T_QUATERNION + 4]  # (4,) w x y z
+        self.rates_frd_radps = view[T_RATES : T_RATES + 3]  # (3,)
+        self.motor_commands = view[T_COMMANDS : T_COMMANDS + 4]  # (4,) 0..1
+        self.motor_rpm = view[T_RPM : T_RPM + 4]  # (4,)
+
+    @property
+    def stamp_s(self) -> float:
+        """Simulated time since the creation of the vehicle, s."""
+        return float(self.flat[T_STAMP])
+
+    @property
+    def on_ground(self) -> bool:
+        """True if a landing leg carries weight."""
+        return bool(self.flat[T_ON_GROUND] > 0.5)
+
+    @property
+    def battery_voltage_v(self) -> float:
+        """Voltage at the terminals, V."""
+        return float(self.flat[T_VOLTAGE])
+
+    @property
+    def battery_current_a(self) -> float:
+        """Battery current, A."""
+        return float(self.flat[T_CURRENT])
+
+    @property
+    def battery_remaining(self) -> float:
+        """Remaining charge, 0..1."""
+        return float(self.flat[T_REMAINING])
+
+    @property
+    def power_regression_w(self) -> float:
+        """Rotor power by the published regression, W; zero while disarmed."""
+        return float(self.flat[T_POWER_REGRESSION])
+
+    @property
+    def power_propeller_w(self) -> float:
+        """Shaft power of the propellers, W, summed over the rotors."""
+        return float(self.flat[T_POWER_PROPELLER])
+
+    @property
+    def energy_regression_j(self) -> float:
+        """Integral of `power_regression_w`, J."""
+        return float(self.flat[T_ENERGY_REGRESSION])
+
+    @property
+    def energy_propeller_j(self) -> float:
+        """Integral of `power_propeller_w`, J."""
+        return float(self.flat[T_ENERGY_PROPELLER])
+
+
+def wreck_of(truth: Truth) -> Truth:
+    """Return the state of a vehicle that stays where it is with its motors stopped."""
+    flat = truth.flat.copy()
+    flat[T_VELOCITY:T_QUATERNION] = 0.0  # and acceleration
+    flat[T_RATES:T_RPM] = 0.0  # and motor commands
+    flat[[T_CURRENT, T_POWER_REGRESSION, T_POWER_PROPELLER]] = 0.0
+    flat[T_ON_GROUND] = 1.0
+    return Truth(flat)
+
+
+def regression_coefficients(energy: EnergyRegression, payload_kg: float) -> Vector:
+    """Return b1..b6 and the constant, which includes the payload (7,), for `regression_power`."""
+    constant = energy.b9 + energy.b7 * payload_kg * GRAMS_PER_KG
+    return np.array([energy.b1, energy.b2, energy.b3, energy.b4, energy.b5, energy.b6, constant])
+
+
+def battery_parameters(battery: Battery) -> Vector:
+    """Return four open-circuit voltages, resistance, capacity C, efficiency and W (8,)."""
+    middle = battery.cell_nominal_v + _MIDDLE * (battery.cell_full_v - battery.cell_nominal_v)
+    cells = (battery.cell_empty_v, battery.cell_nominal_v, middle, battery.cell_full_v)
+    return np.array(
+        [
+            *(battery.cells * voltage for voltage in cells),
+            battery.resistance_ohm,
+            battery.capacity_ah * SECONDS_PER_HOUR,
+            battery.drive_efficiency,
+            battery.avionics_w,
+        ]
+    )
+
+
 @compiled
-def euler_quaternion(roll: float, pitch: float, yaw: float, out: Vector) -> None:
+def regression_power(velocity_mps: Vector, acceleration_mps2: Vector, b: Vector) -> float:
+    """Return rotor power, W, for velocity (3,), acceleration (3,) and coefficients (7,).
+
+    The regression is that of Tseng et al., arXiv 1703.10049, with speeds and accelerations in km/h
+    as in AirSim's fork. The result is never below zero.
+    """
+    v = KMH_PER_MPS * math.sqrt(velocity_mps[0] ** 2 + velocity_mps[1] ** 2)
+    a = KMH_PER_MPS * math.sqrt(acceleration_mps2[0] ** 2 + acceleration_mps2[1] ** 2)
+    vz = KMH_PER_MPS * abs(velocity_mps[2])
+    az = KMH_PER_MPS * abs(acceleration_mps2[2])
+    horizontal = b[0] * v + b[1] * a + b[2] * v * a
+    vertical = b[3] * vz + b[4] * az + b[5] * vz * az
+    power: float = horizontal + vertical + b[6]
+    return max(power, 0.0)
+
+
+@compiled
+def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
+    """Return the voltage of the unloaded pack, V, at a remaining charge in 0..1."""
+    for segment in range(3):
+        if remaining <= _KNEES[segment + 1]:
+            share: float = (remaining - _KNEES[segment]) / (_KNEES[segment + 1] - _KNEES[segment])
+            low: float = parameters[segment]
+            high: float = parameters[segment + 1]
+            return low + share * (high - low)
+    return float(parameters[3])
+
+
+@compiled
+def battery_current(power_w: float, open_circuit_v: float, resistance_ohm: float) -> float:
+    """Return the current, A, at which the loaded pack delivers a power, or its maximum power.
+
+    It is the smaller root of P = I (V - I R), in the form without cancellation.
+    """
+    if 4.0 * resistance_ohm * power_w > open_circuit_v * open_circuit_v:
+        return open_circuit_v / (2.0 * resistance_ohm)
+    root = math.sqrt(open_circuit_v * open_circuit_v - 4.0 * resistance_ohm * power_w)
+    return 2.0 * power_w / (open_circuit_v + root)
+
+
+@compiled
+def _euler_quaternion(roll: float, pitch: float, yaw: float, out: Vector) -> None:
     """Write the quaternion (4,) of the z-y-x rotation yaw, pitch, roll, rad, with w >= 0."""
     cr, sr = math.cos(roll / 2.0), math.sin(roll / 2.0)
     cp, sp = math.cos(pitch / 2.0), math.sin(pitch / 2.0)
@@ -84,7 +228,7 @@ def euler_quaternion(roll: float, pitch: float, yaw: float, out: Vector) -> None
 
 
 @compiled
-def observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
+def _observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
     """Update motion and rotors in `truth` from JSBSim's raw state."""
     for axis in range(3):
         sign = -1.0 if axis == 2 else 1.0
@@ -96,7 +240,7 @@ def observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
         truth[T_RATES + axis] = raw[RAW_RATES + axis]
     truth[T_POSITION + 2] = PLANET_RADIUS_M - raw[RAW_POSITION + 2] * FOOT_M
     roll, pitch, yaw = raw[RAW_EULER : RAW_EULER + 3]
-    euler_quaternion(roll, pitch, yaw, truth[T_QUATERNION : T_QUATERNION + 4])
+    _euler_quaternion(roll, pitch, yaw, truth[T_QUATERNION : T_QUATERNION + 4])
     truth[T_ON_GROUND] = 1.0 if raw[RAW_WOW] > 0.0 else 0.0
     power_w = 0.0
     for rotor in range(4):
@@ -106,7 +250,7 @@ def observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
 
 
 @compiled
-def account_energy(
+def _account_energy(
     truth: Vector, regression: Vector, battery: Vector, dt_s: float, armed: bool
 ) -> None:
     """Update powers, energies and battery in `truth` after a step of `dt_s`."""
@@ -127,7 +271,7 @@ def account_energy(
 
 
 @compiled
-def refresh(
+def _refresh(
     raw: Vector,
     commands: Vector,
     regression: Vector,
@@ -138,10 +282,10 @@ def refresh(
     measurement: Vector,
 ) -> None:
     """Update `truth` and the controller's `measurement` in place after a step of `dt_s`."""
-    observe_motion(raw, dt_s, truth)
+    _observe_motion(raw, dt_s, truth)
     for rotor in range(4):
         truth[T_COMMANDS + rotor] = commands[rotor]
-    account_energy(truth, regression, battery, dt_s, armed)
+    _account_energy(truth, regression, battery, dt_s, armed)
     measurement[M_POSITION : M_POSITION + 3] = truth[T_POSITION : T_POSITION + 3]
     measurement[M_VELOCITY : M_VELOCITY + 3] = truth[T_VELOCITY : T_VELOCITY + 3]
     measurement[M_QUATERNION : M_QUATERNION + 4] = truth[T_QUATERNION : T_QUATERNION + 4]
@@ -208,7 +352,7 @@ class Quadrotor:
 
     def _refresh(self, commands: Vector, dt_s: float, *, armed: bool) -> None:
         self._physics.read(self._raw)
-        refresh(
+        _refresh(
             self._raw,
             commands,
             self._regression,

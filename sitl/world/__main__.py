@@ -1,8 +1,243 @@
 """`python -m sitl.world`, which `mavfi world` runs."""
 
-import sys
+from __future__ import annotations
 
-from sitl.world.command import main
+import functools
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import require_svg, write_atomically, write_text
+from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
+from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, read_scene, scene_toml, world_names
+from sitl.world.world import GeneratorParams, World, show
+
+_WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a TOML file."
+
+
+class _Place(click.ParamType[tuple[float, ...]]):
+    """Parameter type of three comma-separated numbers: east, north, up in m."""
+
+    name = "x,y,z"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """Return three finite numbers (3,), or fail with a usage error."""
+        try:
+            place = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            place = ()
+        if len(place) != 3 or not all(math.isfinite(c) for c in place):
+            self.fail(f"{value!r}: expected x,y,z in m, such as 30,40,5", param, ctx)
+        return place
+
+
+def _on_world(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of a world to a command, which gets the loaded world instead of them."""
+
+    @functools.wraps(command)
+    def with_world(
+        *,
+        name: str,
+        seed: int,
+        start: tuple[float, ...] | None,
+        goal: tuple[float, ...] | None,
+        **given: Any,
+    ) -> None:
+        command(load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal), **given)
+
+    decorators = [
+        click.argument("name", metavar="WORLD"),
+        click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True),
+        click.option("--start", type=_Place(), help="Start of flights, ENU m. See --goal."),
+        click.option(
+            "--goal",
+            type=_Place(),
+            help="Goal of flights, ENU m. A generated world is built round start and goal: a "
+            "change moves the bounds, and towers within 3 m of start and goal are left out.",
+        ),
+        click.option("--json", "as_json", is_flag=True, help="The result as JSON."),
+    ]
+    decorated: Callable[..., None] = with_world
+    for decorate in reversed(decorators):
+        decorated = decorate(decorated)
+    return decorated
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def _world() -> None:
+    """List, make, check and draw worlds: boxes on flat ground, a start and a goal.
+
+    Each cell of 10 x 10 m of a generated world contains a square tower of unlimited height with a
+    given probability. A fixed scene is always the same, and the seed chooses start and goal. The
+    same seed always gives the same world.
+    """
+
+
+@_world.command(name="list")
+@click.option("--json", "as_json", is_flag=True, help="The result as JSON.")
+def _list(as_json: bool) -> None:
+    """List all named worlds."""
+    rows = [(name, _describe(name)) for name in world_names()]
+    if as_json:
+        click.echo(json.dumps([{"name": n, "description": d} for n, d in rows], indent=1))
+        return
+    for name, description in rows:
+        click.echo(f"{name:<14}{description}")
+    click.echo("\nAlso gen:density,size (such as gen:0.1,4) and the path of a TOML file.")
+
+
+def _describe(name: str) -> str:
+    pair = GENERATED.get(name)
+    if pair is None:
+        return f"fixed scene: {read_scene(SCENE_FOLDER / f'{name}.toml').description}"
+    use = "to train detectors on: " if pair.family == "training" else ""
+    return use + _describe_pair(pair)
+
+
+def _describe_pair(pair: GeneratorParams) -> str:
+    return (
+        f"towers of {pair.size_m:g} x {pair.size_m:g} m in {100 * pair.density:g} % "
+        "of the 10 x 10 m cells"
+    )
+
+
+@_world.command(name="make", epilog=_WORLD_HELP)
+@_on_world
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="File  [standard output].")
+def _make(
+    made: World,
+    as_json: bool,
+    output: Path | None,
+) -> None:
+    """Write a world as a TOML file of boxes, which every --world option accepts."""
+    text = scene_toml(made)
+    if output is not None:
+        write_text(output, text)
+    if as_json:
+        click.echo(json.dumps({**made.as_json(), "file": _name(output)}, indent=1))
+    elif output is None:
+        click.echo(text, nl=False)
+    else:
+        click.echo(f"{output}: {_boxes(made)}")
+
+
+@_world.command(name="check", epilog=_WORLD_HELP)
+@_on_world
+@click.option(
+    "--clearance",
+    type=click.FloatRange(min=0.0),
+    default=DEFAULT_CLEARANCE_M,
+    show_default=True,
+    help="Clearance of the path from every box, m.",
+)
+@click.option("--expect", type=click.Choice(["path"]), help="Exit with 1 if there is no path.")
+def _check(
+    made: World,
+    as_json: bool,
+    clearance: float,
+    expect: str | None,
+) -> None:
+    """Check that start and goal are clear and that a path with the clearance exists.
+
+    The path is searched on a grid of 0.5 m at the goal's height. Paths over or under an obstacle
+    are ignored.
+    """
+    found = check_world(made, clearance_m=clearance)
+    if as_json:
+        click.echo(json.dumps({**made.as_json(), "check": _check_json(found)}, indent=1))
+    else:
+        click.echo(_check_text(made, found))
+    if expect == "path" and not found.path_exists:
+        sys.exit(1)
+
+
+@_world.command(name="draw", epilog=_WORLD_HELP)
+@_on_world
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="SVG file  [WORLD-SEED.svg].")
+@click.option("--path", "with_path", is_flag=True, help="Also draw the path that `check` finds.")
+def _draw(
+    made: World,
+    as_json: bool,
+    output: Path | None,
+    with_path: bool,
+) -> None:
+    """Draw a world from above, as SVG."""
+    from sitl.world.draw import world_svg
+
+    file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
+    require_svg(file)
+    path = check_world(made).path_enu_m if with_path else None
+    picture = world_svg(made, path)
+    write_atomically(file, lambda opened: opened.write(picture))
+    if as_json:
+        click.echo(json.dumps({**made.as_json(), "file": _name(file)}, indent=1))
+    else:
+        click.echo(f"{file}: {_boxes(made)}")
+
+
+def _name(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _boxes(made: World) -> str:
+    count = len(made.boxes_enu_m)
+    return f"{made.name}, seed {made.seed}, {count} box{'' if count == 1 else 'es'}"
+
+
+def _check_text(made: World, found: WorldCheck) -> str:
+    path = "none" if found.path_m is None else f"{found.path_m:.1f} m"
+    return "\n".join(
+        [
+            _boxes(made),
+            f"start  {show(made.start_enu_m)}, nearest obstacle {_metres(found.start_clearance_m)}",
+            f"goal   {show(made.goal_enu_m)}, nearest obstacle {_metres(found.goal_clearance_m)}",
+            f"path   {path} with {found.clearance_m:g} m clearance; straight "
+            f"{found.straight_m:.1f} m",
+        ]
+    )
+
+
+def _metres(value: float) -> str:
+    return f"{value:.1f} m away" if math.isfinite(value) else "none"
+
+
+def _check_json(found: WorldCheck) -> dict[str, Any]:
+    def finite(value: float) -> float | None:
+        """Return None for infinity, which JSON lacks."""
+        return value if math.isfinite(value) else None
+
+    return {
+        "clearance_m": found.clearance_m,
+        "path_exists": found.path_exists,
+        "path_m": found.path_m,
+        "straight_m": found.straight_m,
+        "start_clearance_m": finite(found.start_clearance_m),
+        "goal_clearance_m": finite(found.goal_clearance_m),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line. Return 0 if done, 1 for a known error, 2 for wrong usage."""
+    try:
+        _world.main(args=arguments, prog_name="mavfi world", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except click.Abort:
+        return 1
+    except MavfiError as error:
+        click.echo(f"error: {error}", err=True)
+        return 1
+    return 0
+
 
 if __name__ == "__main__":
     sys.exit(main())

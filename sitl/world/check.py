@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.frames import Vector
 from sitl.world.world import World, distance_to_boxes, plan_distance_to_boxes
 
-Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 DEFAULT_CLEARANCE_M = 2.0
@@ -47,7 +47,7 @@ def check_world(
 ) -> WorldCheck:
     """Search a path from start to goal with `clearance_m` to every box."""
     height = float(world.goal_enu_m[2])
-    free, origin = free_grid(world, height, clearance_m, cell_m)
+    free, origin = _free_grid(world, height, clearance_m, cell_m)
     cells = [_cell(p, origin, cell_m) for p in (world.start_enu_m, world.goal_enu_m)]
     found = _shortest(free, cells[0], cells[1])
     plan = world.goal_enu_m[:2] - world.start_enu_m[:2]
@@ -67,7 +67,7 @@ def check_world(
     )
 
 
-def free_grid(
+def _free_grid(
     world: World, height_m: float, clearance_m: float, cell_m: float
 ) -> tuple[Mask, Vector]:
     """Return the free cells (columns, rows) at a height, and the lower corner (2,), ENU m."""

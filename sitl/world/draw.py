@@ -6,14 +6,13 @@ import io
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mavfi_cli.core.frames import Vector
 from sitl.world.world import World
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Vector = NDArray[np.float64]
 
 _GROUND, _INK = "#fbfbf9", "#222831"
 _TALL, _TALL_EDGE = "#c9ced6", "#8b93a1"

@@ -1,16 +1,45 @@
-"""Loads a world by name, generator spec or file."""
+"""Loads a world by name, generator spec or file.
+
+A world file is a fixed scene, shipped (`factory`, `farm`) or a user's own:
+
+    name = "yard"                          # optional, default: the file's name
+    bounds_enu_m = [-20, -20, 0, 40, 40, 50]
+    start_enu_m = [0, 0, 0]                # optional
+    goal_enu_m = [30, 30, 5]               # optional
+
+    [[box]]
+    min_enu_m = [10, 10, 0]
+    max_enu_m = [12, 20, 8]
+
+The seed chooses start and goal if they are not given. They have no obstacle within 3 m
+horizontally. The goal is at `flight_height_m` and within `goal_distance_m` of the start. Each seed
+of a fixed scene thus gives a different mission.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.core.errors import UnknownName, WorldError
-from sitl.world.generate import DEFAULT_GOAL_ENU_M, DEFAULT_START_ENU_M, GeneratorParams, generate
-from sitl.world.scene import read_scene, world_of_scene
-from sitl.world.world import Vector, World
+from mavfi_cli.core.config import read_toml, structure
+from mavfi_cli.core.errors import ConfigError, UnknownName, WorldError
+from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.seeds import Stream, generator
+from sitl.world.world import (
+    CLEAR_RADIUS_M,
+    DEFAULT_GOAL_ENU_M,
+    DEFAULT_START_ENU_M,
+    GeneratorParams,
+    World,
+    generate,
+    inside,
+    plan_distance_to_boxes,
+    refuse_bad_goal,
+    refuse_bad_start,
+)
 
 SCENE_FOLDER = Path(__file__).parent / "scenes"
 
@@ -28,6 +57,8 @@ GENERATED: dict[str, GeneratorParams] = {
 """Pairs of the paper (section VI-A): two for evaluation, four for training."""
 
 SCENES: tuple[str, ...] = ("factory", "farm")
+
+_TRIES = 2000
 
 
 def world_names() -> list[str]:
@@ -66,11 +97,11 @@ def load_world(
         return generate(name_or_path, pair, seed, start, goal)
     if name_or_path in SCENES:
         scene = read_scene(SCENE_FOLDER / f"{name_or_path}.toml")
-        return world_of_scene(scene, name_or_path, seed, start, goal)
+        return _world_of_scene(scene, name_or_path, seed, start, goal)
     if not _is_path(name_or_path):
         raise UnknownName("world", name_or_path, world_names())
     scene = read_scene(Path(name_or_path))
-    return world_of_scene(scene, scene.name or Path(name_or_path).stem, seed, start, goal)
+    return _world_of_scene(scene, scene.name or Path(name_or_path).stem, seed, start, goal)
 
 
 def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
@@ -95,3 +126,165 @@ def _pair_of_spec(text: str) -> GeneratorParams | None:
     except ValueError:
         raise WorldError(f"{text!r}: expected gen:density,size, such as gen:0.2,5") from None
     return GeneratorParams(density=density, size_m=size)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Box:
+    """One obstacle with its corners in ENU, m."""
+
+    min_enu_m: list[float]
+    max_enu_m: list[float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Scene:
+    bounds_enu_m: list[float]
+    name: str = ""
+    description: str = ""
+    start_enu_m: list[float] | None = None
+    goal_enu_m: list[float] | None = None
+    flight_height_m: float = 5.0
+    goal_distance_m: list[float] | None = None  # horizontal limits, start to goal
+    box: list[_Box] | None = None
+
+
+def read_scene(path: Path) -> _Scene:
+    """Read a world file.
+
+    Raises:
+        ConfigError: The file is unreadable or malformed, a key is missing or unknown, the number
+            of coordinates is wrong, or the max of a box is not beyond its min. Names file, line and
+            key.
+    """
+    data, text = read_toml(path)
+    scene = structure(data, _Scene, path=path, text=text)
+    _refuse_bad_lengths(scene, path, text)
+    return scene
+
+
+def _refuse_bad_lengths(scene: _Scene, path: Path, text: str) -> None:
+    lengths = {"bounds_enu_m": 6, "start_enu_m": 3, "goal_enu_m": 3, "goal_distance_m": 2}
+    for key, length in lengths.items():
+        value = getattr(scene, key)
+        if value is not None and len(value) != length:
+            line = _line_of_key(text, key)
+            problem = f"expected {length} numbers, got {len(value)}"
+            raise ConfigError(problem, path=path, line=line, key=key)
+    for index, box in enumerate(scene.box or []):
+        line = _line_of_box(text, index)
+        for key in ("min_enu_m", "max_enu_m"):
+            count = len(getattr(box, key))
+            if count != 3:
+                problem = f"expected 3 numbers, got {count}"
+                raise ConfigError(problem, path=path, line=line, key=f"box[{index}].{key}")
+        if any(high <= low for low, high in zip(box.min_enu_m, box.max_enu_m, strict=True)):
+            problem = "must be beyond min_enu_m along each axis"
+            raise ConfigError(problem, path=path, line=line, key=f"box[{index}].max_enu_m")
+
+
+def _line_of_key(text: str, key: str) -> int | None:
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.split("=")[0].strip() == key:
+            return number
+    return None
+
+
+def _line_of_box(text: str, index: int) -> int | None:
+    lines = enumerate(text.splitlines(), start=1)
+    headers = [number for number, line in lines if line.replace(" ", "").startswith("[[box]]")]
+    return headers[index] if index < len(headers) else None
+
+
+def _world_of_scene(
+    scene: _Scene, name: str, seed: int, start_enu_m: Vector | None, goal_enu_m: Vector | None
+) -> World:
+    """Return the world of a scene. A given start or goal replaces the scene's own.
+
+    Raises:
+        WorldError: Start or goal is unusable, or the seed finds no clear position for it.
+    """
+    boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box or []]).reshape(-1, 6)
+    bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
+    if (bounds[3:] <= bounds[:3]).any():
+        raise WorldError(f"world {name!r}: bounds_enu_m has max <= min")
+    start = _given(start_enu_m, scene.start_enu_m)
+    goal = _given(goal_enu_m, scene.goal_enu_m)
+    if start is None or goal is None:
+        if start is not None:
+            refuse_bad_start(name, boxes, bounds, start)
+        if goal is not None:
+            refuse_bad_goal(name, boxes, bounds, goal)
+        start, goal = _choose(scene, name, seed, boxes, bounds, start, goal)
+    return World(
+        name=name,
+        seed=seed,
+        boxes_enu_m=boxes,
+        bounds_enu_m=bounds,
+        start_enu_m=start,
+        goal_enu_m=goal,
+    )
+
+
+def _given(asked: Vector | None, own: list[float] | None) -> Vector | None:
+    if asked is not None:
+        return np.asarray(asked, dtype=np.float64)
+    return None if own is None else np.array(own, dtype=np.float64)
+
+
+def _choose(
+    scene: _Scene,
+    name: str,
+    seed: int,
+    boxes: Vector,
+    bounds: Vector,
+    start: Vector | None,
+    goal: Vector | None,
+) -> tuple[Vector, Vector]:
+    """Draw missing start and goal until they are clear and at the scene's distance."""
+    stream = generator(seed, Stream.WORLD, "places", scene.name)
+    least, most = scene.goal_distance_m or [45.0, 55.0]
+    low, high = bounds[:2] + CLEAR_RADIUS_M, bounds[3:5] - CLEAR_RADIUS_M
+    for _ in range(_TRIES):
+        plan = np.round(stream.uniform(low, np.maximum(low, high), size=(2, 2)), 1)
+        from_ = start if start is not None else np.array([*plan[0], bounds[2]])
+        to = goal if goal is not None else np.array([*plan[1], scene.flight_height_m])
+        drawn = [p for p, known in ((from_, start), (to, goal)) if known is None]
+        if least <= float(np.hypot(*(to - from_)[:2])) <= most and all(
+            _is_clear(boxes, bounds, place) for place in drawn
+        ):
+            return from_, to
+    raise WorldError(
+        f"world {name!r}, seed {seed}: no clear start and goal {least:g} to {most:g} m apart; "
+        "give start_enu_m and goal_enu_m"
+    )
+
+
+def _is_clear(boxes: Vector, bounds: Vector, place: Vector) -> bool:
+    gaps = plan_distance_to_boxes(boxes, place)
+    return inside(bounds, place) and bool((gaps >= CLEAR_RADIUS_M).all())
+
+
+def scene_toml(world: World) -> str:
+    """Return a world as the text of a world file, which reads back as the same world."""
+    lines = [
+        f"name = {_quoted(world.name)}",
+        f"bounds_enu_m = {_numbers(world.bounds_enu_m)}",
+        f"start_enu_m = {_numbers(world.start_enu_m)}",
+        f"goal_enu_m = {_numbers(world.goal_enu_m)}",
+    ]
+    for box in world.boxes_enu_m:
+        lines += [
+            "",
+            "[[box]]",
+            f"min_enu_m = {_numbers(box[:3])}",
+            f"max_enu_m = {_numbers(box[3:])}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(values: Vector) -> str:
+    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

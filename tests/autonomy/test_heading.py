@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.heading import headings, turn_time_s
+from mavfi_cli.autonomy.smoothing import headings, turn_time_s
 
 
 def test_a_circle_is_followed_round_and_round_without_a_jump():

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavfi_cli.autonomy.orders import PilotMode, PlanFailure
-from mavfi_cli.autonomy.pilot import Pilot, PilotParams
+from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams, PlanFailure
 from mavfi_cli.core.types import CollisionReport, Trajectory, VehicleState
 
 TICK_S = 0.02

@@ -8,7 +8,7 @@ import numpy as np
 from mavfi_cli import autonomy
 from mavfi_cli.autonomy import collision, planning
 from mavfi_cli.autonomy.occupancy import snapshot_of
-from mavfi_cli.autonomy.orders import PlanRequest
+from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.planners import find
 from mavfi_cli.core.types import Trajectory
 

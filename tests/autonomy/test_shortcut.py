@@ -4,7 +4,7 @@ import numpy as np
 
 from mavfi_cli.autonomy import grid as grids
 from mavfi_cli.autonomy.occupancy import snapshot_of
-from mavfi_cli.autonomy.shortcut import shortcut, subdivided
+from mavfi_cli.autonomy.planning import shortcut, subdivided
 
 BOUNDS = np.array([-10.0, -10.0, 0.0, 10.0, 10.0, 10.0])
 

@@ -8,7 +8,7 @@ import pytest
 
 from mavfi_cli.autonomy import grid as grids
 from mavfi_cli.autonomy.occupancy import empty_snapshot, snapshot_of
-from mavfi_cli.autonomy.orders import Departure
+from mavfi_cli.autonomy.pilot import Departure
 from mavfi_cli.autonomy.smoothing import (
     SmoothingParams,
     smooth,

@@ -11,7 +11,7 @@ import pytest
 
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.report.summary import event_lines, summary_lines
-from sitl.world.generate import CLEAR_RADIUS_M
+from sitl.world.world import CLEAR_RADIUS_M
 
 HEAVY = ("numba", "numpy", "torch", "matplotlib", "scipy", "pyarrow", "ompl", "fcl", "pymavlink")
 

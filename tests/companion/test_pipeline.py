@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.autonomy import planners
-from mavfi_cli.autonomy.orders import PilotMode
+from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import ATTEMPTS, Companion
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.orders import PilotMode
-from mavfi_cli.autonomy.pilot import Pilot, PilotParams
+from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
 from mavfi_cli.companion.recovery import Recovery
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState

@@ -5,7 +5,6 @@ import pytest
 
 from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.occupancy import empty_snapshot
-from mavfi_cli.autonomy.planners import registry
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.testing import PlannerContract
 from mavfi_cli.testing.planners import PARAMS, posed, wall_with_gap
@@ -56,7 +55,7 @@ def test_other_packages_plug_in_by_entry_point(monkeypatch):
         def load(self):
             return Straight
 
-    monkeypatch.setattr(registry, "entry_points", lambda group: [Entry()])
+    monkeypatch.setattr(planners, "entry_points", lambda group: [Entry()])
     assert "straight" in planners.names()
     assert isinstance(planners.find("straight"), Straight)
 

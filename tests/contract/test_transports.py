@@ -13,8 +13,7 @@ import pytest
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
 from mavfi_cli.link.codec import Codec
-from mavfi_cli.link.memory import memory_pair
-from mavfi_cli.link.transport import Transport, open_listener, open_transport
+from mavfi_cli.link.transport import Transport, memory_pair, open_listener, open_transport
 from mavfi_cli.testing import StreamTransportContract, TransportContract
 from mavfi_cli.testing.transports import WAIT_S, Pair, introduce, message, receive, send
 
@@ -105,7 +104,7 @@ def _carry(left: int, right: int, stop: int) -> None:
 
 
 def _wait_readable(descriptor: int) -> bool:
-    from mavfi_cli.link.waiting import readable
+    from mavfi_cli.link.endpoint import readable
 
     return readable(descriptor, WAIT_S)
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from mavfi_cli.core.errors import UnknownName
-from mavfi_cli.core.states import BY_NAME, STATES, DType, find, of_stage
+from mavfi_cli.core.states import BY_NAME, STATES, DType, of_stage
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 
 TRAJECTORY = Trajectory(
@@ -49,8 +48,3 @@ def test_the_thirteen_inputs_of_the_autoencoder():
 def test_every_stage_has_states():
     assert sum(len(of_stage(stage)) for stage in Stage) == len(STATES)
     assert all(of_stage(stage) for stage in Stage)
-
-
-def test_an_unknown_state_names_the_nearest():
-    with pytest.raises(UnknownName, match="did you mean 'waypoint_yaw'"):
-        find("waypoint_yav")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mavfi_cli.autonomy import collision, tracking
 from mavfi_cli.autonomy.collision import CollisionParams
 from mavfi_cli.autonomy.occupancy import snapshot_of
-from mavfi_cli.autonomy.orders import Departure
+from mavfi_cli.autonomy.pilot import Departure
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingParams, TrackingState
 from mavfi_cli.autonomy.trajectory import reference_waypoint, without_waypoint

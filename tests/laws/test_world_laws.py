@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.world import load_world
-from sitl.world.generate import CLEAR_RADIUS_M
-from sitl.world.world import distance_to_boxes, plan_distance_to_boxes
+from sitl.world.world import CLEAR_RADIUS_M, distance_to_boxes, plan_distance_to_boxes
 
 seeds = st.integers(0, 2**40)
 names = st.sampled_from(["sparse", "dense", "factory", "farm", "train-0.05-5", "gen:0.6,7.5"])

@@ -6,8 +6,8 @@ import math
 from abc import ABC, abstractmethod
 from typing import Any
 
-from mavfi_cli.link.autopilots import ARDUCOPTER, PX4, AutopilotProfile
 from mavfi_cli.link.codec import Codec, Message, dialect
+from mavfi_cli.link.telemetry import ARDUCOPTER, PX4, AutopilotProfile
 
 DT_S = 0.02
 HOME_AMSL_M = 488.0

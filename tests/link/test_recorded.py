@@ -6,8 +6,7 @@ import pytest
 from pymavlink import mavutil
 
 from mavfi_cli.link.codec import Codec, dialect
-from mavfi_cli.link.recorded import RecordedLink
-from mavfi_cli.link.tlog import EPOCH_UNIX_S
+from mavfi_cli.link.tlog import EPOCH_UNIX_S, RecordedLink
 from mavfi_cli.link.transport import open_transport
 
 OWN, VEHICLE = 191, 1

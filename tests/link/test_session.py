@@ -74,7 +74,7 @@ def test_a_whole_flight(make: type[FakeAutopilot]) -> None:
     session, fake = flight.session, flight.fake
     flight.until_phase(Phase.OFFBOARD)
     assert fake.armed
-    assert fake.mode == fake.autopilot.offboard_mode == session.mode
+    assert fake.mode == fake.autopilot.offboard_mode == session.telemetry.mode
     assert abs(fake.position_enu_m[2] - HEIGHT_M) <= 0.3
     flight.until(lambda: fake.climb_to_m == 0.0)  # PX4 flies the last centimetres in OFFBOARD
     before = list(fake.position_enu_m)
@@ -89,9 +89,9 @@ def test_a_whole_flight(make: type[FakeAutopilot]) -> None:
     flight.until_phase(Phase.DONE)
     assert flight.phases == list(Phase)[: list(Phase).index(Phase.FAILED)]
     assert not fake.armed
-    assert session.landed_state is LandedState.ON_GROUND
+    assert session.telemetry.landed_state is LandedState.ON_GROUND
     assert session.failure is None
-    assert not session.failsafe
+    assert not session.failsafe_text
 
 
 def test_every_tick_ends_with_the_setpoint_of_its_stamp() -> None:
@@ -246,20 +246,20 @@ def test_a_vehicle_that_disarms_on_the_ground_fails_the_take_off() -> None:
 def test_leaving_offboard_unasked_is_a_failsafe() -> None:
     flight = Flight(FakePX4())
     flight.until_phase(Phase.OFFBOARD)
-    assert not flight.session.failsafe
+    assert not flight.session.failsafe_text
     flight.fake.mode = "AUTO.RTL"
-    flight.until(lambda: flight.session.failsafe, 2.0)
+    flight.until(lambda: flight.session.failsafe_text, 2.0)
     assert flight.session.failsafe_text == "the autopilot left OFFBOARD for AUTO.RTL"
     flight.fake.mode = "OFFBOARD"  # PX4 returns by itself
-    flight.until(lambda: flight.session.mode == "OFFBOARD", 2.0)
-    assert flight.session.failsafe
+    flight.until(lambda: flight.session.telemetry.mode == "OFFBOARD", 2.0)
+    assert flight.session.failsafe_text
 
 
 def test_disarming_in_flight_is_a_failsafe() -> None:
     flight = Flight(FakePX4())
     flight.until_phase(Phase.OFFBOARD)
     flight.fake.armed = False
-    flight.until(lambda: flight.session.failsafe, 2.0)
+    flight.until(lambda: flight.session.failsafe_text, 2.0)
     assert flight.session.failsafe_text == "the autopilot disarmed in flight"
 
 
@@ -268,7 +268,7 @@ def test_landing_on_request_is_no_failsafe() -> None:
     flight.until_phase(Phase.OFFBOARD)
     flight.session.request_land()
     flight.until_phase(Phase.DONE)
-    assert not flight.session.failsafe
+    assert not flight.session.failsafe_text
 
 
 def test_a_vehicle_on_the_ground_that_stays_armed_is_disarmed() -> None:
@@ -305,10 +305,10 @@ def test_silence_is_a_lost_link_until_it_speaks_again() -> None:
     flight.until_phase(Phase.OFFBOARD)
     flight.fake.silent = True
     start_s = flight.fake.stamp_s
-    flight.until(lambda: flight.session.link_lost, 5.0)
+    flight.until(lambda: flight.session.telemetry.link_lost, 5.0)
     assert 2.0 <= flight.fake.stamp_s - start_s <= 3.1
     flight.fake.silent = False
-    flight.until(lambda: not flight.session.link_lost, 2.0)
+    flight.until(lambda: not flight.session.telemetry.link_lost, 2.0)
 
 
 def test_a_reported_collision() -> None:
@@ -317,8 +317,8 @@ def test_a_reported_collision() -> None:
     words = "Collision: box 17 at east 12.31 north 20.02 up 5.00, clearance 0.00 m"
     flight.fake.tell(words, severity=0)
     flight.tick()
-    assert flight.session.collision_text == words
-    assert flight.session.texts[-1].severity == 0
+    assert flight.session.telemetry.collision_text == words
+    assert flight.session.telemetry.texts.texts[-1].severity == 0
 
 
 def test_the_setpoint_in_ned() -> None:
@@ -411,17 +411,6 @@ def test_the_camera_is_asked_who_it_is_and_started() -> None:
     assert asked[2000].param2 == pytest.approx(0.1)
     session.handle(_from(1, 100, dialect.MAVLink_command_ack_message(2000, 0, 0, 0, 1, 191)))
     assert ticket.verdict.value == "accepted"
-    name = [0] * 32
-    session.handle(
-        _from(
-            1,
-            100,
-            dialect.MAVLink_camera_information_message(
-                0, name, name, 1, 2.0, 4.0, 3.0, 64, 48, 0, 0, 0, b""
-            ),
-        )
-    )
-    assert session.camera.hfov_rad == pytest.approx(math.pi / 2)
 
 
 def test_states_are_found_again_by_stamp() -> None:

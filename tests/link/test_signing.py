@@ -7,8 +7,14 @@ from typing import Any
 
 import pytest
 
-from mavfi_cli.link.codec import Codec, dialect
-from mavfi_cli.link.signing import EPOCH_UNIX_S, UNITS_PER_S, Signing, key_from_passphrase
+from mavfi_cli.link.codec import (
+    EPOCH_UNIX_S,
+    UNITS_PER_S,
+    Codec,
+    Signing,
+    dialect,
+    key_from_passphrase,
+)
 
 KEY = key_from_passphrase("open sesame")
 NOW_S = EPOCH_UNIX_S + 3600.0

@@ -32,9 +32,9 @@ from mavfi_cli.attack.outcome import Outcome
 from mavfi_cli.attack.profile import TargetProfile, Watch, profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import Difference, Golden, RunLimits, RunVerdict, digest, judged
-from mavfi_cli.core.channel import receive
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
-from mavfi_cli.core.sources import own_digest
+from mavfi_cli.core.files import own_digest
+from mavfi_cli.core.processes import receive
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee

@@ -29,7 +29,7 @@ from mavfi_cli.attack.kernels.catalogue import Call
 from mavfi_cli.attack.kernels.difference import pack
 from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
 from mavfi_cli.attack.served import channel, newest_cache_ns
-from mavfi_cli.core.channel import receive, send
+from mavfi_cli.core.processes import receive, send
 
 RAISED = 3  # exit code of a child whose kernel raised an error
 TIMES = struct.Struct("<dd")

@@ -1,5 +1,9 @@
-"""Path planners, found by name. Other packages add planners by entry point."""
+"""Path planners by name: ours, and those that other packages register under `mavfi.planners`."""
 
+from collections.abc import Callable
+from importlib.metadata import entry_points
+
+from mavfi_cli.autonomy import OUR_PLANNERS, canonical_planner
 from mavfi_cli.autonomy.planners.base import (
     Planner,
     PlanningParams,
@@ -7,7 +11,8 @@ from mavfi_cli.autonomy.planners.base import (
     PlanResult,
     pose_problem,
 )
-from mavfi_cli.autonomy.planners.registry import find, names
+from mavfi_cli.autonomy.planners.ompl import RRT, RRTConnect, RRTStar
+from mavfi_cli.core.errors import UnknownName
 
 __all__ = [
     "PlanResult",
@@ -18,3 +23,33 @@ __all__ = [
     "names",
     "pose_problem",
 ]
+
+_ENTRY_POINT_GROUP = "mavfi.planners"
+
+_OURS: dict[str, Callable[[], Planner]] = dict(
+    zip(OUR_PLANNERS, (RRTStar, RRT, RRTConnect), strict=True)
+)
+
+
+def names() -> list[str]:
+    """Return the names of all installed planners, ours first."""
+    others = {entry.name for entry in entry_points(group=_ENTRY_POINT_GROUP)}
+    return [*_OURS, *sorted(others - set(_OURS))]
+
+
+def find(name: str) -> Planner:
+    """Return the planner of that name with its default settings.
+
+    Names of our own planners may be spelt differently; see `canonical_planner`.
+
+    Raises:
+        UnknownName: No planner has this name. Suggests the nearest.
+    """
+    plain = canonical_planner(name)
+    if plain in _OURS:
+        return _OURS[plain]()
+    for entry in entry_points(group=_ENTRY_POINT_GROUP):
+        if entry.name == name:
+            planner: Planner = entry.load()()
+            return planner
+    raise UnknownName("planner", name, names())

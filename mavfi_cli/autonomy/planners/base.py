@@ -66,7 +66,7 @@ class Planner(Protocol):
         """
 
 
-def failure(problem: PlanningProblem, reason: str) -> PlanResult:
+def _failure(problem: PlanningProblem, reason: str) -> PlanResult:
     """Return a failure without a search."""
     gap_m = math.dist(problem.goal_enu_m, problem.start_enu_m)
     return PlanResult(found=False, path_enu_m=np.empty((0, 3)), reason=reason, nearest_m=gap_m)
@@ -115,7 +115,7 @@ def _escape(
 def refuse(problem: PlanningProblem) -> PlanResult | None:
     """Return a failure if start or goal is blocked, else None."""
     if not problem.grid.point_free(problem.start_enu_m):
-        return failure(problem, "start blocked")
+        return _failure(problem, "start blocked")
     if not problem.grid.point_free(problem.goal_enu_m):
-        return failure(problem, "goal blocked")
+        return _failure(problem, "goal blocked")
     return None

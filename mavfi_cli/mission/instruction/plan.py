@@ -19,9 +19,8 @@ import numpy as np
 from mavfi_cli.attack.kernels.scope import kernel_of_node
 from mavfi_cli.attack.profile import TargetProfile
 from mavfi_cli.core.errors import FaultError, RecordError
-from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.files import own_digest, write_atomically
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.sources import own_digest
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import InstructionFault

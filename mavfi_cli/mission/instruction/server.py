@@ -11,7 +11,7 @@ from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.node_process import serve
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection
-from mavfi_cli.core.channel import receive, send
+from mavfi_cli.core.processes import receive, send
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.spec.mission import MissionConfig, stack_of

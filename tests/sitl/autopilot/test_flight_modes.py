@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.commander import Result
-from sitl.autopilot.modes import FlightMode
+from sitl.autopilot.commander import FlightMode, Result
 
 TAKEOFF = dialect.MAV_CMD_NAV_TAKEOFF
 NAN = math.nan

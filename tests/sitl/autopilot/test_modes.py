@@ -1,6 +1,6 @@
 import pytest
 
-from sitl.autopilot.modes import FlightMode, base_mode, mode_from_custom, mode_from_numbers
+from sitl.autopilot.commander import FlightMode
 
 
 # Seen on the wire of PX4 v1.17.
@@ -17,7 +17,7 @@ from sitl.autopilot.modes import FlightMode, base_mode, mode_from_custom, mode_f
 )
 def test_custom_mode_is_px4s(mode, custom):
     assert mode.custom_mode == custom
-    assert mode_from_custom(custom) is mode
+    assert FlightMode.from_custom(custom) is mode
 
 
 @pytest.mark.parametrize(
@@ -30,13 +30,13 @@ def test_custom_mode_is_px4s(mode, custom):
     ],
 )
 def test_base_mode_is_px4s(mode, armed, expected):
-    assert base_mode(mode, armed=armed) == expected
+    assert mode.base_mode(armed=armed) == expected
 
 
 def test_auto_without_sub_mode_is_loiter():
-    assert mode_from_numbers(4, 0) is FlightMode.LOITER
+    assert FlightMode.from_numbers(4, 0) is FlightMode.LOITER
 
 
 @pytest.mark.parametrize("numbers", [(0, 0), (77, 0), (4, 99), (255, 255)])
 def test_unknown_modes_are_none(numbers):
-    assert mode_from_numbers(*numbers) is None
+    assert FlightMode.from_numbers(*numbers) is None

@@ -3,7 +3,8 @@ from collections import Counter
 
 import pytest
 
-from sitl.autopilot.streams import BUILDERS, Preset
+from sitl.autopilot.streams import Preset
+from sitl.autopilot.telemetry import BUILDERS
 
 WIRE_RATES = {
     Preset.ONBOARD: {

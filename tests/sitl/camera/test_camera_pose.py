@@ -8,7 +8,7 @@ import pytest
 
 from mavfi_cli.core.frames import yaw_from_quaternion
 from mavfi_cli.link.codec import dialect
-from sitl.camera.pose import PoseTracker
+from sitl.camera.station import PoseTracker
 
 
 def position(ms: int, *, north: float = 0.0, east: float = 0.0, vn: float = 0.0) -> Any:

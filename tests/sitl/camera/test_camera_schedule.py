@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sitl.camera.schedule import PeriodicSchedule
+from sitl.camera.component import PeriodicSchedule
 
 
 def count(schedule: PeriodicSchedule, stamps: list[float]) -> int:

@@ -13,10 +13,9 @@ import pytest
 
 from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import Transport, open_transport
-from sitl.camera.command import main
+from sitl.camera.__main__ import main
 from sitl.camera.component import Camera
-from sitl.camera.pose import PoseTracker
-from sitl.camera.station import Station
+from sitl.camera.station import PoseTracker, Station
 from sitl.world import load_world
 
 WORLD = load_world("dense", seed=1)

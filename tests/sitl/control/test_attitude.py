@@ -8,10 +8,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
-from sitl.control import layout
-from sitl.control.attitude import rotation, specific_force, tilt_rates
+from sitl.control import cascade
+from sitl.control.cascade import rotation, specific_force, tilt_rates
 from sitl.control.gains import gains_for
-from sitl.vehicle.profile_files import load_profile, profile_names
+from sitl.vehicle.profile import load_profile, profile_names
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in profile_names()}
 angles = st.floats(-3.0, 3.0)
@@ -19,8 +19,8 @@ accelerations = st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3).map(np.
 
 
 def measured(quaternion):
-    measurement = np.zeros(layout.MEASUREMENT_SIZE)
-    measurement[layout.M_QUATERNION : layout.M_QUATERNION + 4] = quaternion
+    measurement = np.zeros(cascade.MEASUREMENT_SIZE)
+    measurement[cascade.M_QUATERNION : cascade.M_QUATERNION + 4] = quaternion
     return measurement
 
 
@@ -39,13 +39,13 @@ def test_force_keeps_tilt_and_thrust_limits_and_the_height(name, acceleration):
     gains = GAINS[name]
     force = specific_force(acceleration, gains)
     horizontal = math.hypot(force[0], force[1])
-    largest = 4.0 * gains[layout.G_ROTOR_THRUST] / gains[layout.G_MASS]
+    largest = 4.0 * gains[cascade.G_ROTOR_THRUST] / gains[cascade.G_MASS]
     assert force[2] < 0.0
-    assert horizontal <= -force[2] * gains[layout.G_TILT_TANGENT] * (1.0 + 1e-12)
+    assert horizontal <= -force[2] * gains[cascade.G_TILT_TANGENT] * (1.0 + 1e-12)
     assert np.linalg.norm(force) <= 0.9 * largest * (1.0 + 1e-12)
-    wanted = acceleration[2] - gains[layout.G_GRAVITY]
-    margin = min(math.hypot(acceleration[0], acceleration[1]), 0.2 * gains[layout.G_GRAVITY])
-    if -math.sqrt((0.9 * largest) ** 2 - margin**2) < wanted < -0.25 * gains[layout.G_GRAVITY]:
+    wanted = acceleration[2] - gains[cascade.G_GRAVITY]
+    margin = min(math.hypot(acceleration[0], acceleration[1]), 0.2 * gains[cascade.G_GRAVITY])
+    if -math.sqrt((0.9 * largest) ** 2 - margin**2) < wanted < -0.25 * gains[cascade.G_GRAVITY]:
         assert force[2] == wanted
     assert force[0] * acceleration[1] == pytest.approx(force[1] * acceleration[0], abs=1e-9)
 
@@ -64,7 +64,7 @@ def test_rates_turn_the_thrust_towards_the_force(roll, pitch, yaw, acceleration)
     assert rates[2] == 0.0
     size = np.linalg.norm(rates)
     assert size == pytest.approx(
-        min(gains[layout.G_TILT_P] * angle, gains[layout.G_TILT_RATE_LIMIT]), rel=1e-6
+        min(gains[cascade.G_TILT_P] * angle, gains[cascade.G_TILT_RATE_LIMIT]), rel=1e-6
     )
     # turning by `angle` about that axis brings the body's down axis onto the wanted one
     axis = matrix @ (rates / size)

@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.core.frames import quaternion_from_euler
-from sitl.control import layout
+from sitl.control import cascade
 from sitl.control.cascade import control_step
 from sitl.control.gains import gains_for
-from sitl.vehicle.profile_files import load_profile, profile_names
+from sitl.vehicle.profile import load_profile, profile_names
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in profile_names()}
 names = st.sampled_from(profile_names())
@@ -20,19 +20,19 @@ small = st.floats(-1.0, 1.0)
 
 @st.composite
 def measurements(draw, on_ground=0.0):
-    measurement = np.zeros(layout.MEASUREMENT_SIZE)
+    measurement = np.zeros(cascade.MEASUREMENT_SIZE)
     measurement[:6] = [100.0 * draw(small) for _ in range(3)] + [5.0 * draw(small)] * 3
     quaternion = quaternion_from_euler(*(3.0 * draw(small) for _ in range(3)))
-    measurement[layout.M_QUATERNION : layout.M_QUATERNION + 4] = quaternion
-    measurement[layout.M_RATES : layout.M_RATES + 3] = [10.0 * draw(small) for _ in range(3)]
-    measurement[layout.M_ON_GROUND] = on_ground
+    measurement[cascade.M_QUATERNION : cascade.M_QUATERNION + 4] = quaternion
+    measurement[cascade.M_RATES : cascade.M_RATES + 3] = [10.0 * draw(small) for _ in range(3)]
+    measurement[cascade.M_ON_GROUND] = on_ground
     return measurement
 
 
 @settings(deadline=None)  # the first call may compile
 @given(names, measurements(), st.lists(anything, min_size=1, max_size=5))
 def test_any_setpoint_leaves_state_finite_and_commands_in_range(name, measurement, setpoints):
-    state = np.zeros(layout.STATE_SIZE)
+    state = np.zeros(cascade.STATE_SIZE)
     for setpoint in setpoints:
         state, commands = control_step(state, measurement, setpoint, GAINS[name], True)  # noqa: FBT003
         assert np.isfinite(state).all()
@@ -43,8 +43,8 @@ def test_any_setpoint_leaves_state_finite_and_commands_in_range(name, measuremen
 @settings(deadline=None)  # the first call may compile
 @given(names, measurements(), anything)
 def test_step_is_pure(name, measurement, setpoint):
-    state = np.zeros(layout.STATE_SIZE)
-    state[layout.S_FLYING] = 1.0
+    state = np.zeros(cascade.STATE_SIZE)
+    state[cascade.S_FLYING] = 1.0
     copies = [array.copy() for array in (state, measurement, setpoint)]
     first = control_step(state, measurement, setpoint, GAINS[name], True)  # noqa: FBT003
     second = control_step(state, measurement, setpoint, GAINS[name], True)  # noqa: FBT003
@@ -58,24 +58,24 @@ def test_step_is_pure(name, measurement, setpoint):
 @given(names, measurements(), anything)
 def test_disarmed_motors_stand_still(name, measurement, setpoint):
     state, commands = control_step(
-        np.ones(layout.STATE_SIZE),
+        np.ones(cascade.STATE_SIZE),
         measurement,
         setpoint,
         GAINS[name],
         False,  # noqa: FBT003
     )
     assert not commands.any()
-    assert state[layout.S_FLYING] == 0.0
+    assert state[cascade.S_FLYING] == 0.0
 
 
 @settings(deadline=None)  # the first call may compile
 @given(names, measurements(on_ground=1.0), st.floats(-0.09, 1e9))
 def test_on_the_ground_only_a_climb_lifts_off(name, measurement, down):
-    setpoint = np.full(layout.SETPOINT_SIZE, math.nan)
-    setpoint[layout.SP_VELOCITY + 2] = down
-    state = np.zeros(layout.STATE_SIZE)
+    setpoint = np.full(cascade.SETPOINT_SIZE, math.nan)
+    setpoint[cascade.SP_VELOCITY + 2] = down
+    state = np.zeros(cascade.STATE_SIZE)
     _, commands = control_step(state, measurement, setpoint, GAINS[name], True)  # noqa: FBT003
     assert 0.0 < commands.max() < 0.15
-    setpoint[layout.SP_VELOCITY + 2] = -1.0
+    setpoint[cascade.SP_VELOCITY + 2] = -1.0
     flying, _ = control_step(state, measurement, setpoint, GAINS[name], True)  # noqa: FBT003
-    assert flying[layout.S_FLYING] == 1.0
+    assert flying[cascade.S_FLYING] == 1.0

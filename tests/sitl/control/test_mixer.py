@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.control import layout
+from sitl.control import cascade
+from sitl.control.cascade import LEAST_SHARE, mix, throttle, thrust_shares
 from sitl.control.gains import gains_for
-from sitl.control.mixer import LEAST_SHARE, mix, throttle, thrust_shares
-from sitl.vehicle.model import ROTOR_LAYOUT
-from sitl.vehicle.profile_files import load_profile, profile_names
+from sitl.vehicle.physics import ROTOR_LAYOUT
+from sitl.vehicle.profile import load_profile, profile_names
 
 PROFILES = {name: load_profile(name) for name in profile_names()}
 GAINS = {name: gains_for(profile, 0.004) for name, profile in PROFILES.items()}
@@ -41,9 +41,9 @@ def wrench(shares, name):
 )
 def test_inverts_the_geometry_when_nothing_saturates(name, level, roll, pitch, yaw):
     gains = GAINS[name]
-    unit = 4.0 * gains[layout.G_ROTOR_THRUST]
-    arm = unit * gains[layout.G_ROTOR_OFFSET]
-    torque = np.array([roll * arm, pitch * arm, yaw * unit * gains[layout.G_TORQUE_PER_THRUST]])
+    unit = 4.0 * gains[cascade.G_ROTOR_THRUST]
+    arm = unit * gains[cascade.G_ROTOR_OFFSET]
+    torque = np.array([roll * arm, pitch * arm, yaw * unit * gains[cascade.G_TORQUE_PER_THRUST]])
     collective, made = wrench(thrust_shares(level * unit, torque, gains), name)
     assert collective == pytest.approx(level * unit, rel=1e-9)
     np.testing.assert_allclose(made, torque, rtol=0, atol=1e-9 * unit)
@@ -64,8 +64,8 @@ def test_commands_are_within_zero_and_one(name, collective_n, torque_nm):
 @given(names, st.floats(-2.0, 3.0), torques)
 def test_roll_and_pitch_keep_their_direction_and_come_before_the_rest(name, level, torque_nm):
     gains = GAINS[name]
-    unit = 4.0 * gains[layout.G_ROTOR_THRUST]
-    arm = unit * gains[layout.G_ROTOR_OFFSET]
+    unit = 4.0 * gains[cascade.G_ROTOR_THRUST]
+    arm = unit * gains[cascade.G_ROTOR_OFFSET]
     _, made = wrench(thrust_shares(level * unit, torque_nm, gains), name)
     spread = 2.0 * (abs(torque_nm[0]) + abs(torque_nm[1])) / arm
     expected = torque_nm[:2] * min(1.0, (1.0 - LEAST_SHARE) / max(spread, 1e-300))

@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.control import layout
+from sitl.control import cascade
+from sitl.control.cascade import FARTHEST_M, clean_setpoint, wrap
 from sitl.control.gains import gains_for
-from sitl.control.setpoint import FARTHEST_M, clean_setpoint, wrap
-from sitl.vehicle.profile_files import load_profile
+from sitl.vehicle.profile import load_profile
 
 GAINS = gains_for(load_profile("solo"), 0.004)
 anything = st.lists(st.floats(), min_size=11, max_size=11).map(np.array)
@@ -31,12 +31,12 @@ def test_everything_is_limited(setpoint):
     np.testing.assert_array_equal(np.isnan(clean), ~np.isfinite(setpoint))
     finite = np.nan_to_num(clean)
     assert (np.abs(finite[:3]) <= FARTHEST_M).all()
-    assert np.hypot(finite[3], finite[4]) <= GAINS[layout.G_SPEED_LIMIT] * (1 + 1e-12)
-    assert -GAINS[layout.G_CLIMB_LIMIT] <= finite[5] <= GAINS[layout.G_DESCENT_LIMIT]
-    assert np.hypot(finite[6], finite[7]) <= GAINS[layout.G_ACCELERATION_LIMIT] * (1 + 1e-12)
-    assert abs(finite[8]) <= GAINS[layout.G_ACCELERATION_LIMIT + 1]
+    assert np.hypot(finite[3], finite[4]) <= GAINS[cascade.G_SPEED_LIMIT] * (1 + 1e-12)
+    assert -GAINS[cascade.G_CLIMB_LIMIT] <= finite[5] <= GAINS[cascade.G_DESCENT_LIMIT]
+    assert np.hypot(finite[6], finite[7]) <= GAINS[cascade.G_ACCELERATION_LIMIT] * (1 + 1e-12)
+    assert abs(finite[8]) <= GAINS[cascade.G_ACCELERATION_LIMIT + 1]
     assert -math.pi <= finite[9] <= math.pi
-    assert abs(finite[10]) <= GAINS[layout.G_YAW_RATE_LIMIT]
+    assert abs(finite[10]) <= GAINS[cascade.G_YAW_RATE_LIMIT]
 
 
 @settings(deadline=None)  # the first call may compile

@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.control import layout
+from sitl.control import cascade
+from sitl.control.cascade import acceleration_target, velocity_target
 from sitl.control.gains import gains_for
-from sitl.control.velocity import acceleration_target, velocity_target
-from sitl.vehicle.profile_files import load_profile
+from sitl.vehicle.profile import load_profile
 
 GAINS = gains_for(load_profile("solo"), 0.004)
 FREE = math.nan
 
 
 def setpoint(**fields):
-    clean = np.full(layout.SETPOINT_SIZE, FREE)
+    clean = np.full(cascade.SETPOINT_SIZE, FREE)
     for name, values in fields.items():
         start = {"position": 0, "velocity": 3, "acceleration": 6}[name]
         clean[start : start + 3] = values
@@ -25,15 +25,15 @@ def setpoint(**fields):
 
 
 def at_rest():
-    measurement = np.zeros(layout.MEASUREMENT_SIZE)
-    measurement[layout.M_QUATERNION] = 1.0
+    measurement = np.zeros(cascade.MEASUREMENT_SIZE)
+    measurement[cascade.M_QUATERNION] = 1.0
     return measurement
 
 
 def test_position_adds_to_velocity():
     clean = setpoint(position=(1.0, 0.0, 0.5), velocity=(0.5, FREE, 0.2))
     target = velocity_target(clean, at_rest(), GAINS)
-    p = GAINS[layout.G_POSITION_P : layout.G_POSITION_P + 3]
+    p = GAINS[cascade.G_POSITION_P : cascade.G_POSITION_P + 3]
     np.testing.assert_allclose(target, (p[0] + 0.5, 0.0, 0.5 * p[2] + 0.2))
 
 
@@ -48,26 +48,26 @@ def test_nothing_controlled_is_stand_still_and_acceleration_alone_is_free():
 @given(st.lists(st.floats(-1e5, 1e5), min_size=3, max_size=3))
 def test_far_positions_are_flown_to_within_the_speed_limits(position):
     target = velocity_target(setpoint(position=position), at_rest(), GAINS)
-    assert math.hypot(target[0], target[1]) <= GAINS[layout.G_SPEED_LIMIT] * (1 + 1e-12)
-    assert -GAINS[layout.G_CLIMB_LIMIT] <= target[2] <= GAINS[layout.G_DESCENT_LIMIT]
+    assert math.hypot(target[0], target[1]) <= GAINS[cascade.G_SPEED_LIMIT] * (1 + 1e-12)
+    assert -GAINS[cascade.G_CLIMB_LIMIT] <= target[2] <= GAINS[cascade.G_DESCENT_LIMIT]
 
 
 def test_integral_is_limited_when_the_vehicle_is_stuck():
-    state = np.zeros(layout.STATE_SIZE)
+    state = np.zeros(cascade.STATE_SIZE)
     clean = setpoint(velocity=(5.0, -5.0, -3.0))
     for _ in range(20000):
         total = acceleration_target(clean[3:6].copy(), clean, at_rest(), state, GAINS)
-    limits = GAINS[layout.G_INTEGRAL_LIMIT : layout.G_INTEGRAL_LIMIT + 3]
-    integral = state[layout.S_VELOCITY_INTEGRAL : layout.S_VELOCITY_INTEGRAL + 3]
+    limits = GAINS[cascade.G_INTEGRAL_LIMIT : cascade.G_INTEGRAL_LIMIT + 3]
+    integral = state[cascade.S_VELOCITY_INTEGRAL : cascade.S_VELOCITY_INTEGRAL + 3]
     np.testing.assert_allclose(np.abs(integral), limits)
     assert np.isfinite(total).all()
 
 
 def test_model_is_the_closed_form_second_order_step():
     # tau v'' + v' + k v = k u: the reference model, small enough to meet no limit
-    state = np.zeros(layout.STATE_SIZE)
+    state = np.zeros(cascade.STATE_SIZE)
     clean = setpoint(velocity=(0.5, 0.0, 0.0))
-    k, tau = GAINS[layout.G_MODEL_P], GAINS[layout.G_MODEL_LAG]
+    k, tau = GAINS[cascade.G_MODEL_P], GAINS[cascade.G_MODEL_LAG]
     measurement = at_rest()
     natural, damping = math.sqrt(k / tau), 0.5 / math.sqrt(k * tau)
     damped = natural * math.sqrt(1.0 - damping**2)
@@ -77,4 +77,4 @@ def test_model_is_the_closed_form_second_order_step():
         decay = math.exp(-damping * natural * t)
         swing = math.cos(damped * t) + damping * natural / damped * math.sin(damped * t)
         expected = 0.5 * (1.0 - decay * swing)
-        assert state[layout.S_MODEL_VELOCITY] == pytest.approx(expected, abs=0.012)
+        assert state[cascade.S_MODEL_VELOCITY] == pytest.approx(expected, abs=0.012)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.frames import quaternion_from_euler
-from sitl.referee.ground import GroundRule, LandingLimits
+from sitl.referee.referee import GroundRule
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def rule() -> GroundRule:
-    return GroundRule(half_m=(0.25, 0.25, 0.08), limits=LandingLimits())
+    return GroundRule(half_m=(0.25, 0.25, 0.08))
 
 
 def watch(

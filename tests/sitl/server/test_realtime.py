@@ -10,8 +10,7 @@ import time
 
 import pytest
 
-from mavfi_cli.link.codec import Codec, dialect
-from mavfi_cli.link.signing import Signing, key_from_passphrase
+from mavfi_cli.link.codec import Codec, Signing, dialect, key_from_passphrase
 
 LONG_S = 30.0
 

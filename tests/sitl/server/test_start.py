@@ -101,4 +101,4 @@ def test_defaults_are_those_of_a_px4_sitl():
     ]
     assert options.speed == 1.0
     assert parse(["--lockstep", "--fd", "5"]).speed is None
-    assert parse(["--lockstep", "--fd", "5"]).links == ()
+    assert parse(["--lockstep", "--fd", "5"]).links == []

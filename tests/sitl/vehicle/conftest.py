@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sitl.vehicle.profile_files import load_profile
-from sitl.vehicle.truth import T_POSITION, T_QUATERNION, T_VELOCITY
-from sitl.vehicle.vehicle import PHYSICS_DT_S, Quadrotor
+from sitl.vehicle.profile import load_profile
+from sitl.vehicle.vehicle import PHYSICS_DT_S, T_POSITION, T_QUATERNION, T_VELOCITY, Quadrotor
 
 FREE = math.nan
 

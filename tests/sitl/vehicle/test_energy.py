@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.vehicle.energy import (
+from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.vehicle import (
     battery_current,
     battery_parameters,
     open_circuit_voltage,
     regression_coefficients,
     regression_power,
 )
-from sitl.vehicle.profile_files import load_profile, profile_names
 
 components = st.lists(st.floats(-20.0, 20.0), min_size=3, max_size=3).map(np.array)
 

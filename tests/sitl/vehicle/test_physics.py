@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import VehicleProcessError
+from sitl.control.cascade import throttle
 from sitl.control.gains import gains_for
-from sitl.control.mixer import throttle
-from sitl.vehicle.model import AIRCRAFT, power_share, thrust_share, write_model
 from sitl.vehicle.physics import (
+    AIRCRAFT,
     FOOT_M,
     RAW_POSITION,
     RAW_RATES,
@@ -17,9 +17,11 @@ from sitl.vehicle.physics import (
     RAW_SIZE,
     RAW_VELOCITY,
     Physics,
+    power_share,
+    thrust_share,
+    write_model,
 )
-from sitl.vehicle.profile import GRAVITY_MPS2
-from sitl.vehicle.profile_files import load_profile, profile_names
+from sitl.vehicle.profile import GRAVITY_MPS2, load_profile, profile_names
 
 DT_S = 0.004
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import ConfigError
-from sitl.vehicle.profile import GRAVITY_MPS2, MIN_THRUST_TO_WEIGHT
-from sitl.vehicle.profile_files import load_profile
+from sitl.vehicle.profile import GRAVITY_MPS2, MIN_THRUST_TO_WEIGHT, load_profile
 
 HEAVY = """name = "heavy"
 base = "spark"

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.frames import enu_from_ned, flu_enu_from_frd_ned, yaw_from_quaternion
-from sitl.vehicle.profile_files import load_profile
-from sitl.vehicle.truth import T_ON_GROUND
-from sitl.vehicle.vehicle import PHYSICS_DT_S, Quadrotor
+from sitl.vehicle.profile import load_profile
+from sitl.vehicle.vehicle import PHYSICS_DT_S, T_ON_GROUND, Quadrotor
 
 NAMES = ("solo", "spark", "solo+0.3")
 

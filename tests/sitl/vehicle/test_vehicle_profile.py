@@ -8,8 +8,7 @@ import pytest
 
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 from sitl.vehicle import profile as profile_module
-from sitl.vehicle.profile import GRAVITY_MPS2
-from sitl.vehicle.profile_files import load_profile, profile_names
+from sitl.vehicle.profile import GRAVITY_MPS2, load_profile, profile_names
 
 SHIPPED = Path(profile_module.__file__).parent / "profiles"
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sitl.world import load_world
-from sitl.world.command import main
+from sitl.world.__main__ import main
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -107,7 +107,7 @@ def test_wrong_usage_is_exit_2(capsys: pytest.CaptureFixture[str], arguments: li
 
 def test_it_runs_as_a_module_without_loading_matplotlib_or_numba() -> None:
     code = (
-        "import sys; from sitl.world.command import main; main(['check', 'dense']); "
+        "import sys; from sitl.world.__main__ import main; main(['check', 'dense']); "
         "print([m for m in ('matplotlib', 'numba') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -5,9 +5,8 @@ import pytest
 
 from mavfi_cli.core.errors import WorldError
 from sitl.world import load_world
-from sitl.world.generate import CLEAR_RADIUS_M, GeneratorParams, generate
 from sitl.world.load import GENERATED
-from sitl.world.world import plan_distance_to_boxes
+from sitl.world.world import CLEAR_RADIUS_M, GeneratorParams, generate, plan_distance_to_boxes
 
 START, GOAL = np.zeros(3), np.array([30.0, 40.0, 5.0])
 FAR_GOAL = np.array([900.0, 900.0, 5.0])

@@ -8,9 +8,8 @@ import pytest
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName, WorldError
 from sitl.world import load_world, world_names
 from sitl.world.check import check_world
-from sitl.world.generate import CLEAR_RADIUS_M
-from sitl.world.scene import scene_toml
-from sitl.world.world import plan_distance_to_boxes
+from sitl.world.load import scene_toml
+from sitl.world.world import CLEAR_RADIUS_M, plan_distance_to_boxes
 
 YARD = """name = "yard"
 bounds_enu_m = [-10, -10, 0, 40, 40, 30]

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.link.codec import Codec
-from sitl.autopilot.text import text_messages
+from mavfi_cli.link.texts import text_messages
 
 printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=200)
 
@@ -11,7 +11,9 @@ printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size
 @given(printable)
 def test_chunks_put_together_are_the_text_and_a_tab(text):
     sender, receiver = Codec(1, 1), Codec(2, 2)
-    messages = [receiver.decode(sender.encode(m))[0] for m in text_messages(4, text, 7)]
+    messages = [
+        receiver.decode(sender.encode(m))[0] for m in text_messages(4, text.encode() + b"\t", 7)
+    ]
     assert "".join(m.text for m in messages) == text + "\t"
     assert [m.chunk_seq for m in messages] == list(range(len(messages)))
     assert {m.id for m in messages} == ({0} if len(messages) == 1 else {7})
@@ -21,5 +23,5 @@ def test_chunks_put_together_are_the_text_and_a_tab(text):
 
 @pytest.mark.parametrize("length", [48, 49, 50, 99, 100])
 def test_around_the_chunk_length(length):
-    messages = list(text_messages(6, "x" * length, 1))
+    messages = list(text_messages(6, b"x" * length + b"\t", 1))
     assert len(messages) == (1 if length + 1 <= 50 else (length + 1) // 50 + 1)

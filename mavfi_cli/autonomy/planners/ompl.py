@@ -1,4 +1,4 @@
-"""One OMPL search: state space, validity check, seed and stop condition for all OMPL planners.
+"""OMPL's planners: RRT* (Karaman and Frazzoli 2011), RRT (LaValle 1998), RRTConnect (Kuffner 2000).
 
 OMPL's random generators take their seeds from a process-wide sequence when they are created. Each
 search resets that sequence first and creates its generators afterwards, so its result depends on
@@ -11,10 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from ompl import base as ob
+from ompl import geometric as og
 from ompl import util as ou
 
 from mavfi_cli.autonomy.grid import ObstacleGrid, segment_free
@@ -25,7 +26,7 @@ MAX_SEED = 0x7FFF_FFFF
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Search:
+class _Search:
     """Settings of an OMPL search."""
 
     make: Callable[[Any], Any]  # space information -> configured OMPL planner
@@ -46,7 +47,7 @@ class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
         return free
 
 
-def run(problem: PlanningProblem, seed: int, search: Search) -> PlanResult:
+def _run(problem: PlanningProblem, seed: int, search: _Search) -> PlanResult:
     """Search a path from start to goal. Return a straight line if that is free."""
     refused = refuse(problem)
     if refused is not None:
@@ -128,3 +129,89 @@ def _result(problem: PlanningProblem, definition: Any, iterations: int) -> PlanR
     path = np.array([[state[0], state[1], state[2]] for state in states])
     path[0], path[-1] = problem.start_enu_m, problem.goal_enu_m
     return PlanResult(found=True, path_enu_m=path, iterations=iterations)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RRT:
+    """RRT with OMPL's default goal bias, and a shorter maximum step for dense maps."""
+
+    name: ClassVar[str] = "rrt"
+
+    iterations: int = 5000
+    range_m: float = 10.0
+    goal_bias: float = 0.05
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
+        """See `Planner.plan`."""
+        return _run(problem, seed, _Search(make=self._make, iterations=self.iterations))
+
+    def _make(self, information: Any) -> Any:
+        planner = og.RRT(information)
+        planner.setRange(self.range_m)
+        planner.setGoalBias(self.goal_bias)
+        return planner
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RRTConnect:
+    """RRTConnect, which grows two trees towards each other."""
+
+    name: ClassVar[str] = "rrtconnect"
+
+    iterations: int = 5000
+    range_m: float = 10.0
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
+        """See `Planner.plan`."""
+        return _run(problem, seed, _Search(make=self._make, iterations=self.iterations))
+
+    def _make(self, information: Any) -> Any:
+        planner = og.RRTConnect(information)
+        planner.setRange(self.range_m)
+        return planner
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RRTStar:
+    """RRT* with OMPL's default goal bias and rewiring factor.
+
+    After the first solution it samples only states that could shorten the path (Gammell et al.
+    2014). 300 iterations with this restriction give shorter paths than 500 without, at half the
+    cost.
+
+    If the iterations end without a solution, a second search takes shorter steps and up to
+    `patience` iterations, and stops at its first solution. Only hard maps incur this cost.
+    """
+
+    name: ClassVar[str] = "rrtstar"
+
+    iterations: int = 300
+    range_m: float = 25.0
+    patience: int = 2000
+    patient_range_m: float = 5.0
+    goal_bias: float = 0.05
+    rewire_factor: float = 1.1
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
+        """See `Planner.plan`."""
+        best = _Search(
+            make=lambda information: self._make(information, self.range_m),
+            iterations=self.iterations,
+            optimise=True,
+        )
+        result = _run(problem, seed, best)
+        if result.found or result.iterations == 0:
+            return result
+        any_at_all = _Search(
+            make=lambda information: self._make(information, self.patient_range_m),
+            iterations=self.patience,
+        )
+        return _run(problem, seed, any_at_all)
+
+    def _make(self, information: Any, range_m: float) -> Any:
+        planner = og.RRTstar(information)
+        planner.setRange(range_m)
+        planner.setGoalBias(self.goal_bias)
+        planner.setRewireFactor(self.rewire_factor)
+        planner.setInformedSampling(True)
+        return planner
