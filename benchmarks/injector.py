@@ -23,12 +23,12 @@ import numpy as np
 
 from mavfi_cli.attack.campaign import TargetRuns, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
-from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.image import Image
-from mavfi_cli.fi.tracer.spawn import Command
+from mavfi_cli.fi.tracer.spawn import Program
 
 SOURCE = r"""
 #include <stdio.h>
@@ -67,7 +67,7 @@ def build(folder: Path) -> Path:
 def target_of(program: Path, ticks: int, mechanism: Mechanism | None = None) -> ProgramTarget:
     """The program as a target."""
     return ProgramTarget(
-        command=Command.of([str(program), str(ticks)]),
+        command=Program.of([str(program), str(ticks)]),
         comparison=OutputComparison(),
         mechanism=mechanism,
     )
@@ -119,7 +119,7 @@ def summarise(campaign: TargetRuns, say: Callable[[str], None]) -> None:
     """The figures of a campaign."""
     records = campaign.records
     total = sum(entry["run_s"] for entry in records)
-    quick = [e["run_s"] for e in records if e["outcome"] != Outcome.HANG.value]
+    quick = [e["run_s"] for e in records if e["outcome"] != RunOutcome.HANG.value]
     hangs = len(records) - len(quick)
     say(f"injections per hour and core: {3600 * len(records) / total:,.0f} in all")
     say(f"  without the {hangs} hangs: {3600 * len(quick) / sum(quick):,.0f}")

@@ -5,8 +5,9 @@ the import itself and `mavfi --help` stay fast. docs/library.md shows how to use
 """
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.core.versions import __version__
 
 if TYPE_CHECKING:
     from mavfi_cli.campaign.missions import PlannedMission
@@ -20,11 +21,6 @@ if TYPE_CHECKING:
     from mavfi_cli.spec.fault import FaultConfig
     from mavfi_cli.spec.instruction import InstructionConfig
     from mavfi_cli.spec.mission import MissionConfig
-
-try:
-    __version__ = version("mavfi")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
 
 __all__ = [
     "DetectorConfig",

@@ -186,12 +186,12 @@ def tracing_problem():
 @pytest.fixture
 def start(native_program, tmp_path):
     """Function that starts a program at its entry point; what it leaves behind is killed."""
-    from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
+    from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 
     tracees = []
 
     def begin(name, *arguments, mechanism=None):
-        command = Command.of([str(native_program(name)), *arguments])
+        command = Program.of([str(native_program(name)), *arguments])
         tracee = spawn(
             command, stdout=tmp_path / "stdout", stderr=tmp_path / "stderr", mechanism=mechanism
         )

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.analysis.flights import BoolArray, IntArray, known
-from mavfi_cli.analysis.groups import METRICS, Group, matched, untreated
+from mavfi_cli.analysis.groups import METRICS, RESAMPLES, Group, matched, untreated
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import holm, mcnemar
 from mavfi_cli.stats.worst_case import WorstCase, worst_case, worst_over_own
-
-RESAMPLES = 1999
 
 
 @dataclass(frozen=True, slots=True)

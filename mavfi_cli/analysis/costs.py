@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.comparison import RESAMPLES
 from mavfi_cli.analysis.flights import chosen, numbers
+from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import interval_of_rows

@@ -6,10 +6,8 @@ The list supplies the configuration of the missions, the records their results. 
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,14 +24,11 @@ from mavfi_cli.campaign.missions import (
     canonical,
     changes_of,
 )
-from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.mission.record.measures import QUALITY, STRUCK, measures_of
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
 FAULT = ("target", "seed", "bits", "field")
-FORMATS = (".parquet", ".csv")
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
@@ -139,44 +134,6 @@ def rows_of(table: pa.Table, names: Sequence[str]) -> list[Mapping[str, Any]]:
     """The named columns, row by row."""
     found: list[Mapping[str, Any]] = table.select(names).to_pylist()
     return found
-
-
-# The table as a file --------------------------------------------------------------------------
-
-
-def export(table: pa.Table, path: Path) -> int:
-    """Write an exported table to a .parquet or .csv file; return the number of rows.
-
-    Raises:
-        ConfigError: the file has another suffix.
-        RecordError: it cannot be written.
-    """
-    if path.suffix not in FORMATS:
-        raise ConfigError(
-            f"expected a name that ends in {' or '.join(FORMATS)}, or - for CSV on stdout",
-            path=path,
-        )
-
-    def write(file: Any) -> None:
-        """Write the table in the format of the name."""
-        from pyarrow import csv, parquet
-
-        if path.suffix == ".csv":
-            csv.write_csv(table, file)
-        else:
-            parquet.write_table(table, file, compression="zstd")
-
-    write_atomically(path, write)
-    return int(table.num_rows)
-
-
-def export_csv(table: pa.Table) -> bytes:
-    """Return an exported table as CSV."""
-    from pyarrow import csv
-
-    text = io.BytesIO()
-    csv.write_csv(table, text)
-    return text.getvalue()
 
 
 def exported(ledger: Ledger) -> pa.Table:

@@ -21,6 +21,7 @@ from mavfi_cli.campaign.missions import COUNTED, Injected, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 
+RESAMPLES = 1999
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 # Labels in which protected flights differ from unprotected ones.
 TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")

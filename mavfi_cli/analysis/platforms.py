@@ -15,9 +15,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.comparison import RESAMPLES
 from mavfi_cli.analysis.costs import MISSION, cost_difference, cost_row, struck, worst_row
 from mavfi_cli.analysis.flights import chosen, flags, flown, known, numbers
+from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.analysis.pairs import both_succeed, difference, paired, ratio, success_test
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform

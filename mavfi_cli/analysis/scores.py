@@ -41,7 +41,7 @@ def _kept_of(path: Path) -> _Kept:
     run = load_run(path)
     if run.trace is None:
         return _Kept(columns={}, plans=(), strikes=())
-    fault = run.result.get("fault") or {}
+    fault = run.record.fault
     strikes = [
         PlanStrike(
             stamp_s=strike["stamp_s"], state=change["state"], waypoint=change["index"],

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.analysis.comparison import RESAMPLES, against_golden, protection
-from mavfi_cli.analysis.groups import INACTIVE, METRICS, Group, groups
+from mavfi_cli.analysis.comparison import against_golden, protection
+from mavfi_cli.analysis.groups import INACTIVE, METRICS, RESAMPLES, Group, groups
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import COUNTED
 from mavfi_cli.stats.bootstrap import interval

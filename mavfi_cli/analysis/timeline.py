@@ -62,7 +62,7 @@ def timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any
         RecordError: the time table cannot be read.
     """
     timetable = read_timetable(run.folder.kernels)
-    told = {e["stamp_s"]: e["text"] for e in run.result["events"] if e["kind"] in _ANSWERS}
+    told = {e["stamp_s"]: e["text"] for e in run.record.events if e["kind"] in _ANSWERS}
     stamps = [] if run.trace is None else run.trace["stamp_s"].to_pylist()
     reaction = typical(timetable.reactions, told)
     if reaction is None:

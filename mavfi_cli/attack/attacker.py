@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.alarm import ProcessTimer
-from mavfi_cli.fi.tracer.fault import InstructionFault, Stage
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import (
     NOTHING,
@@ -39,7 +39,7 @@ _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times 
 class RunResult:
     """One faulty run."""
 
-    outcome: Outcome
+    outcome: RunOutcome
     signal: int | None
     verdict: RunVerdict
     fault: InstructionFault | None  # None if a time trigger found nothing to hit
@@ -159,7 +159,7 @@ class Attacker:
         planned = fault is None or fault.corruption is not None
         missed = planned and not (injection is not None and injection.applied)
         return RunResult(
-            outcome=Outcome.NOT_INJECTED if missed else verdict.outcome,
+            outcome=RunOutcome.NOT_INJECTED if missed else verdict.outcome,
             signal=None if ended is None else ended.signal,
             verdict=verdict,
             fault=fault,
@@ -183,7 +183,7 @@ def _fault_here(
     if instruction is None or corruption is None:
         return None, "no operand that the fault model allows"
     fault = InstructionFault(
-        trigger=(Stage(image.locate(here), 1),),
+        trigger=(CountedStop(image.locate(here), 1),),
         execution=0,
         instruction=instruction.text,
         instruction_bytes=instruction.raw,

@@ -12,7 +12,7 @@ from typing import Any
 from mavfi_cli.stats.shares import Share, design_effect, wilson
 
 
-class Outcome(Enum):
+class RunOutcome(Enum):
     """The outcome of one run of an isolated program or kernel."""
 
     BENIGN = "benign"
@@ -24,15 +24,15 @@ class Outcome(Enum):
     @property
     def title(self) -> str:
         """The name in tables."""
-        return "SDC" if self is Outcome.SDC else self.value.replace("_", " ")
+        return "SDC" if self is RunOutcome.SDC else self.value.replace("_", " ")
 
 
 Window = tuple[Hashable, int]  # stratum and number of the sampled window that a run hit
 
 
 def shares(
-    outcomes: Iterable[Outcome], windows: Iterable[Window | None] = ()
-) -> dict[Outcome, Share]:
+    outcomes: Iterable[RunOutcome], windows: Iterable[Window | None] = ()
+) -> dict[RunOutcome, Share]:
     """Share of each outcome in the *injected* runs; not injected ones are a share of all runs.
 
     Args:
@@ -42,17 +42,17 @@ def shares(
     """
     ended = list(outcomes)
     hit = list(windows) or [None] * len(ended)
-    injected = [(o, w) for o, w in zip(ended, hit, strict=True) if o is not Outcome.NOT_INJECTED]
+    injected = [(o, w) for o, w in zip(ended, hit, strict=True) if o is not RunOutcome.NOT_INJECTED]
     found = {}
-    for outcome in Outcome:
-        of = list(zip(ended, hit, strict=True)) if outcome is Outcome.NOT_INJECTED else injected
+    for outcome in RunOutcome:
+        of = list(zip(ended, hit, strict=True)) if outcome is RunOutcome.NOT_INJECTED else injected
         is_it = [each is outcome for each, _ in of]
         effect = design_effect(is_it, [window for _, window in of])
         found[outcome] = wilson(sum(is_it), len(of), design_effect=effect)
     return found
 
 
-def shares_to_json(found: Mapping[Outcome, Share]) -> dict[str, dict[str, Any]]:
+def shares_to_json(found: Mapping[RunOutcome, Share]) -> dict[str, dict[str, Any]]:
     """The result of `shares` as plain values; a share of nothing is null."""
     return {
         outcome.value: {

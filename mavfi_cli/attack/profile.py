@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from mavfi_cli.attack.outcome import Window
 from mavfi_cli.attack.target import AttackPlace
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.fault import InstructionFault, Stage
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.sampling import Strategy, draw_fault
 from mavfi_cli.fi.tracer.symbols import short_name
@@ -88,7 +88,7 @@ class TargetProfile:
         stratum, locate = self.strata[which], self.image.locate
         return draw_fault(stratum, plan, rng, code_at=self.code_at, locate=locate)
 
-    def after(self, begin: Stage) -> TargetProfile:
+    def after(self, begin: CountedStop) -> TargetProfile:
         """Make the same profile for a run that has to reach `begin` first."""
 
         def later(stratum: Stratum) -> Stratum:
@@ -295,9 +295,9 @@ class _Stepper:
             for number in numbers:
                 if number <= passed and self.marker is not None:
                     return
-                start: tuple[Stage, ...] = ()
+                start: tuple[CountedStop, ...] = ()
                 if self.marker is not None:
-                    start = (Stage(self.marker, number),)
+                    start = (CountedStop(self.marker, number),)
                     if not tracee.run_to(address, number - passed):
                         raise TargetError(self.place.name, "does not repeat its function calls")
                 trace = record_window(

@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
-from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
+from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 
@@ -30,7 +30,7 @@ from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 class ProgramTarget:
     """A program, its code in scope, and its compared outputs."""
 
-    command: Command
+    command: Program
     comparison: OutputComparison
     objects: tuple[str, ...] = ()  # file names in scope; by default the program itself
     function: str | None = None  # hit only calls of this function

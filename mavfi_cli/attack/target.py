@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
@@ -58,7 +58,7 @@ class RunVerdict:
         details: further entries of the record, such as `magnitude`.
     """
 
-    outcome: Outcome
+    outcome: RunOutcome
     output_sha256: str
     details: Mapping[str, Any] = field(default_factory=dict)
 
@@ -171,7 +171,7 @@ def judged(
     compare: Callable[[bytes, bytes], Difference | None],
     *,
     tolerance: float | None,
-) -> tuple[Outcome, Difference | None]:
+) -> tuple[RunOutcome, Difference | None]:
     """Judge a run: its outcome, and the size of its difference if it is known.
 
     Args:
@@ -182,15 +182,15 @@ def judged(
         tolerance: largest relative difference that is benign; None if every byte counts.
     """
     if ended is None:
-        return Outcome.HANG, None
+        return RunOutcome.HANG, None
     same_end = ended.exit_code == golden.exit_code
     if output is None or ended.signal is not None or (ended.exit_code and not same_end):
-        return Outcome.CRASH, None
+        return RunOutcome.CRASH, None
     if output == golden.output and same_end:
-        return Outcome.BENIGN, Difference(relative=0.0, absolute=0.0)
+        return RunOutcome.BENIGN, Difference(relative=0.0, absolute=0.0)
     difference = compare(golden.output, output)
     near = difference is not None and tolerance is not None and difference.relative <= tolerance
-    return Outcome.BENIGN if near and same_end else Outcome.SDC, difference
+    return RunOutcome.BENIGN if near and same_end else RunOutcome.SDC, difference
 
 
 def digest(output: bytes) -> str:

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.octree import occupied_leaves
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray
+
+if TYPE_CHECKING:
+    from mavfi_cli.autonomy.occupancy import MapSnapshot
 
 Blocked = NDArray[np.uint8]
 

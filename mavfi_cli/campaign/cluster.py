@@ -26,9 +26,8 @@ from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.campaign.workers import TASK, Assignment, AttemptEnd, LocalWorkers, Workers
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.fork_server import SCRATCH
+from mavfi_cli.core.versions import installed_versions, version_differences
 from mavfi_cli.mission.record.run_folder import FAULT, RESULT
-from mavfi_cli.mission.replay import version_differences
-from mavfi_cli.mission.run import installed_versions
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -149,7 +148,7 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
         client.wait_for_workers(1, timeout=WORKERS_S)
     except TimeoutError:
         raise ClusterError(f"{address}: no worker within {WORKERS_S:g} s") from None
-    told = client.run(worker_versions, on_error="return")
+    told = client.run(_worker_versions, on_error="return")
     for worker, versions in sorted(told.items()):
         if not isinstance(versions, dict):
             raise ClusterError(f"worker {worker} cannot fly missions: {versions!r}")
@@ -190,14 +189,14 @@ class _Answer:
 
 
 @cache
-def worker_versions() -> dict[str, str]:
+def _worker_versions() -> dict[str, str]:
     """Versions on this worker that results depend on."""
     return installed_versions()
 
 
 def fly(order: _Order) -> _Answer:
     """Fly a mission; run folders that the campaign does not keep are sent without their traces."""
-    differing = version_differences(order.versions, worker_versions())
+    differing = version_differences(order.versions, _worker_versions())
     if differing:
         return _Answer(refused="; ".join(differing))
     place = _scratch() / f"{order.number}-{threading.get_ident()}"

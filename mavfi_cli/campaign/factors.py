@@ -19,14 +19,14 @@ from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 
-class Level(Enum):
+class _Level(Enum):
     """The level at which faults strike."""
 
     SOURCE = "source"
     INSTRUCTION = "instruction"
 
 
-_RECORDS = {Level.SOURCE: FaultConfig, Level.INSTRUCTION: InstructionConfig}
+_RECORDS = {_Level.SOURCE: FaultConfig, _Level.INSTRUCTION: InstructionConfig}
 # Other names in a specification for fields of the mission and of either level's fault.
 _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
@@ -43,7 +43,7 @@ _FAULT = {
 
 
 def _names() -> tuple[str, ...]:
-    fault = dict.fromkeys((*_ALIASES, "level", *_FAULT[Level.SOURCE], *_FAULT[Level.INSTRUCTION]))
+    fault = dict.fromkeys((*_ALIASES, "level", *_FAULT[_Level.SOURCE], *_FAULT[_Level.INSTRUCTION]))
     return (*MISSION, *_DETECTOR, *(name for name in fault if name != "target"))
 
 
@@ -72,7 +72,7 @@ class Point:
         fault = self._fault(fault_seed)
         if fault:
             level, values = fault
-            mission["fault" if level is Level.SOURCE else "instruction"] = values
+            mission["fault" if level is _Level.SOURCE else "instruction"] = values
         detector = {_DETECTOR[name]: value for name, value in self.values.items()
                     if name in _DETECTOR}  # fmt: skip
         if detector and "name" not in detector:
@@ -81,10 +81,10 @@ class Point:
             mission["detector"] = detector
         return structure(mission, MissionConfig)
 
-    def _fault(self, seed: int) -> tuple[Level, dict[str, Any]] | None:
+    def _fault(self, seed: int) -> tuple[_Level, dict[str, Any]] | None:
         elsewhere = {*MISSION, *_DETECTOR}
         asked = {name: value for name, value in self.values.items() if name not in elsewhere}
-        level_name = asked.pop("level", Level.SOURCE.value)
+        level_name = asked.pop("level", _Level.SOURCE.value)
         targets = [name for name in _ALIASES if name in asked]
         level = _member(level_name)
         if not targets:
@@ -104,17 +104,17 @@ class Point:
         return level, {**values, "seed": seed}
 
 
-def _no_factor(name: str, level: Level) -> ConfigError:
+def _no_factor(name: str, level: _Level) -> ConfigError:
     match = nearest(name, (*_ALIASES, *_FAULT[level]))
     hint = f"; did you mean {match!r}?" if match else ""
     return ConfigError(f"no factor of faults at {level.value} level{hint}", key=name)
 
 
-def _member(name: Any) -> Level:
+def _member(name: Any) -> _Level:
     try:
-        return Level(name)
+        return _Level(name)
     except ValueError:
-        known = " or ".join(level.value for level in Level)
+        known = " or ".join(level.value for level in _Level)
         raise ConfigError(f"expected {known}, got {name!r}", key="level") from None
 
 

@@ -32,7 +32,7 @@ from mavfi_cli.campaign.missions import (
 )
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import plain
-from mavfi_cli.mission.record.measures import fields_of
+from mavfi_cli.mission.record.measures import fields_of, record_of
 
 SCHEMA = 1
 LEDGER, LOCK, RUNS = "ledger.sqlite", "ledger.lock", "runs"
@@ -276,7 +276,7 @@ class Ledger:
         row = (
             number,
             state.value,
-            result.get("outcome"),
+            record_of(result).outcome or None,
             reason,
             None if injected is None else injected.value,
             *(columns[name] for name in _SHORT),

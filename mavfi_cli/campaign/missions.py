@@ -13,6 +13,7 @@ from typing import Any
 
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, MavfiError
+from mavfi_cli.mission.record.measures import FlightRecord, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None
@@ -186,24 +187,25 @@ def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
         result: result.json.
         asked: true if the mission was to have a fault.
     """
-    fault = result.get("fault")
+    flight = record_of(result)
+    fault = flight.fault
     if not asked:
         return Injected.GOLDEN
-    if fault is None or fault["state"] in ("planned", "not_injected"):
+    if not fault or fault["state"] in ("planned", "not_injected"):
         return Injected.NOT_INJECTED
     if fault["state"] == "null":
         return Injected.NULL
     activation = fault.get("activation") or {"activation": "read"}  # cut off: it may have been
     found = _BY_ACTIVATION.get(activation["activation"], Injected.ACTIVE)
-    return Injected.CAUGHT if found is Injected.NOT_ACTIVATED and _caught(result) else found
+    return Injected.CAUGHT if found is Injected.NOT_ACTIVATED and _caught(flight) else found
 
 
-def _caught(result: Mapping[str, Any]) -> bool:
+def _caught(flight: FlightRecord) -> bool:
     """True if an alarm withheld the struck value: at its stamp, or by the name of its state."""
-    strikes = result["fault"].get("strikes") or []
+    strikes = flight.fault.get("strikes") or []
     stamps = {strike["stamp_s"] for strike in strikes}
     states = {change["state"] for strike in strikes for change in strike["changes"]}
-    alarms = (result.get("detection") or {}).get("alarms", [])
+    alarms = flight.detection.get("alarms", [])
     return any(
         alarm["response"] != "accept"
         and (

@@ -37,9 +37,10 @@ from mavfi_cli.campaign.workers import (
     judge,
 )
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
+from mavfi_cli.core.processes import interruptible
+from mavfi_cli.core.versions import installed_versions, version_differences
+from mavfi_cli.mission.record.measures import record_of
 from mavfi_cli.mission.record.run_folder import RESULT
-from mavfi_cli.mission.replay import version_differences
-from mavfi_cli.mission.run import installed_versions, interruptible
 
 WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # most attempts at a mission that something outside ends
@@ -292,8 +293,8 @@ class _Run:
         """Store a mission that is over: first its run folder, then its row."""
         assert verdict.state is not None
         number, result = ended.number, verdict.result
-        path = None
-        if verdict.run is not None and self._options.keep.wants(number, result.get("outcome")):
+        path, outcome = None, record_of(result).outcome or None
+        if verdict.run is not None and self._options.keep.wants(number, outcome):
             place = _put_away(verdict.run, self._folder / RUNS, number)
             path = str(place.relative_to(self._folder))
         flown = verdict.state is ResultState.FLOWN
@@ -312,9 +313,9 @@ class _Run:
         self._over += 1
         if self._gate is not None:
             fate = None if injected is None else injected.value
-            self._gate.record(number, (result.get("outcome"), fate))
+            self._gate.record(number, (outcome, fate))
         if flown:
-            self._outcomes[self._setting_of[number]][str(result["outcome"])] += 1
+            self._outcomes[self._setting_of[number]][str(outcome)] += 1
             return
         self._errors += 1
         self._spectator.on_note(f"mission {number} could not be flown: {verdict.reason}")

@@ -53,10 +53,10 @@ def parse_spec(text: str, path: Path) -> Spec:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise syntax_error(error, path) from None
-    return read_spec(data, path, text)
+    return _read_spec(data, path, text)
 
 
-def read_spec(data: Mapping[str, Any], path: Path, text: str = "") -> Spec:
+def _read_spec(data: Mapping[str, Any], path: Path, text: str = "") -> Spec:
     """Read a specification from TOML's tables; `path` as for `parse_spec`, `text` for lines."""
     read = _Reader(path)
     read.known(data, _TOP, "")
@@ -230,7 +230,7 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
     if len(data["name"]) > _LONGEST:
         digest = hashlib.sha256("\n".join(changes).encode()).hexdigest()[:8]
         data["name"] = f"{data['name'][: _LONGEST - 9]}-{digest}"
-    return read_spec(data, Path(f"{spec.name}.toml"))
+    return _read_spec(data, Path(f"{spec.name}.toml"))
 
 
 def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:

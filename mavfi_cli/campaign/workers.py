@@ -18,6 +18,7 @@ from mavfi_cli.campaign.missions import ResultState
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.types import Outcome
+from mavfi_cli.mission.record.measures import record_of
 from mavfi_cli.mission.record.run_folder import RunFolder
 from mavfi_cli.spec.fault import PROCESS
 
@@ -243,19 +244,18 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
         result = json.loads((run / "result.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise RecordError(f"{run}: {error}") from None
-    outcome, reason = result["outcome"], result["reason"]
+    flight = record_of(result)
+    outcome, reason = flight.outcome, flight.reason
     if outcome == Outcome.INTERRUPTED.value:
         return Verdict(state=None, result={}, reason="interrupted")
-    crashes = [
-        crash["how"] for node in result.get("nodes", {}).values() for crash in node["crashes"]
-    ]
+    crashes = [crash["how"] for node in flight.nodes.values() for crash in node["crashes"]]
     if config.get("link") is None:  # no fault of the companion can kill the simulated vehicle
         if outcome == Outcome.LINK_LOST.value and reason.endswith(_OUTSIDE_WORDS):
             return Verdict(state=None, result={}, reason=reason)
-        if result.get("referee", {}) is None:
+        if flight.referee is None:
             reason = "the vehicle died before it had saved the truth"
             return Verdict(state=None, result={}, reason=reason)
-    by_fault = (result.get("fault") or {}).get("stage") == PROCESS  # it kills a node itself
+    by_fault = flight.fault.get("stage") == PROCESS  # it kills a node itself
     doubtful = not by_fault and any(how.endswith(_OUTSIDE_WORDS) for how in crashes)
     return Verdict(
         state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=doubtful

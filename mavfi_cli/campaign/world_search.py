@@ -22,7 +22,7 @@ SEARCH = "world-search"  # the folder
 _AT_ONCE = 4  # candidates that are flown at the same time
 
 
-class NoWorldFits(ConfigError):
+class _NoWorldFits(ConfigError):
     """None of the candidates fits the rule; the message has the replans of their flights."""
 
     def __init__(self, world: str, rule: FixedWorld, flown: Flown) -> None:
@@ -59,7 +59,7 @@ def with_worlds(
         folder: folder of the campaign.
 
     Raises:
-        NoWorldFits: no candidate fits.
+        ConfigError: no candidate fits.
         MavfiError: as `run_campaign`.
     """
     rule = spec.fixed_world
@@ -107,7 +107,7 @@ def _search(
             flown = (*flown, tuple(count for count in counts if count is not None))
             if rule.fits(flown[-1]):
                 return flown[:seed]
-    raise NoWorldFits(config.world, rule, flown)
+    raise _NoWorldFits(config.world, rule, flown)
 
 
 def _replans(

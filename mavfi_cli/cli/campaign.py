@@ -128,14 +128,13 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 def export(what: str, path: Path) -> None:
     """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli import library
-    from mavfi_cli.analysis.flights import export as write
-    from mavfi_cli.analysis.flights import export_csv
+    from mavfi_cli.report.tables.export import flights_csv, write_flights
 
     table = library.campaign(what).table
     if path == Path("-"):
-        click.echo(export_csv(table), nl=False)
+        click.echo(flights_csv(table), nl=False)
     else:
-        click.echo(f"{write(table, path)} missions in {path}")
+        click.echo(f"{write_flights(table, path)} missions in {path}")
 
 
 @campaign.command()

@@ -7,7 +7,7 @@ import textwrap
 
 import click
 
-from mavfi_cli.core.columns import WIDTH
+from mavfi_cli.report.tables.columns import WIDTH
 
 _INDENT = 29  # column of a check's finding
 _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}

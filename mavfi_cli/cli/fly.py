@@ -178,9 +178,9 @@ def fly(
         click.echo(
             f"\nRun folder  {folder.path}" + (f"  (see {folder.picture.name})" if picture else "")
         )
-    if run.result["outcome"] == "interrupted":
+    if run.record.outcome == "interrupted":
         raise click.exceptions.Exit(130)
-    if expect is not None and run.result["outcome"] != expect:
+    if expect is not None and run.record.outcome != expect:
         click.echo(f"error: expected {expect}, got {outcome_line(run.result)}", err=True)
         raise click.exceptions.Exit(1)
 

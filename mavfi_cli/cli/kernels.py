@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import os
 import shlex
@@ -156,9 +154,9 @@ def _attacked(
 def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.kernels.catalogue import select
     from mavfi_cli.attack.kernels.target import KernelTarget
-    from mavfi_cli.attack.summary import KERNEL_COLUMNS, summarise, table
     from mavfi_cli.mission.kernel_inputs import inputs_of_flight
     from mavfi_cli.report.kernel_plot import write_kernel_plot
+    from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, summarise, table
     from mavfi_cli.spec.mission import MissionConfig
 
     plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
@@ -187,7 +185,7 @@ def _folder(out: Path | None) -> Iterator[Path]:
 
 
 def _attack_program(options: dict[str, Any]) -> None:
-    from mavfi_cli.attack.summary import PROGRAM_COLUMNS, program_table, summarise_program
+    from mavfi_cli.report.tables.attacks import PROGRAM_COLUMNS, program_table, summarise_program
 
     plan, out = _plan(options), options["out"]
     campaign = _attacked(plan, [_program(options)], options, out)
@@ -201,7 +199,7 @@ def _attack_program(options: dict[str, Any]) -> None:
 def _program(options: dict[str, Any]) -> AttackTarget:
     from mavfi_cli.attack.comparison import OutputComparison, absolute_arguments
     from mavfi_cli.attack.program import ProgramTarget
-    from mavfi_cli.fi.tracer.spawn import Command
+    from mavfi_cli.fi.tracer.spawn import Program
 
     comparison = OutputComparison.of(
         options["compare"], tolerance=options["tolerance"], ignored=options["ignore_lines"]
@@ -214,7 +212,7 @@ def _program(options: dict[str, Any]) -> AttackTarget:
         arguments = list(absolute_arguments(arguments, Path.cwd(), comparison.files))
     stdin = (options["stdin_file"] or Path(os.devnull)).resolve()
     return ProgramTarget(
-        command=Command.of([options["program"], *arguments], stdin=stdin),
+        command=Program.of([options["program"], *arguments], stdin=stdin),
         comparison=comparison,
         objects=tuple(options["scope"]),
         function=options["function"],
@@ -224,12 +222,10 @@ def _program(options: dict[str, Any]) -> AttackTarget:
 def _save(
     folder: Path, told: dict[str, Any], campaign: list[TargetRuns], columns: Sequence[str]
 ) -> None:
-    from mavfi_cli.attack.summary import csv_rows
     from mavfi_cli.core.files import write_json, write_text
+    from mavfi_cli.report.tables.attacks import runs_csv
 
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(csv_rows(columns, campaign))
-    write_text(folder / "kernels.csv", text.getvalue())
+    write_text(folder / "kernels.csv", runs_csv(columns, campaign))
     write_json(folder / "kernels.json", told)
 
 

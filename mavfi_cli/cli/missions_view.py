@@ -35,7 +35,7 @@ class _Plain(Spectator):
 
     def on_end(self, progress: Progress) -> None:
         """Print the time that the missions took."""
-        if line := end_line(progress):
+        if line := _end_line(progress):
             click.echo(line, err=True)
 
     def on_note(self, text: str) -> None:
@@ -55,7 +55,7 @@ class _Live(Spectator):
 
     def on_end(self, progress: Progress) -> None:
         """Print the time that the missions took above the line."""
-        if line := end_line(progress):
+        if line := _end_line(progress):
             self.on_note(line)
 
     def on_note(self, text: str) -> None:
@@ -91,7 +91,7 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.1f}"
 
 
-def end_line(progress: Progress) -> str:
+def _end_line(progress: Progress) -> str:
     """The time that the missions took; empty if none was flown."""
     flown = progress.over - progress.before
     if not flown:

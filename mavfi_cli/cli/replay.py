@@ -27,6 +27,7 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     effect of the fault. An interrupted replay leaves no files.
     """
     from mavfi_cli.core.errors import Interrupted
+    from mavfi_cli.core.versions import installed_versions, version_differences
     from mavfi_cli.fi.tracer.record import read
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.record.run_folder import load_run
@@ -36,13 +37,12 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
         first_difference,
         interrupted,
         same_file,
-        version_differences,
     )
-    from mavfi_cli.mission.run import fly_mission, installed_versions
+    from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.report.summary import difference_lines, outcome_line
 
     recorded = load_run(run)
-    for text in version_differences(recorded.result["versions"], installed_versions()):
+    for text in version_differences(recorded.record.versions, installed_versions()):
         click.echo(f"warning: another build: {text}", err=True)
     config = config_of(recorded, with_fault=not without_fault)
     what = "without its fault" if without_fault else "again"
@@ -68,7 +68,7 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
             "run": str(recorded.folder.path),
             "again": str(again.folder.path),
             "identical": identical,
-            "outcomes": [recorded.result["outcome"], again.result["outcome"]],
+            "outcomes": [recorded.record.outcome, again.record.outcome],
             "differing_sections": differing,
             "first_difference": None
             if parting is None

@@ -60,7 +60,7 @@ class PlainRuns:
             self._last_s = now_s
 
 
-class LiveRuns:
+class _LiveRuns:
     """A bar over all runs that names the kernel, and the step before its first run.
 
     Args:
@@ -94,4 +94,4 @@ def runs_view(kernels: Sequence[str], runs: int) -> Iterator[RunsView]:
     make: Any = click.progressbar
     length = runs * len(kernels)
     with make(length=length, file=sys.stderr, item_show_func=lambda name: name) as bar:
-        yield LiveRuns(bar, kernels, runs)
+        yield _LiveRuns(bar, kernels, runs)

@@ -32,7 +32,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
         click.echo(json.dumps(record.result, indent=2, sort_keys=True))
         return
     lines = summary_lines(record.result)
-    if record.result.get("fault"):
+    if record.record.fault:
         golden = paired_golden(record, _note) if pair else kept_golden(record)
         if golden is None:
             lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import functools
 import gc
 import importlib
 import json
@@ -53,6 +54,7 @@ from mavfi_cli.core.processes import (
     call_this_process,
     die_with,
     end_children,
+    fork,
     threads,
 )
 
@@ -173,26 +175,30 @@ def main() -> NoReturn:
         packet, channels, _, _ = socket.recv_fds(control, PACKET, 1)
         if not packet:
             os._exit(0)  # an orderly end would have native libraries complain of what is loaded
-        if os.fork() == 0:
-            control.close()
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            _guard(json.loads(packet), socket.socket(fileno=channels[0]), module)
+        fork(functools.partial(_guard, control, packet, channels[0], module))
         os.close(channels[0])
 
 
 # The guard ----------------------------------------------------------------------------------------
 
 
-def _guard(order: Mapping[str, Any], channel: socket.socket, module: _Module) -> NoReturn:
+def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Module) -> int:
+    """The whole life of a guard; the server's socket is not for it."""
+    control.close()
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    order, channel = json.loads(packet), socket.socket(fileno=descriptor)
     call_this_process(GUARD)
     become_reaper()
     begun_s, guard = time.monotonic(), os.getpid()
     reading, writing = os.pipe()
-    worker = os.fork()
-    if worker == 0:
+
+    def work() -> NoReturn:
+        """Do the work in the fork, without the guard's ends of channels."""
         channel.close()
         os.close(reading)
         _work(order, module, guard, writing)
+
+    worker = fork(work)
     os.close(writing)
     with contextlib.suppress(OSError):  # the client is gone: so will be the guard
         channel.send(json.dumps({"pid": worker}).encode())
@@ -209,7 +215,7 @@ def _guard(order: Mapping[str, Any], channel: socket.socket, module: _Module) ->
         told["wall_s"] = round(time.monotonic() - begun_s, 6)
         channel.send(json.dumps(told).encode())
     end_children()
-    os._exit(0)
+    return 0
 
 
 def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:

@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import socket
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,22 @@ ONE_THREAD = {
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 
 _LENGTH = 8
+
+
+def fork(work: Callable[[], int]) -> int:
+    """Do work in a fork of this process, which exits with the returned code, or 1 on an error.
+
+    Returns:
+        Process id of the fork.
+    """
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        code = work()
+    finally:
+        os._exit(code)
 
 
 def become_reaper() -> None:
@@ -103,3 +120,21 @@ def _exactly(connection: socket.socket, size: int) -> bytearray:
         filled += count
     view.release()
     return data
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[list[int]]:
+    """Turn Ctrl-C and SIGTERM into a request, so that a mission ends with a complete record.
+
+    Yields a list that is empty until a signal arrives. Has no effect outside the main thread.
+    """
+    asked: list[int] = []
+    previous: dict[signal.Signals, Any] = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with contextlib.suppress(ValueError):  # not the main thread
+            previous[number] = signal.signal(number, lambda n, _frame: asked.append(n))
+    try:
+        yield asked
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

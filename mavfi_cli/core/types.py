@@ -115,3 +115,16 @@ class Command:
     acceleration_enu_mps2: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,)
     pace: float = 1.0  # rate of the trajectory's clock while this command holds, 0..1
     skips_waypoint: bool = False  # True ends the current waypoint
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StackMark:
+    """Identity of the companion's stack. Error-free flights differ between stacks.
+
+    Attributes:
+        name: Name of the stack.
+        digest: SHA-256 of its settings. Equal digests mean equal stacks.
+    """
+
+    name: str
+    digest: str

@@ -38,7 +38,7 @@ _WORK = _B3 + COUNT
 
 
 @compiled
-def reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
+def _reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
     """Return the mean squared reconstruction error. Memory from `_WORK` on is scratch space."""
     work = memory[_WORK:]
     for place in range(COUNT):
@@ -74,7 +74,7 @@ def judge_tick(
 ) -> tuple[float, int]:
     """Compute the deltas of a tick and their score; see `FittedDetector.tick_judge`."""
     take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
-    error = reconstruction_error(memory, work[DELTA])
+    error = _reconstruction_error(memory, work[DELTA])
     return error, PASSED if error <= memory[0] else OF_CONTROL
 
 
@@ -91,7 +91,7 @@ def judge_plan(
     """Compute the steps of a plan and their scores; see `FittedDetector.plan_judge`."""
     count = plan_deltas(waypoints, first, work, steps, changes)
     for number in range(count):
-        scores[number] = reconstruction_error(memory, changes[number])
+        scores[number] = _reconstruction_error(memory, changes[number])
     return count
 
 
@@ -111,7 +111,7 @@ class AutoencoderDetector(FittedDetector):
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the reconstruction error: the mean square over the 13 scaled deltas."""
-        error: float = reconstruction_error(self._flat, deltas)
+        error: float = _reconstruction_error(self._flat, deltas)
         return error
 
     def learn(self, deltas: Codes, stage: Stage) -> None:

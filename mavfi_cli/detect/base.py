@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,19 +10,6 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect.preprocess import Codes
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StackMark:
-    """Identity of the companion's stack. Error-free flights differ between stacks.
-
-    Attributes:
-        name: Name of the stack.
-        digest: SHA-256 of its settings. Equal digests mean equal stacks.
-    """
-
-    name: str
-    digest: str
 
 
 class Detector(Protocol):

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.files import write_atomically
-from mavfi_cli.core.types import FloatArray, Stage
-from mavfi_cli.detect.base import StackMark
+from mavfi_cli.core.types import FloatArray, StackMark, Stage
 from mavfi_cli.detect.preprocess import COUNT, NAMES, Codes, PreprocessParams, states_digest
 from mavfi_cli.detect.watch import EXTENDED
 

@@ -13,9 +13,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from mavfi_cli.core.types import FloatArray
+from mavfi_cli.core.types import FloatArray, StackMark
 from mavfi_cli.detect import model as model_file
-from mavfi_cli.detect.base import StackMark
 from mavfi_cli.detect.watch import Ranges
 
 Shapes = dict[str, tuple[int, ...]]

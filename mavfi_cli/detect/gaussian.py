@@ -61,7 +61,7 @@ def farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
 
 
 @compiled
-def welford(memory: FloatArray, deltas: Codes, first: int, end: int) -> None:
+def _welford(memory: FloatArray, deltas: Codes, first: int, end: int) -> None:
     """Add one sample to the model of each state from `first` up to, not including, `end`."""
     for place in range(first, end):
         value = float(deltas[place])
@@ -91,11 +91,11 @@ def judge_tick(
         score = farthest(memory, deltas, _PLANNING, _CONTROL)
         if not score <= memory[0]:
             return score, OF_PLANNING
-        welford(memory, deltas, _PLANNING, _CONTROL)
+        _welford(memory, deltas, _PLANNING, _CONTROL)
     score = farthest(memory, deltas, _CONTROL, COUNT)
     if not score <= memory[0]:
         return score, OF_CONTROL
-    welford(memory, deltas, _CONTROL, COUNT)
+    _welford(memory, deltas, _CONTROL, COUNT)
     return score, PASSED
 
 
@@ -150,4 +150,4 @@ class GaussianDetector(FittedDetector):
     def learn(self, deltas: Codes, stage: Stage) -> None:
         """Apply equations 1 and 2 to each state of the stage."""
         first, end = span(stage)
-        welford(self._flat, deltas, first, end)
+        _welford(self._flat, deltas, first, end)

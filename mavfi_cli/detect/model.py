@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.types import FloatArray
-from mavfi_cli.detect.base import StackMark
+from mavfi_cli.core.types import FloatArray, StackMark
 from mavfi_cli.detect.preprocess import LIMIT, PreprocessParams, states_digest
 from mavfi_cli.detect.watch import EXTENDED, Ranges
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from mavfi_cli.autonomy.pilot import PilotMode
-from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
 from mavfi_cli.mission.progress import FlightProgress, Watcher
 from mavfi_cli.mission.record.events import EventLog
+
+if TYPE_CHECKING:
+    from mavfi_cli.companion.injection import NoInjection
+    from mavfi_cli.companion.pipeline import Companion
 
 PROGRESS_EVERY_S = 1.0
 

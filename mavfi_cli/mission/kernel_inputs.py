@@ -19,7 +19,7 @@ from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, derive
-from mavfi_cli.core.types import Outcome
+from mavfi_cli.mission.record.measures import record_of
 from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.mission import MissionConfig
@@ -34,9 +34,9 @@ def record_inputs(config: MissionConfig) -> KernelInputs:
     """
     recorder = Recorder()
     with tempfile.TemporaryDirectory(prefix="mavfi-golden-") as scratch:
-        result = fly_golden(config, Path(scratch), recorder)
-    if result["outcome"] != Outcome.SUCCESS.value:
-        raise TargetError("golden flight", f"ended with {result['outcome']}: {result['reason']}")
+        flight = record_of(fly_golden(config, Path(scratch), recorder))
+    if not flight.succeeded:
+        raise TargetError("golden flight", f"ended with {flight.outcome}: {flight.reason}")
     return _middle(flight_name(config), config, recorder)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
         RecordError: The run is not repeatable, because it flew a foreign autopilot, used measured
             times, or was interrupted by the user.
     """
-    values = dict(run.result["config"])
+    values = dict(run.record.config)
     if interrupted(run):
         raise RecordError(f"{run.folder.path}: an interrupted flight does not repeat")
     if values.get("link") is not None:
@@ -52,16 +52,7 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
 
 def interrupted(run: Run) -> bool:
     """Return True if the user interrupted the flight, so that the mission has no outcome."""
-    return bool(run.result["outcome"] == Outcome.INTERRUPTED.value)
-
-
-def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]) -> list[str]:
-    """Describe each library that differs between a record and this installation."""
-    return [
-        f"{name} was {recorded.get(name, 'absent')}, is {versions.get(name, 'absent')}"
-        for name in sorted({*recorded, *versions})
-        if recorded.get(name) != versions.get(name)
-    ]
+    return bool(run.record.outcome == Outcome.INTERRUPTED.value)
 
 
 def differing_results(this: dict[str, Any], other: dict[str, Any]) -> list[str]:
@@ -116,7 +107,7 @@ def _end(this: Run, other: Run, rows: int) -> Parting | None:
     """Compare length and outcome of two runs with equal traces so far."""
     assert this.trace is not None
     stamp_s = this.trace["stamp_s"][rows - 1].as_py() if rows else 0.0
-    ends = [str(run.result["outcome"]) for run in (this, other)]
+    ends = [run.record.outcome for run in (this, other)]
     if ends[0] != ends[1]:
         return Parting(stamp_s=stamp_s, column="outcome", this=ends[0], other=ends[1])
     lengths = [0 if run.trace is None else run.trace.num_rows for run in (this, other)]

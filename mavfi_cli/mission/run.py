@@ -5,13 +5,10 @@ from __future__ import annotations
 import contextlib
 import datetime
 import functools
-import importlib.metadata
 import json
 import os
 import platform as host_platform
 import resource
-import signal
-import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -21,15 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli import __version__
 from mavfi_cli.autonomy import is_compiled, planners, warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
+from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome
+from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record import quality
+from mavfi_cli.mission.record.measures import record_of
 from mavfi_cli.mission.record.plan_file import write_plans
 from mavfi_cli.mission.record.run_folder import CRASH, RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.record.statistics import mission_statistics, plan_lines
@@ -41,7 +40,6 @@ from mavfi_cli.spec.mission import MissionConfig, stack_of
 from mavfi_cli.spec.platform import load_platform
 
 COMPILING = "compiling the kernels, once on this machine: this takes a while"
-_VERSIONS = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")
 
 
 def fly_mission(
@@ -193,9 +191,10 @@ def fly_golden(
     """
     flown = fly_mission(config, out, Watcher(), recorder=recorder, launch=launch)
     result: dict[str, Any] = json.loads(flown.result.read_text())
-    if result["outcome"] == Outcome.INTERRUPTED.value:
+    flight = record_of(result)
+    if flight.outcome == Outcome.INTERRUPTED.value:
         raise Interrupted("interrupted")
-    if result["referee"] is None:
+    if flight.referee is None:
         raise VehicleProcessError("the vehicle process of the golden flight died")
     return result
 
@@ -210,24 +209,6 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
         flight.end(Outcome.CRASH, f"{type(error).__name__}: {error}")
         return traceback.format_exc()
     return None
-
-
-@contextlib.contextmanager
-def interruptible() -> Iterator[list[int]]:
-    """Turn Ctrl-C and SIGTERM into a request, so that a mission ends with a complete record.
-
-    Yields a list that is empty until a signal arrives. Has no effect outside the main thread.
-    """
-    asked: list[int] = []
-    previous: dict[signal.Signals, Any] = {}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        with contextlib.suppress(ValueError):  # not the main thread
-            previous[number] = signal.signal(number, lambda n, _frame: asked.append(n))
-    try:
-        yield asked
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, Any] | None]:
@@ -295,11 +276,3 @@ def _write(
     if errors := [text for text in (*told, crash) if text]:
         (folder.path / CRASH).write_text("\n".join(errors))
     folder.write_result(result)
-
-
-def installed_versions() -> dict[str, str]:
-    """Return the versions of all libraries that a record depends on."""
-    versions = {"mavfi": __version__, "python": sys.version.split()[0]}
-    for name in _VERSIONS:
-        versions[name] = importlib.metadata.version(name)
-    return versions

@@ -23,10 +23,10 @@ _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 def write_kernel_plot(summary: Mapping[str, Any], path: Path) -> None:
     """Write the plot of a kernel campaign as SVG, atomically. Equal summaries give equal bytes."""
-    write_svg(draw_kernel_plot(summary), path)
+    write_svg(_draw_kernel_plot(summary), path)
 
 
-def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
+def _draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
     """Draw a figure with one bar per kernel and the shares of its injected runs in per cent."""
     from matplotlib.figure import Figure
 

@@ -19,10 +19,10 @@ _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
 
 def write_roofline_plot(report: Mapping[str, Any], path: Path) -> None:
     """Write the plot of a model report as SVG, atomically. Equal reports give equal bytes."""
-    write_svg(draw_roofline_plot(report), path)
+    write_svg(_draw_roofline_plot(report), path)
 
 
-def draw_roofline_plot(report: Mapping[str, Any]) -> Figure:
+def _draw_roofline_plot(report: Mapping[str, Any]) -> Figure:
     """Draw a figure with throughput in Hz and velocity in m/s on logarithmic axes."""
     from matplotlib.figure import Figure
 

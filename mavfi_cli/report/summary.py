@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 from typing import Any
 
-from mavfi_cli.core.columns import WIDTH
 from mavfi_cli.fi.tracer.symbols import short_name
-from mavfi_cli.mission.record.detection_cost import detection_cost
+from mavfi_cli.mission.record.detection_cost import DetectionCost, detection_cost
+from mavfi_cli.mission.record.measures import FlightRecord, record_of
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.replay import first_difference, largest_deviation_m
+from mavfi_cli.report.tables.columns import WIDTH
 
+Section = Mapping[str, Any]
 _INDENT = 12 * " "
 _OUTCOMES = {
     "success": "SUCCESS: reached the goal",
@@ -31,14 +34,15 @@ def _number(value: Any, unit: str, digits: int = 1) -> str:
 
 def outcome_line(result: dict[str, Any]) -> str:
     """Return the outcome and its reason in one line."""
-    text = _OUTCOMES.get(result["outcome"], result["outcome"])
-    reason = result.get("reason") or ""
-    return f"{text} ({reason})" if reason else text
+    flight = record_of(result)
+    text = _OUTCOMES.get(flight.outcome, flight.outcome)
+    return f"{text} ({flight.reason})" if flight.reason else text
 
 
 def summary_lines(result: dict[str, Any]) -> list[str]:
     """Return outcome, quality of flight, pipeline figures and cost on this machine."""
-    config = result["config"]
+    flight = record_of(result)
+    config = flight.config
     flown = f"{config['vehicle']} in {config['world']}, seed {config['seed']}"
     if config["link"] is not None:
         flown = f"foreign autopilot at {config['link']}, seed {config['seed']}"
@@ -46,19 +50,19 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
         outcome_line(result),
         "",
         f"Mission     {flown}; planner {config['planner']}, platform {config['platform']}",
-        *_flight_lines(result),
+        *_flight_lines(flight),
     ]
-    lines += fault_lines(result)
-    lines += node_lines(result)
-    lines += detection_lines(result)
-    response = result.get("response_time_s") or {}
+    lines += _fault_lines(flight.fault)
+    lines += _node_lines(flight.nodes)
+    lines += _detection_lines(flight.detection, detection_cost(result))
+    response = flight.response_time_s
     if response.get("median") is not None:
         lines.append(
             f"Response    {response['median'] * 1e3:.0f} ms from depth frame to setpoint "
             f"(median), {response['p95'] * 1e3:.0f} ms (95th percentile)"
         )
-    lines += measured_lines(result)
-    lines += _host_lines(result)
+    lines += _measured_lines(flight.measured_platform)
+    lines += _host_lines(flight)
     return [part for line in lines for part in _folded(line)]
 
 
@@ -69,24 +73,24 @@ def _folded(line: str) -> list[str]:
     ) or [""]
 
 
-def _host_lines(result: dict[str, Any]) -> list[str]:
+def _host_lines(flight: FlightRecord) -> list[str]:
     """Return the host time of the flight."""
-    host = result["host"]
-    if host.get("flight_wall_s"):
-        factor = result["simulated_s"] / host["flight_wall_s"]
+    host, simulated_s = flight.host, flight.simulated_s
+    if host.get("flight_wall_s") and simulated_s is not None:
+        factor = simulated_s / host["flight_wall_s"]
         return [
-            f"Host        {host['flight_wall_s']:.2f} s for {result['simulated_s']:.1f} simulated "
+            f"Host        {host['flight_wall_s']:.2f} s for {simulated_s:.1f} simulated "
             f"seconds: {factor:.0f} times real time, after {host['startup_s']:.1f} s of start-up"
         ]
     return []
 
 
-def _flight_lines(result: dict[str, Any]) -> list[str]:
+def _flight_lines(flight: FlightRecord) -> list[str]:
     """Return quality of flight and counts of plans, or one line if there was no flight."""
-    qof, counters = result["quality_of_flight"], result["pilot"]
+    qof, counters = flight.quality_of_flight, flight.pilot
     if qof["flight_time_s"] is None:
         return ["Flight      none: the mission ended before the companion took over"]
-    flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in result["events"])
+    flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in flight.events)
     asked, failed = counters["plans_requested"], counters["plans_failed"]
     return [
         f"Flight      {_number(qof['flight_time_s'], 's')}, "
@@ -100,7 +104,7 @@ def _flight_lines(result: dict[str, Any]) -> list[str]:
     ]
 
 
-def _clearance_and_energy(qof: dict[str, Any]) -> list[str]:
+def _clearance_and_energy(qof: Section) -> list[str]:
     """Return clearance and energy, which are unknown for a foreign autopilot."""
     clearance, energy = "not known", "not known"
     if qof["min_clearance_m"] is not None:
@@ -113,9 +117,8 @@ def _clearance_and_energy(qof: dict[str, Any]) -> list[str]:
     return [f"Clearance   {clearance}", f"Energy      {energy}"]
 
 
-def measured_lines(result: dict[str, Any]) -> list[str]:
+def _measured_lines(measured: Section) -> list[str]:
     """Return the kernel medians of a platform measured on the host."""
-    measured = result.get("measured_platform")
     if not measured:
         return []
     medians = ", ".join(
@@ -124,10 +127,10 @@ def measured_lines(result: dict[str, Any]) -> list[str]:
     return [f"Measured    {medians} (medians on this host), x {measured['factor']:g} in the flight"]
 
 
-def node_lines(result: dict[str, Any]) -> list[str]:
+def _node_lines(nodes: Section) -> list[str]:
     """Return the crashes and hangs of each node."""
     lines = []
-    for name, node in (result.get("nodes") or {}).items():
+    for name, node in nodes.items():
         ends = [f"{c['how']} at {c['stamp_s']:.2f} s" for c in node["crashes"][:3]]
         if len(node["crashes"]) > 3:
             ends.append(f"{len(node['crashes']) - 3} more crashes")
@@ -138,9 +141,8 @@ def node_lines(result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def detection_lines(result: dict[str, Any]) -> list[str]:
+def _detection_lines(detection: Section, cost: DetectionCost | None) -> list[str]:
     """Return the detector's alarms, its recomputations, and the host time of its checks."""
-    detection = result.get("detection")
     if not detection:
         return []
     responses = detection["responses"]
@@ -164,7 +166,6 @@ def detection_lines(result: dict[str, Any]) -> list[str]:
             f"            recovered {'; '.join(recovered)}; {responses['hold']} holds, "
             f"{responses['accept']} accepted after all"
         )
-    cost = detection_cost(result)
     if cost is not None:
         lines.append(
             f"            {1e6 * cost.check_host_s:.1f} us a check here, "
@@ -179,12 +180,11 @@ def _kilo(value: float | None) -> float | None:
 
 def event_lines(result: dict[str, Any]) -> list[str]:
     """Return one line per event with its simulated time."""
-    return [f"{e['stamp_s']:9.2f} s  {e['kind']:<10} {e['text']}" for e in result["events"]]
+    return [f"{e['stamp_s']:9.2f} s  {e['kind']:<10} {e['text']}" for e in record_of(result).events]
 
 
-def fault_lines(result: dict[str, Any]) -> list[str]:
+def _fault_lines(fault: Section) -> list[str]:
     """Return the requested fault and its strikes."""
-    fault = result.get("fault")
     if not fault:
         return []
     if fault["level"] == "instruction":
@@ -214,7 +214,7 @@ def fault_lines(result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _activation(fault: dict[str, Any]) -> str:
+def _activation(fault: Section) -> str:
     """Return the activation: whether any node read the corrupted value."""
     reader = fault["activation"]["first_reader"]
     if reader is not None:
@@ -227,7 +227,7 @@ def _activation(fault: dict[str, Any]) -> str:
     }[fault["activation"]["activation"]]
 
 
-def _instruction_lines(fault: dict[str, Any]) -> list[str]:
+def _instruction_lines(fault: Section) -> list[str]:
     """Return the drawn instruction-level fault, its population and its effect."""
     lines = [
         f"Fault       node {fault['node']}, invocation {fault['invocation']} of "
@@ -250,7 +250,7 @@ def _instruction_lines(fault: dict[str, Any]) -> list[str]:
     ]
 
 
-def _place(fault: dict[str, Any]) -> str:
+def _place(fault: Section) -> str:
     """Return the place of an instruction: function and offset, or offset in its object."""
     if not fault["symbol"]:
         return f"{fault['object']}+{fault['offset']:#x}"
@@ -284,7 +284,8 @@ def _formatted(change: dict[str, Any], when: str) -> str:
 def difference_lines(run: Run, golden: Run) -> list[str]:
     """Compare a run with its golden run: first difference, deviation and outcome."""
     parting = first_difference(run, golden)
-    fault = run.result["fault"] or {}
+    ours, theirs = run.record, golden.record
+    fault = ours.fault
     if parting is None or first_difference(run, golden, leave_out=fault.get("states", ())) is None:
         why = _no_effect(fault) if fault else "none"
         return [f"Effect      {why}: nothing else ever differs from the golden flight"]
@@ -293,17 +294,17 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
         f"{_pair(parting.this, parting.other)}",
         f"            at most {largest_deviation_m(run, golden):.2f} m off the golden path",
     ]
-    ours, theirs = run.result["quality_of_flight"], golden.result["quality_of_flight"]
-    if ours["flight_time_s"] and theirs["flight_time_s"]:
-        change = 100.0 * (ours["flight_time_s"] / theirs["flight_time_s"] - 1.0)
+    our_s, their_s = (each.quality_of_flight["flight_time_s"] for each in (ours, theirs))
+    if our_s and their_s:
+        change = 100.0 * (our_s / their_s - 1.0)
         lines.append(
-            f"            {ours['flight_time_s']:.1f} s and {run.result['outcome']} instead of "
-            f"{theirs['flight_time_s']:.1f} s and {golden.result['outcome']} ({change:+.1f} %)"
+            f"            {our_s:.1f} s and {ours.outcome} instead of "
+            f"{their_s:.1f} s and {theirs.outcome} ({change:+.1f} %)"
         )
     return lines
 
 
-def _no_effect(fault: dict[str, Any]) -> str:
+def _no_effect(fault: Section) -> str:
     """Return why a fault had no effect: not injected, not activated, or masked."""
     if fault["state"] == "not_injected":
         return "none, not injected"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mavfi_cli.mission.record.measures import FlightRecord
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.report.drawing import write_svg
 
@@ -49,18 +50,19 @@ def draw_top_view(run: Run) -> Figure:
     figure = Figure(figsize=(6.4, 6.0), layout="constrained")
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
     axes = figure.add_subplot()
-    world = run.result.get("world") or {}
+    flight = run.record
+    world = flight.world
     positions, speeds = path_of(run)
     draw_obstacles(axes, world, positions)
-    _draw_plans(axes, run.result.get("plans", []))
+    _draw_plans(axes, flight.plans)
     if len(positions) > 1:
-        _draw_path(figure, axes, positions, speeds, run.result["config"]["v_max_mps"])
-    draw_places(axes, run.result, positions)
-    draw_end(axes, run.result, positions)
+        _draw_path(figure, axes, positions, speeds, flight.config["v_max_mps"])
+    draw_places(axes, flight, positions)
+    draw_end(axes, flight, positions)
     for kind in _MARKS:
-        draw_marks(axes, run.result["events"], kind)
+        draw_marks(axes, flight.events, kind)
     frame(axes, world, positions)
-    _caption(figure, axes, run.result)
+    _caption(figure, axes, flight)
     return figure
 
 
@@ -83,7 +85,7 @@ def path_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
     return positions[known], speeds[known]
 
 
-def draw_obstacles(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
+def draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
     """Draw the boxes of a world, pale if they end below the positions (n, 3) m of the flight."""
     from matplotlib.patches import Rectangle
 
@@ -98,7 +100,7 @@ def draw_obstacles(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> 
         )  # fmt: skip
 
 
-def _draw_plans(axes: Axes, plans: list[dict[str, Any]]) -> None:
+def _draw_plans(axes: Axes, plans: Sequence[Mapping[str, Any]]) -> None:
     for number, plan in enumerate(plans):
         points = np.array(plan["points_enu_m"], dtype=float)
         if len(points):
@@ -128,14 +130,13 @@ def _draw_path(
     bar.outline.set_linewidth(0.4)
 
 
-def draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> None:
+def draw_places(axes: Axes, flight: FlightRecord, positions: np.ndarray) -> None:
     """Mark start and goal of a flight with positions (n, 3) m."""
     from matplotlib.patches import Circle
 
-    world = result.get("world") or {}
-    goal = result.get("goal_enu_m") or world.get("goal")
+    goal = flight.goal_enu_m or flight.world.get("goal")
     if goal:
-        tolerance = result["config"]["goal_tolerance_m"]
+        tolerance = flight.config["goal_tolerance_m"]
         axes.add_patch(
             Circle((goal[0], goal[1]), tolerance, fill=False, color=_GOOD, linewidth=1.0, zorder=3)
         )
@@ -148,12 +149,12 @@ def draw_places(axes: Axes, result: dict[str, Any], positions: np.ndarray) -> No
         )  # fmt: skip
 
 
-def draw_end(axes: Axes, result: dict[str, Any], positions: np.ndarray, colour: str = _BAD) -> None:
+def draw_end(axes: Axes, flight: FlightRecord, positions: np.ndarray, colour: str = _BAD) -> None:
     """Mark the end of a failed flight with positions (n, 3) m."""
-    if len(positions) and result["outcome"] != "success":
+    if len(positions) and not flight.succeeded:
         axes.scatter(
             [positions[-1, 0]], [positions[-1, 1]], marker="X", s=90, color=colour,
-            edgecolors="white", linewidths=0.8, zorder=7, label=result["outcome"],
+            edgecolors="white", linewidths=0.8, zorder=7, label=flight.outcome,
         )  # fmt: skip
 
 
@@ -167,7 +168,7 @@ def draw_marks(axes: Axes, events: Iterable[dict[str, Any]], kind: str, **style:
     return places
 
 
-def frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
+def frame(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
     """Set the limits round world and positions (n, 3) m, equal scales and plain axes."""
     places = [positions[:, :2]] if len(positions) else []
     places += [np.array([world[key][:2]], dtype=float) for key in ("start", "goal") if key in world]
@@ -188,19 +189,19 @@ def frame(axes: Axes, world: dict[str, Any], positions: np.ndarray) -> None:
     axes.tick_params(color="#aab1bd", labelsize=8)
 
 
-def place_of(result: dict[str, Any]) -> str:
+def place_of(flight: FlightRecord) -> str:
     """Return world and seed of a flight as text."""
-    config = result["config"]
+    config = flight.config
     world = config["link"] or config["world"].removesuffix(".toml").rpartition("/")[2]
     return f"{world}, seed {config['seed']}"
 
 
-def _caption(figure: Figure, axes: Axes, result: dict[str, Any]) -> None:
-    qof = result["quality_of_flight"]
+def _caption(figure: Figure, axes: Axes, flight: FlightRecord) -> None:
+    qof = flight.quality_of_flight
     time_s, distance_m = qof["flight_time_s"], qof["distance_m"]
     figures = "" if time_s is None else f", {time_s:.1f} s, {distance_m:.1f} m"
     axes.set_title(
-        f"{place_of(result)}: {result['outcome'].replace('_', ' ')}{figures}",
+        f"{place_of(flight)}: {flight.outcome.replace('_', ' ')}{figures}",
         fontsize=10, loc="left",
     )  # fmt: skip
     figure.legend(

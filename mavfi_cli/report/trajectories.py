@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mavfi_cli.mission.record.measures import FlightRecord
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.report.drawing import DETECTORS, INK, write_svg
 from mavfi_cli.report.top_view import (
@@ -75,7 +76,7 @@ def draw_trajectories(panels: Sequence[Panel]) -> Figure:
         else:
             axes.set_axis_off()
     _explain_marks(figure)
-    figure.suptitle(place_of(panels[0].flights[0][1].result), fontsize=11)
+    figure.suptitle(place_of(panels[0].flights[0][1].record), fontsize=11)
     return figure
 
 
@@ -85,7 +86,7 @@ def _colours(panels: Sequence[Panel]) -> dict[str, str]:
     turn = itertools.cycle(_COLOURS)
     for name, run in (flight for panel in panels for flight in panel.flights):
         if name not in colours:
-            detector = (run.result.get("detection") or {}).get("detector")
+            detector = run.record.detection.get("detector")
             own = DETECTORS.get(detector) if detector else None
             colours[name] = own if own and own not in colours.values() else next(turn)
     return colours
@@ -93,12 +94,12 @@ def _colours(panels: Sequence[Panel]) -> dict[str, str]:
 
 def lines(panels: Sequence[Panel]) -> list[str]:
     """Describe the picture: world and seed, and outcome, time and folder of every flight."""
-    text = [place_of(panels[0].flights[0][1].result)]
+    text = [place_of(panels[0].flights[0][1].record)]
     for panel in panels:
         text += [f"fault: {panel.title}"] if panel.title else []
         golden_s = _golden_s([run for _, run in panel.flights])
         text += [
-            f"  {_legend_entry(name, run.result, golden_s)}  {run.folder.path}"
+            f"  {_legend_entry(name, run.record, golden_s)}  {run.folder.path}"
             for name, run in panel.flights
         ]
     return text
@@ -110,21 +111,21 @@ def _draw_panel(
     runs = [run for _, run in panel.flights]
     paths = [path_of(run)[0] for run in runs]
     everywhere = np.concatenate(paths)
-    first = runs[0].result
+    first = runs[0].record
     golden_s = _golden_s(runs)
-    draw_obstacles(axes, first.get("world") or {}, everywhere)
+    draw_obstacles(axes, first.world, everywhere)
     handles = []
     for place, ((name, run), positions) in enumerate(zip(panel.flights, paths, strict=True)):
         handles += axes.plot(
             positions[:, 0], positions[:, 1], color=colours[name], zorder=4.0 + 0.01 * place,
             linewidth=max(_LEAST, _WIDEST - _STEP * place), alpha=0.5 if place == 0 else 1.0,
             solid_capstyle="round", solid_joinstyle="round", gid=f"flight-{number}-{place}",
-            label=_legend_entry(name, run.result, golden_s),
+            label=_legend_entry(name, run.record, golden_s),
         )  # fmt: skip
-        draw_end(axes, run.result, positions, colours[name])
+        draw_end(axes, run.record, positions, colours[name])
     draw_places(axes, first, paths[0])
     _draw_marks(figure, axes, panel, colours)
-    frame(axes, first.get("world") or {}, everywhere)
+    frame(axes, first.world, everywhere)
     if panel.title:
         axes.set_title(f"fault: {panel.title}", fontsize=9.5, loc="left")
     axes.legend(
@@ -142,7 +143,7 @@ def _draw_marks(figure: Figure, axes: Axes, panel: Panel, colours: Mapping[str, 
         for name, run in panel.flights:
             beside = offset_copy(axes.transData, figure, right, up, units="points")
             places = draw_marks(
-                axes, run.result["events"], kind, facecolors=colours[name], edgecolors=INK,
+                axes, run.record.events, kind, facecolors=colours[name], edgecolors=INK,
                 linewidths=0.6, transform=beside,
             )  # fmt: skip
             for place in places:
@@ -171,20 +172,19 @@ def _explain_marks(figure: Figure) -> None:
 def _golden_s(runs: Sequence[Run]) -> float | None:
     """Return the flight time of the golden flight if it succeeded, else None."""
     for run in runs:
-        if not (run.result.get("fault") or run.result.get("detection")):
-            time_s = run.result["quality_of_flight"]["flight_time_s"]
-            return time_s if run.result["outcome"] == "success" else None
+        if (flight := run.record).golden:
+            time_s: float | None = flight.quality_of_flight["flight_time_s"]
+            return time_s if flight.succeeded else None
     return None
 
 
-def _legend_entry(name: str, result: Mapping[str, Any], golden_s: float | None) -> str:
+def _legend_entry(name: str, flight: FlightRecord, golden_s: float | None) -> str:
     """Return the legend entry of a flight: setting, outcome and flight time."""
-    time_s = result["quality_of_flight"]["flight_time_s"]
-    entry = f"{name}: {result['outcome'].replace('_', ' ')}"
+    time_s = flight.quality_of_flight["flight_time_s"]
+    entry = f"{name}: {flight.outcome.replace('_', ' ')}"
     if time_s is None:
         return entry
     entry += f", {time_s:.1f} s"
-    golden = not (result.get("fault") or result.get("detection"))
-    if golden or golden_s is None or result["outcome"] != "success":
+    if flight.golden or golden_s is None or not flight.succeeded:
         return entry
     return f"{entry} ({100.0 * (time_s / golden_s - 1.0):+.1f} %)"

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import ConfigError, OtherStack, UnknownName
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.fitted import FittedDetector
-from mavfi_cli.detect.model import shipped, shipped_stacks
-from mavfi_cli.detect.registry import find
-from mavfi_cli.detect.watch import ExtendedWatch
 from mavfi_cli.spec.stack import lineage, load_stack
+
+if TYPE_CHECKING:
+    from mavfi_cli.detect.base import Detector
+    from mavfi_cli.detect.watch import ExtendedWatch
 
 STAGES = tuple(stage.value for stage in Stage)
 PAPER, EXTENDED = "paper", "extended"  # sets of watched states
@@ -68,6 +68,8 @@ def model_path(config: DetectorConfig, stack: str) -> Path | None:
         config: Configuration of the detector.
         stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
     """
+    from mavfi_cli.detect.model import shipped, shipped_stacks
+
     if config.model is not None:
         return Path(config.model)
     for each in lineage(load_stack(stack)):
@@ -89,6 +91,9 @@ def detector_of(config: DetectorConfig, stack: str) -> Detector:
         ModelError: The model cannot be used.
         ConfigError: The threshold is out of range, or the model lacks ranges of extended states.
     """
+    from mavfi_cli.detect.fitted import FittedDetector
+    from mavfi_cli.detect.registry import find
+
     path = model_path(config, stack)
     detector = find(config.name, model=path, threshold=config.threshold)
     made_for = detector.stack if isinstance(detector, FittedDetector) else None
@@ -107,6 +112,9 @@ def watch_of(config: DetectorConfig, detector: Detector) -> ExtendedWatch | None
     Raises:
         ConfigError: The model lacks ranges of the extended states.
     """
+    from mavfi_cli.detect.fitted import FittedDetector
+    from mavfi_cli.detect.watch import ExtendedWatch
+
     if config.watch == PAPER:
         return None
     ranges = detector.extended if isinstance(detector, FittedDetector) else None

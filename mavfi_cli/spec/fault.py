@@ -111,8 +111,8 @@ class FaultConfig:
             )
 
     def trigger(self) -> Trigger:
-        """Return the trigger. Raises as `parse_trigger`."""
-        return parse_trigger(self.at)
+        """Return the trigger. Raises UnknownName and FaultSpecError."""
+        return _parse_trigger(self.at)
 
     def corruption(self) -> Corruption:
         """Return the corruption of the value. Raises UnknownName and FaultSpecError."""
@@ -149,7 +149,7 @@ class FaultConfig:
         )
 
 
-def parse_trigger(text: str) -> Trigger:
+def _parse_trigger(text: str) -> Trigger:
     """Parse a trigger such as `time=12.5`.
 
     Raises:

@@ -18,7 +18,7 @@ from typing import Any
 
 from mavfi_cli.core.config import read_toml, shipped_names, shipped_path, structure
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
-from mavfi_cli.detect.base import StackMark
+from mavfi_cli.core.types import StackMark
 from mavfi_cli.spec.platform import KERNELS
 
 DEFAULT = "mavbench"

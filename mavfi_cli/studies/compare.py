@@ -19,8 +19,8 @@ from mavfi_cli.campaign.missions import PlannedMission, ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
 from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.run import installed_versions
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.studies.compare_plan import ComparePlan
 

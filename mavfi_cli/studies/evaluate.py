@@ -28,7 +28,7 @@ from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
 from mavfi_cli.campaign.specification import Keep
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.mission.run import installed_versions
+from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.studies.evaluation_plan import EvaluationPlan, Fault, require_held_out
 
 SCHEMA = 1

@@ -80,7 +80,7 @@ class TrainedDetectors:
     failed: int
 
 
-def fly_training(
+def _fly_training(
     plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
 ) -> tuple[Dataset, int]:
     """Fly the missing flights, and collect the samples of those that reached the goal.
@@ -131,7 +131,7 @@ def train(
         RecordError: a file cannot be written.
     """
     check(plan.kinds, len(plan.missions()), plan.n_sigma)
-    dataset, failed = fly_training(plan, folder, options, spectator)
+    dataset, failed = _fly_training(plan, folder, options, spectator)
     fitted = {}
     for kind in plan.kinds:
         spectator.on_note(f"fitting {kind}")

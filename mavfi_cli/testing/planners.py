@@ -37,7 +37,7 @@ def wall_with_gap(gap_m: float = 4.0) -> MapSnapshot:
     return snapshot_of(np.vstack([below, above]))
 
 
-def closed_box(around: FloatArray, half: float = 3.0) -> MapSnapshot:
+def _closed_box(around: FloatArray, half: float = 3.0) -> MapSnapshot:
     """Six walls round a point."""
     faces = []
     for axis in range(3):
@@ -120,7 +120,7 @@ class PlannerContract:
         assert other.stdout.strip() == here.path_enu_m.tobytes().hex()
 
     def test_a_closed_box_is_an_honest_failure(self, name: str) -> None:
-        result = planners.find(name).plan(posed(closed_box(START)), 1)
+        result = planners.find(name).plan(posed(_closed_box(START)), 1)
         assert not result.found
         assert len(result.path_enu_m) == 0
         assert result.reason

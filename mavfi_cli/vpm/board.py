@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.core.config import load_shipped, shipped_names
+from mavfi_cli.core.config import load_shipped
 from mavfi_cli.spec.platform import HARDWARE, PlatformProfile, check_hardware
 
 _FOLDER = Path(__file__).parent / "boards"
@@ -43,11 +43,6 @@ class Board:
             sources=sources,
             **{key: getattr(platform, key) if platform.carried else 0.0 for key in HARDWARE},
         )
-
-
-def board_names() -> list[str]:
-    """The shipped boards, in alphabetical order."""
-    return shipped_names(_FOLDER)
 
 
 def load_board(name_or_path: str) -> Board:

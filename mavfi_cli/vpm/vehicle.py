@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.core.config import load_shipped, shipped_names
+from mavfi_cli.core.config import load_shipped
 from mavfi_cli.spec.platform import LARGEST
 
 CALIBRATED = ("rotor_pull_n", "response_s")  # the parameters that a calibration may set
@@ -83,11 +83,6 @@ class ModelVehicle:
     def tilt_rad(self) -> float:
         """Angle between the thrust and the vertical, rad."""
         return math.radians(self.tilt_deg)
-
-
-def vehicle_names() -> list[str]:
-    """The shipped vehicles of the model, in alphabetical order."""
-    return shipped_names(_FOLDER)
 
 
 def load_vehicle(name_or_path: str) -> ModelVehicle:

@@ -15,7 +15,7 @@ from mavfi_cli.link.transport import open_listener, open_transport
 from sitl.autopilot.streams import Preset
 from sitl.server.client import Client
 from sitl.server.loops import Door, EmbeddedVehicle, Realtime, run_lockstep
-from sitl.server.options import Options, parse
+from sitl.server.options import ServerOptions, parse
 from sitl.server.simulation import Simulation
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _serve(options: Options) -> None:
+def _serve(options: ServerOptions) -> None:
     """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
     stopped = _stop_on_signals()
     simulation = _simulation(options)
@@ -88,7 +88,7 @@ def warm_up() -> None:
         simulation.advance()
 
 
-def _simulation(options: Options) -> Simulation:
+def _simulation(options: ServerOptions) -> Simulation:
     world = load_world(
         options.world,
         seed=options.seed,
@@ -113,7 +113,7 @@ def _stop_on_signals() -> Callable[[], bool]:
     return lambda: bool(seen)
 
 
-def _lockstep(options: Options, simulation: Simulation, stopped: Callable[[], bool]) -> None:
+def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
     transport = open_transport(f"fd:{options.fd}")
     client = Client(simulation, transport, Preset.LOCKSTEP)
     try:
@@ -128,7 +128,7 @@ def _lockstep(options: Options, simulation: Simulation, stopped: Callable[[], bo
         client.close()
 
 
-def _realtime(options: Options, simulation: Simulation, stopped: Callable[[], bool]) -> None:
+def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
     key = None if options.key_file is None else key_from_file(options.key_file)
     doors: list[Door] = []
     server = Realtime(simulation, doors, speed=options.speed or 1.0)
@@ -152,7 +152,7 @@ def _signing_maker(key: bytes | None) -> Callable[[], Signing | None]:
     return lambda: None if key is None else Signing(key, clock=time.time)
 
 
-def _announce(options: Options, simulation: Simulation) -> None:
+def _announce(options: ServerOptions, simulation: Simulation) -> None:
     world = simulation.referee.world
     links = []
     for preset, url in options.links:

@@ -21,7 +21,7 @@ _Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Options:
+class ServerOptions:
     """The parsed options of the user."""
 
     world: str
@@ -42,10 +42,10 @@ class Options:
     allow_unsigned: bool
 
 
-def parse(arguments: Sequence[str]) -> Options:
+def parse(arguments: Sequence[str]) -> ServerOptions:
     """Parse a command line; exit with code 2 if it is not valid."""
     parser = _parser()
-    options = Options(**vars(parser.parse_args(arguments)))
+    options = ServerOptions(**vars(parser.parse_args(arguments)))
     links, speed = options.links, options.speed
     if options.lockstep:
         if options.fd is None:

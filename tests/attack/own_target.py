@@ -7,7 +7,7 @@ from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.target import Golden, RunLimits, RunVerdict, digest, judged
 from mavfi_cli.fi.tracer.image import Image, scope_of
-from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
+from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class OwnPlace:
 
     def __init__(self, target):
         self.target, self.name = target, target.name
-        self._command = Command.of([str(target.program), "30"])
+        self._command = Program.of([str(target.program), "30"])
         self._output = target.scratch / f"output-{id(self)}"
 
     def start(self):

@@ -9,11 +9,11 @@ from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import golden_run
 from mavfi_cli.attack.comparison import OutputComparison, absolute_arguments, magnitude
-from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.cli.kernels import kernels
 from mavfi_cli.core.errors import ConfigError, TargetError
-from mavfi_cli.fi.tracer.spawn import Command
+from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Ended
 
 
@@ -28,7 +28,7 @@ def place(native_program, tmp_path):
         path.write_text(f"#!/bin/sh\n{script}\n")
         path.chmod(0o755)
         target = ProgramTarget(
-            command=Command.of([str(path)]),
+            command=Program.of([str(path)]),
             comparison=OutputComparison.of(outputs, **options),
         )
         places.append(target.open())
@@ -138,7 +138,7 @@ def test_a_file_that_a_faulty_run_does_not_write_is_no_benign_outcome(place):
     golden = golden_run(where)
     assert golden.output == b""
     where.start().kill()  # in a new folder, before it writes
-    assert where.judge(golden, Ended(exit_code=0, signal=None)).outcome is Outcome.SDC
+    assert where.judge(golden, Ended(exit_code=0, signal=None)).outcome is RunOutcome.SDC
 
 
 def test_several_outputs_are_compared(command, place):
@@ -183,7 +183,7 @@ def test_standard_input_is_a_file(command, tmp_path):
 def test_standard_input_reaches_the_program(native_program, tmp_path):
     given = tmp_path / "given.txt"
     given.write_text("21\n")
-    program = Command.of([str(native_program("writing")), "o"], stdin=given)
+    program = Program.of([str(native_program("writing")), "o"], stdin=given)
     where = Workplace(ProgramTarget(command=program, comparison=OutputComparison.of(["file:o"])))
     assert golden_run(where).output == b"21 42\n"
     where.close()

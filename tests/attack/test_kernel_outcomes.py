@@ -11,22 +11,22 @@ from mavfi_cli.attack import served
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import InstructionFault, Role, Stage, explicit_corruption
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, explicit_corruption
 
 KNOWN = Path(__file__).parent / "known_kernel.py"
 # In each, r10 is set once: corrupted after that, it is never read, dereferenced, waited for or
 # returned.
 BODIES = {
-    Outcome.BENIGN: 'long r = 7; __asm__ volatile("mov $1, %%r10" ::: "r10"); return r;',
-    Outcome.CRASH: 'static long v = 7; long r, *p = &v; __asm__ volatile('
+    RunOutcome.BENIGN: 'long r = 7; __asm__ volatile("mov $1, %%r10" ::: "r10"); return r;',
+    RunOutcome.CRASH: 'static long v = 7; long r, *p = &v; __asm__ volatile('
     '"mov %1, %%r10; mov (%%r10), %0" : "=r"(r) : "r"(p) : "r10"); return r;',
-    Outcome.HANG: 'long r = 7; __asm__ volatile('
+    RunOutcome.HANG: 'long r = 7; __asm__ volatile('
     '"mov $0, %%r10; 1: test %%r10, %%r10; jne 1b" ::: "r10", "cc"); return r;',
-    Outcome.SDC: 'long r; __asm__ volatile('
+    RunOutcome.SDC: 'long r; __asm__ volatile('
     '"mov $7, %%r10; mov %%r10, %0" : "=r"(r) :: "r10"); return r;',
 }  # fmt: skip
 
@@ -69,7 +69,7 @@ def fault_in_r10(place, profile, bit):
         instruction = decode(profile.code_at(address), address)
         if instruction.text.startswith("mov r10,"):
             return InstructionFault(
-                trigger=(Stage(place.layout.image.locate(address), 1),),
+                trigger=(CountedStop(place.layout.image.locate(address), 1),),
                 execution=1,
                 instruction=instruction.text,
                 instruction_bytes=instruction.raw,
@@ -88,8 +88,8 @@ def test_known_outcomes(known, expected):
         result = attacker.run(fault_in_r10(place, profile, bit))
         assert result.outcome is expected, result
         assert result.injection.applied
-        assert (result.signal == 11) == (expected is Outcome.CRASH)
-        if expected is Outcome.SDC:
+        assert (result.signal == 11) == (expected is RunOutcome.CRASH)
+        if expected is RunOutcome.SDC:
             assert result.verdict.details["magnitude"]["absolute"] == 2.0**bit
 
 
@@ -115,7 +115,7 @@ def test_a_kernel_that_does_not_load_says_why(known_target):
 
 
 def test_a_run_that_is_given_up_disturbs_no_other(known):
-    place = known(BODIES[Outcome.SDC])
+    place = known(BODIES[RunOutcome.SDC])
     golden = golden_run(place)
     for _ in range(3):
         tracee = place.start()
@@ -124,7 +124,7 @@ def test_a_run_that_is_given_up_disturbs_no_other(known):
 
 
 def test_a_kernel_of_ones_own_is_attacked_by_the_name_of_its_file(known_target, tmp_path):
-    target = known_target(BODIES[Outcome.SDC])
+    target = known_target(BODIES[RunOutcome.SDC])
     plan = Plan(runs=12, seed=3)
     (alone,), (together,) = (run_campaign(plan, [target], jobs=jobs) for jobs in (1, 2))
     outcomes = [entry["outcome"] for entry in alone.records]

@@ -13,11 +13,11 @@ from mavfi_cli.attack.kernels.difference import pack
 from mavfi_cli.attack.kernels.inputs import load_inputs
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.replay import replay_runs
-from mavfi_cli.attack.summary import KERNEL_COLUMNS, csv_rows, summarise, table
 from mavfi_cli.attack.target import digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.kernel_plot import write_kernel_plot
+from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, runs_csv, summarise, table
 
 OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
 
@@ -189,12 +189,8 @@ def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
     text = table(summary)
     assert "sampling: instruction-uniform" in text
     assert "PID: all" in text
-    rows = list(
-        csv.reader(
-            io.StringIO("\n".join(",".join(r[:4]) for r in csv_rows(KERNEL_COLUMNS, campaign)))
-        )
-    )
-    assert rows[0] == KERNEL_COLUMNS[:4]
+    rows = list(csv.reader(io.StringIO(runs_csv(KERNEL_COLUMNS, campaign))))
+    assert rows[0] == KERNEL_COLUMNS
     assert len(rows) == 31
     for name in ("one.svg", "two.svg"):
         write_kernel_plot(summary, tmp_path / name)

@@ -14,7 +14,7 @@ from mavfi_cli.attack.profile import profile_call, profile_calls
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux, record, tracee
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import InstructionFault, Role, Stage, explicit_corruption
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, explicit_corruption
 from mavfi_cli.fi.tracer.image import Image, Location, executable_mapping, scope_of
 from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.sampling import strategy
@@ -174,13 +174,13 @@ def entry_of(process):
 @pytest.fixture
 def profiled(nodes, node):
     """What one call of the kernel executes; the first of the node that is attacked."""
-    return profile_call(nodes).after(Stage(entry_of(node), 1))
+    return profile_call(nodes).after(CountedStop(entry_of(node), 1))
 
 
 def test_a_call_is_profiled_from_its_entry_to_its_return(profiled, node):
     (stratum,) = profiled.strata
     (segment,) = stratum.segments
-    assert segment.start == (Stage(entry_of(node), 1),)
+    assert segment.start == (CountedStop(entry_of(node), 1),)
     texts = {profiled.image.symbol(profiled.image.locate(int(a))) for a in segment.trace}
     assert {text.split("+")[0] for text in texts} >= {"kernel", "inner"}
     assert len(segment.trace) > 3 * 4
@@ -233,7 +233,7 @@ def test_a_fault_hits_exactly_its_invocation(profiled, node, tmp_path):
     instruction_bytes = profiled.code_at(image.address(entry))
     first = decode(instruction_bytes, image.address(entry))
     fault = InstructionFault(
-        trigger=(Stage(entry, 3),),
+        trigger=(CountedStop(entry, 3),),
         execution=1,
         instruction=first.text,
         instruction_bytes=first.raw,
@@ -309,7 +309,7 @@ def test_a_kernel_without_a_file_is_a_region(library, compiled_nodes, tmp_path):
         at = found.image.address(entry)
         first = decode(found.code_at(at), at)
         fault = InstructionFault(
-            trigger=(Stage(entry, 2),),
+            trigger=(CountedStop(entry, 2),),
             execution=1,
             instruction=first.text,
             instruction_bytes=first.raw,

@@ -10,7 +10,7 @@ from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.spawn import Command
+from mavfi_cli.fi.tracer.spawn import Program
 
 DRAWN = ("object", "offset", "k", "corruption")
 
@@ -26,7 +26,7 @@ def own(native_program, tmp_path):
 
 
 def test_a_target_of_ones_own_gets_the_faults_that_a_program_gets(own):
-    command = Command.of([str(own.program), "30"])
+    command = Program.of([str(own.program), "30"])
     program = records(
         ProgramTarget(command=command, comparison=OutputComparison(), limits=OwnPlace.limits)
     )

@@ -1,6 +1,7 @@
 """Outcomes that are known, faults that repeat, records that refuse another build."""
 
 import csv
+import io
 import json
 import math
 import re
@@ -12,10 +13,9 @@ from click.testing import CliRunner
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
-from mavfi_cli.attack.outcome import Outcome, shares
+from mavfi_cli.attack.outcome import RunOutcome, shares
 from mavfi_cli.attack.plan import Plan
 from mavfi_cli.attack.program import ProgramTarget, Workplace
-from mavfi_cli.attack.summary import PROGRAM_COLUMNS, csv_rows, summarise_program
 from mavfi_cli.attack.target import RunLimits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
@@ -24,16 +24,17 @@ from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.fault import (
     DATA_REGISTERS,
+    CountedStop,
     FaultModel,
     InstructionFault,
     Role,
     Site,
-    Stage,
     explicit_corruption,
 )
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation
-from mavfi_cli.fi.tracer.spawn import Command
+from mavfi_cli.fi.tracer.spawn import Program
+from mavfi_cli.report.tables.attacks import PROGRAM_COLUMNS, runs_csv, summarise_program
 from mavfi_cli.stats.shares import design_effect, wilson
 
 QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
@@ -48,7 +49,7 @@ def attacked(program, jobs=1, folder=None, **plan):
 @pytest.fixture
 def target(native_program):
     def make(name, *arguments, **options):
-        command = Command.of([str(native_program(name)), *arguments])
+        command = Program.of([str(native_program(name)), *arguments])
         options.setdefault("comparison", OutputComparison())
         return ProgramTarget(command=command, limits=QUICK, **options)
 
@@ -81,7 +82,7 @@ def victim_fault(place, target, bit):
         address = instruction.next_address
     tracee.kill()
     return InstructionFault(
-        trigger=(Stage(image.locate(address), 1),),
+        trigger=(CountedStop(image.locate(address), 1),),
         execution=1,
         instruction=instruction.text,
         instruction_bytes=instruction.raw,
@@ -92,10 +93,10 @@ def victim_fault(place, target, bit):
 @pytest.mark.parametrize(
     ("name", "bit", "outcome"),
     [
-        ("benign", 5, Outcome.BENIGN),
-        ("crash", 62, Outcome.CRASH),
-        ("hang", 3, Outcome.HANG),
-        ("sdc", 4, Outcome.SDC),
+        ("benign", 5, RunOutcome.BENIGN),
+        ("crash", 62, RunOutcome.CRASH),
+        ("hang", 3, RunOutcome.HANG),
+        ("sdc", 4, RunOutcome.SDC),
     ],
 )
 def test_programs_of_known_outcome(target, workplace, name, bit, outcome):
@@ -103,14 +104,14 @@ def test_programs_of_known_outcome(target, workplace, name, bit, outcome):
     place = workplace(program)
     attacker = Attacker(place=place, golden=golden_run(place))
     fault = victim_fault(place, program, bit)
-    for _ in range(2 if outcome is Outcome.HANG else 5):
+    for _ in range(2 if outcome is RunOutcome.HANG else 5):
         result = attacker.run(fault)
         assert result.outcome is outcome
         assert result.injection.applied
         assert result.injection.before ^ result.injection.after == 1 << bit
-    if outcome is Outcome.CRASH:
+    if outcome is RunOutcome.CRASH:
         assert result.signal == 11
-    if outcome is Outcome.SDC:
+    if outcome is RunOutcome.SDC:
         assert result.verdict.details["magnitude"] == pytest.approx((23 - 7) / 7)
 
 
@@ -119,7 +120,7 @@ def test_a_tolerance_makes_small_differences_benign(target, workplace):
     place = workplace(program)
     attacker = Attacker(place=place, golden=golden_run(place))
     result = attacker.run(victim_fault(place, program, 4))
-    assert result.outcome is Outcome.BENIGN
+    assert result.outcome is RunOutcome.BENIGN
     assert result.verdict.details["magnitude"] > 0.0
 
 
@@ -142,12 +143,14 @@ def test_what_was_overwritten_before_it_was_read_is_benign(target, sites):
     model = FaultModel(roles=frozenset((Role.DESTINATION,)), sites=sites)
     campaign = attacked(target("sorting"), runs=80, seed=3, model=model)
     fates = {
-        (BitActivation(entry["activation"]["activation"]), Outcome(entry["outcome"]))
+        (BitActivation(entry["activation"]["activation"]), RunOutcome(entry["outcome"]))
         for entry in campaign.records
         if entry["activation"]["activation"] == BitActivation.OVERWRITTEN.value
     }
-    expected = set() if sites != DATA_REGISTERS else {(BitActivation.OVERWRITTEN, Outcome.BENIGN)}
-    assert fates - {(BitActivation.OVERWRITTEN, Outcome.BENIGN)} == set()
+    expected = (
+        set() if sites != DATA_REGISTERS else {(BitActivation.OVERWRITTEN, RunOutcome.BENIGN)}
+    )
+    assert fates - {(BitActivation.OVERWRITTEN, RunOutcome.BENIGN)} == set()
     assert fates >= expected
     assert {entry["outcome"] for entry in campaign.records} > {"benign"}
 
@@ -180,14 +183,14 @@ def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplac
     (entry,) = attacked(target("counting", "60"), runs=1, seed=1).records
     fault = record.fault_of(entry)
     late = InstructionFault(
-        trigger=(Stage(fault.target, 100_000),),
+        trigger=(CountedStop(fault.target, 100_000),),
         execution=100_000,
         instruction=fault.instruction,
         instruction_bytes=fault.instruction_bytes,
         corruption=fault.corruption,
     )
     result = attacker.run(late)
-    assert result.outcome is Outcome.NOT_INJECTED
+    assert result.outcome is RunOutcome.NOT_INJECTED
     assert "ended before execution 100000 of counting+0x" in result.reason
     assert result.followed.activation is BitActivation.NOT_INJECTED
 
@@ -255,7 +258,7 @@ def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_progr
     script = tmp_path / "random"
     script.write_text("#!/bin/sh\nod -An -N8 -tx8 /dev/urandom\n")
     script.chmod(0o755)
-    program = ProgramTarget(command=Command.of([str(script)]), comparison=OutputComparison())
+    program = ProgramTarget(command=Program.of([str(script)]), comparison=OutputComparison())
     place = Workplace(program)
     with pytest.raises(TargetError, match="fault-free runs differ"):
         golden_run(place)
@@ -330,9 +333,14 @@ def test_a_damaged_record_is_a_clear_error():
 
 
 def test_not_injected_runs_are_no_part_of_the_other_shares():
-    result = shares([Outcome.SDC, Outcome.BENIGN, Outcome.NOT_INJECTED, Outcome.NOT_INJECTED])
-    assert (result[Outcome.SDC].share, result[Outcome.SDC].total) == (0.5, 2)
-    assert (result[Outcome.NOT_INJECTED].share, result[Outcome.NOT_INJECTED].total) == (0.5, 4)
+    result = shares(
+        [RunOutcome.SDC, RunOutcome.BENIGN, RunOutcome.NOT_INJECTED, RunOutcome.NOT_INJECTED]
+    )
+    assert (result[RunOutcome.SDC].share, result[RunOutcome.SDC].total) == (0.5, 2)
+    assert (result[RunOutcome.NOT_INJECTED].share, result[RunOutcome.NOT_INJECTED].total) == (
+        0.5,
+        4,
+    )
     assert math.isnan(wilson(0, 0).share)
 
 
@@ -343,9 +351,9 @@ def test_independent_runs_count_in_full():
     strata = [(number % 2, number) for number in range(400)]
     assert design_effect(hits, strata) == pytest.approx(1.0, abs=0.02)
     assert design_effect([True] * 9, [("f", 1)] * 9) == 1.0
-    half = [Outcome.SDC, Outcome.BENIGN] * 50
-    alone = shares(half)[Outcome.SDC]
-    alike = shares(half, [("f", number % 2) for number in range(100)])[Outcome.SDC]
+    half = [RunOutcome.SDC, RunOutcome.BENIGN] * 50
+    alone = shares(half)[RunOutcome.SDC]
+    alike = shares(half, [("f", number % 2) for number in range(100)])[RunOutcome.SDC]
     assert alike.share == alone.share == 0.5
     assert alike.high - alike.low > 2.0 * (alone.high - alone.low)
 
@@ -385,6 +393,6 @@ def test_the_table_names_outcomes_and_signals(native_program, tmp_path):
 
 def test_csv_has_a_value_for_every_column(target):
     campaign = attacked(target("counting", "30"), runs=3, seed=1)
-    header, *rows = csv_rows(PROGRAM_COLUMNS, [campaign])
+    header, *rows = csv.reader(io.StringIO(runs_csv(PROGRAM_COLUMNS, [campaign])))
     assert all(len(row) == len(header) for row in rows)
     assert all(row[header.index("instruction")] for row in rows)

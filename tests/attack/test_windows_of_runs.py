@@ -12,7 +12,7 @@ from mavfi_cli.core.errors import TargetError, UnknownName
 from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.fault import FaultModel, Site
 from mavfi_cli.fi.tracer.sampling import strategy
-from mavfi_cli.fi.tracer.spawn import Command
+from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.windows import WindowTooLong, record_window
 
 RECURSIVE = """
@@ -33,7 +33,7 @@ def place(native_program):
     places = []
 
     def make(name, *arguments, **options):
-        command = Command.of([str(native_program(name)), *arguments])
+        command = Program.of([str(native_program(name)), *arguments])
         target = ProgramTarget(command=command, comparison=OutputComparison(), **options)
         places.append(Workplace(target))
         return places[-1]

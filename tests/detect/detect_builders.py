@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from mavfi_cli.core.types import CollisionReport, Command, Trajectory
-from mavfi_cli.detect.base import StackMark
+from mavfi_cli.core.types import CollisionReport, Command, StackMark, Trajectory
 from mavfi_cli.detect.preprocess import NAMES
 
 STACK = StackMark(name="some", digest="5" * 64)

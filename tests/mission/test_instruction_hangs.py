@@ -12,7 +12,7 @@ from mavfi_cli.companion import node_process
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED, decode
 from mavfi_cli.fi.tracer.doctor import check_tracing
-from mavfi_cli.fi.tracer.fault import InstructionFault, Role, Stage, explicit_corruption
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, explicit_corruption
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
@@ -54,8 +54,8 @@ def endless(world_to_search):
     register = next(use.register for use in found.writes if use.register != "rflags")
     fault = InstructionFault(
         trigger=(
-            Stage(scope.entry, 1),
-            Stage(Location(SEGMENT, found.address - span.start), EXECUTION),
+            CountedStop(scope.entry, 1),
+            CountedStop(Location(SEGMENT, found.address - span.start), EXECUTION),
         ),
         execution=EXECUTION,
         instruction=found.text,

@@ -1,17 +1,22 @@
 """Fig. 15 of the paper, what its ratios hang on, and reports of other vehicles and computers."""
 
 import math
+from pathlib import Path
 
 import pytest
 
+from mavfi_cli import vpm
+from mavfi_cli.core.config import shipped_names
 from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.vpm.board import Board, board_names, load_board
+from mavfi_cli.vpm.board import Board, load_board
 from mavfi_cli.vpm.calibrate import calibrated
 from mavfi_cli.vpm.model import GRAVITY_MPS2
 from mavfi_cli.vpm.report import Choices, report
 from mavfi_cli.vpm.schemes import SCHEMES, schemes_with
-from mavfi_cli.vpm.vehicle import load_vehicle, vehicle_names
+from mavfi_cli.vpm.vehicle import load_vehicle
+
+VPM = Path(vpm.__file__).parent
 
 
 def told(vehicle, choices=None, schemes=SCHEMES):
@@ -78,7 +83,7 @@ def vehicle_file(name):
     return vehicle._FOLDER / f"{name}.toml"
 
 
-@pytest.mark.parametrize("name", vehicle_names())
+@pytest.mark.parametrize("name", shipped_names(VPM / "vehicles"))
 def test_the_rows_agree_with_each_other(name):
     response = 0.2 if name == "cal20" else None
     one = told(name, Choices(response_s=response, board=load_board("raspi3b"), distance_m=120.0))
@@ -242,7 +247,7 @@ def test_a_vehicle_that_needs_more(choices, said):
         told("cal20", choices)
 
 
-@pytest.mark.parametrize("name", board_names())
+@pytest.mark.parametrize("name", shipped_names(VPM / "boards"))
 def test_shipped_boards_have_sources(name):
     board = load_board(name)
     assert board.name == name

@@ -28,7 +28,7 @@ from mavfi_cli.attack.kernels.template import (
     RUN,
     TIMES,
 )
-from mavfi_cli.attack.outcome import Outcome
+from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.profile import TargetProfile, Watch, profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import Difference, Golden, RunLimits, RunVerdict, digest, judged
@@ -224,7 +224,7 @@ class KernelPlace:
             details={
                 "error": left.decode(errors="replace") if raised and left is not None else "",
                 "magnitude": None if difference is None else difference.to_json(),
-                "within_tolerance": outcome is Outcome.BENIGN and size > 0.0,
+                "within_tolerance": outcome is RunOutcome.BENIGN and size > 0.0,
             },
         )
 

@@ -29,7 +29,7 @@ from mavfi_cli.attack.kernels.catalogue import Call
 from mavfi_cli.attack.kernels.difference import pack
 from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
 from mavfi_cli.attack.served import channel, newest_cache_ns
-from mavfi_cli.core.processes import receive, send
+from mavfi_cli.core.processes import fork, receive, send
 
 RAISED = 3  # exit code of a child whose kernel raised an error
 TIMES = struct.Struct("<dd")
@@ -71,14 +71,7 @@ def _give_up(why: str) -> None:
 
 def _in_child(work: Callable[[], int]) -> int:
     """Do work in a fork of this process; return its wait status when it has ended."""
-    child = os.fork()
-    if child:
-        return os.waitpid(child, 0)[1]
-    code = 1
-    try:
-        code = work()
-    finally:
-        os._exit(code)
+    return os.waitpid(fork(work), 0)[1]
 
 
 def _limit() -> None:

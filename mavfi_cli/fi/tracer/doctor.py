@@ -10,7 +10,7 @@ from pathlib import Path
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.fi.tracer.arch import widest_vector
 from mavfi_cli.fi.tracer.breakpoints import Mechanism, perf_allowed
-from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
+from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 from mavfi_cli.fi.tracer.tracee import Tracee
 
 _PERF_REMEDY = (
@@ -35,7 +35,7 @@ def check_tracing(mechanism: Mechanism | None = None) -> Capability:
     with tempfile.TemporaryDirectory(prefix="mavfi-doctor-") as folder:
         output = Path(folder) / "output"
         try:
-            command = Command.of(["true"], environment=dict(os.environ))
+            command = Program.of(["true"], environment=dict(os.environ))
             tracee = spawn(command, stdout=output, stderr=output, mechanism=mechanism)
             try:
                 if not run_to_entry(tracee):

@@ -40,7 +40,7 @@ class Role(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class CountedStop:
     """Run until `location` is about to execute for the `count`-th time since the stage before."""
 
     location: Location
@@ -63,7 +63,7 @@ class InstructionCorruption:
 class InstructionFault:
     """One fault. The last stage of the trigger is the attacked instruction itself."""
 
-    trigger: tuple[Stage, ...]
+    trigger: tuple[CountedStop, ...]
     execution: int  # k: number of the execution in the profiled scope, from 1
     instruction: str
     instruction_bytes: bytes
@@ -150,7 +150,7 @@ def draw_corruption(
     )
 
 
-def site_of(register: str) -> Site:
+def _site_of(register: str) -> Site:
     """The class of a full register."""
     return Site(register_kind(register))
 
@@ -169,7 +169,7 @@ def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> In
     if not 0 <= bit < width:
         raise BitOutsideWidth(bit, register, width)
     return InstructionCorruption(
-        site=site_of(register), role=role, register=register, operand=register, bits=(bit,)
+        site=_site_of(register), role=role, register=register, operand=register, bits=(bit,)
     )
 
 
@@ -192,7 +192,7 @@ def _registers(
 ) -> list[_Candidate]:
     merged: dict[str, _Candidate] = {}
     for use in uses:
-        site = site_of(use.register)
+        site = _site_of(use.register)
         if site not in model.sites:
             continue
         if not (use.explicit or model.implicit):

@@ -14,7 +14,13 @@ from typing import Any
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import write_text
-from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site, Stage
+from mavfi_cli.fi.tracer.fault import (
+    CountedStop,
+    InstructionCorruption,
+    InstructionFault,
+    Role,
+    Site,
+)
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
 
@@ -101,19 +107,19 @@ def fault_of(record: Mapping[str, Any]) -> InstructionFault:
         corruption = record["corruption"]
         return InstructionFault(
             trigger=tuple(
-                Stage(Location(stage["object"], stage["offset"]), stage["count"])
+                CountedStop(Location(stage["object"], stage["offset"]), stage["count"])
                 for stage in record["trigger"]
             ),
             execution=record["k"],
             instruction=record["instruction"],
             instruction_bytes=bytes.fromhex(record["instruction_bytes"]),
-            corruption=None if corruption is None else corruption_of(corruption),
+            corruption=None if corruption is None else _corruption_of(corruption),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise RecordError(f"the fault record is damaged: {error!r}") from None
 
 
-def corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
+def _corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
     """The corruption part of a record, read back."""
     return InstructionCorruption(
         site=Site(data["site"]),

@@ -26,7 +26,7 @@ _LAUNCHER = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+class Program:
     """A program to start with fixed addresses, a fixed environment and output in files."""
 
     argv: tuple[str, ...]
@@ -42,7 +42,7 @@ class Command:
         directory: Path | None = None,
         environment: Mapping[str, str] | None = None,
         stdin: Path = Path(os.devnull),
-    ) -> Command:
+    ) -> Program:
         """Make a command whose program is looked up on the path.
 
         Raises:
@@ -61,7 +61,7 @@ class Command:
 
 
 def spawn(
-    command: Command, *, stdout: Path, stderr: Path, mechanism: Mechanism | None = None
+    command: Program, *, stdout: Path, stderr: Path, mechanism: Mechanism | None = None
 ) -> Tracee:
     """Start a program without address randomisation, stopped before its first instruction.
 
@@ -96,7 +96,7 @@ def run_to_entry(tracee: Tracee) -> bool:
     return entry is not None and tracee.run_to(entry)
 
 
-def _launch(command: Command, stdout: Path, stderr: Path, channel: int) -> int:
+def _launch(command: Program, stdout: Path, stderr: Path, channel: int) -> int:
     truncate = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
     actions = [
         (os.POSIX_SPAWN_OPEN, 0, str(command.stdin), os.O_RDONLY, 0),
@@ -117,7 +117,7 @@ def _launch(command: Command, stdout: Path, stderr: Path, channel: int) -> int:
         )
 
 
-def _await_exec(tracee: Tracee, command: Command) -> None:
+def _await_exec(tracee: Tracee, command: Program) -> None:
     while True:
         status = linux.wait(tracee.pid)
         if status.ended:

@@ -18,7 +18,7 @@ from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.arch import TRAITS, record_steps, return_address
 from mavfi_cli.fi.tracer.arch.traits import StepEnd
-from mavfi_cli.fi.tracer.fault import Stage
+from mavfi_cli.fi.tracer.fault import CountedStop
 from mavfi_cli.fi.tracer.image import Location, Scope
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
@@ -30,7 +30,7 @@ _CHUNK = 16384
 class Segment:
     """One stepped window: its start, and the instructions that executed in it."""
 
-    start: tuple[Stage, ...]  # empty: the program's entry point
+    start: tuple[CountedStop, ...]  # empty: the program's entry point
     trace: NDArray[np.int64]  # (n,) addresses in order; a repeated string instruction is one entry
 
     @functools.cached_property
@@ -192,7 +192,7 @@ class _Blanket:
 
 def plan_trigger(
     segment: Segment, index: int, locate: Callable[[int], Location]
-) -> tuple[tuple[Stage, ...], int]:
+) -> tuple[tuple[CountedStop, ...], int]:
     """Plan the cheapest exact trigger of one executed instruction of a segment.
 
     Each counted hit costs the same. So a rarely executed instruction shortly before the target is
@@ -211,16 +211,16 @@ def plan_trigger(
     is_target = trace == target
     k = int(np.count_nonzero(is_target))
     if k <= _STAGE_COST:
-        return (*segment.start, Stage(locate(int(target)), k)), k
+        return (*segment.start, CountedStop(locate(int(target)), k)), k
     first = max(0, index - _HORIZON)
     ranks = segment.ranks[first:index]
     after = k - (np.cumsum(is_target)[first:index] - is_target[first:index])
     cost = np.where(is_target[first:index], np.iinfo(np.int64).max, ranks + after)
     best = int(np.argmin(cost)) if len(cost) else -1
     if best < 0 or int(cost[best]) + _STAGE_COST >= k:
-        return (*segment.start, Stage(locate(int(target)), k)), k
-    anchor = Stage(locate(int(trace[first + best])), int(ranks[best]))
-    return (*segment.start, anchor, Stage(locate(int(target)), int(after[best]))), k
+        return (*segment.start, CountedStop(locate(int(target)), k)), k
+    anchor = CountedStop(locate(int(trace[first + best])), int(ranks[best]))
+    return (*segment.start, anchor, CountedStop(locate(int(target)), int(after[best]))), k
 
 
 _STAGE_COST = 12  # one more stop costs about as much as 12 counted hits

@@ -19,7 +19,7 @@ from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.fault import Stage
+from mavfi_cli.fi.tracer.fault import CountedStop
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
 from mavfi_cli.fi.tracer.tracee import Tracee
@@ -145,7 +145,7 @@ def profile_invocation(
         found = TracerThread(lambda _armed: place.profile(rng)).result()
     finally:
         place.close()
-    return found.after(Stage(place.scope_of_node.entry, entry))
+    return found.after(CountedStop(place.scope_of_node.entry, entry))
 
 
 def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:

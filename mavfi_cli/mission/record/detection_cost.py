@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavfi_cli.core.types import Stage
+from mavfi_cli.mission.record.measures import record_of
 
 # Kernels that are recomputed after an alarm of a stage, from first to last.
 RECOMPUTED = {
@@ -87,18 +88,17 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
     Returns:
         Cost; None without a detector or without any check.
     """
-    detection = result.get("detection")
-    walls = (result.get("host") or {}).get("stage_wall_s") or {}
+    flight = record_of(result)
+    detection, kernels = flight.detection, flight.kernels
+    walls = flight.host.get("stage_wall_s") or {}
     checks_host_s = walls.get("gate")
     if not detection or not checks_host_s:
         return None
     checks = sum(detection["checks"].values())
-    quality = result.get("quality_of_flight") or {}
-    flight_s = quality.get("flight_time_s") or result.get("simulated_s")
+    flight_s = flight.quality_of_flight.get("flight_time_s") or flight.simulated_s
     if not checks or not flight_s:
         return None
     again = _recomputations(detection)
-    kernels = result.get("kernels") or {}
     return DetectionCost(
         detector=detection["detector"],
         checks=checks,
@@ -111,8 +111,8 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
         },
         compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
         host_compute_s=math.fsum(walls.get(name, 0.0) for name in KERNELS),
-        platform=str(result.get("config", {}).get("platform", UNKNOWN)),
-        faulty=bool(result.get("fault")),
+        platform=str(flight.config.get("platform", UNKNOWN)),
+        faulty=bool(flight.fault),
     )
 
 

@@ -1,15 +1,16 @@
-"""The measures of a flight: the one place where whoever counts flights reads a result.json.
+"""The sections and the measures of a flight: the one place where a result.json is read.
 
-Each is a column of a table of flights. A mission that crashed or hung before it could write its
-record has few fields; a measure that its record does not have is None. A source-level fault that
-struck several components has them joined by ";", in one order in all measures; of several strikes
-the measures have the first.
+Each measure is a column of a table of flights. A mission that crashed or hung before it could write
+its record has few fields; a measure that its record does not have is None. A source-level fault
+that struck several components has them joined by ";", in one order in all measures; of several
+strikes the measures have the first.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from mavfi_cli.fi import bits
@@ -42,6 +43,55 @@ _INSTRUCTION = (
 )  # fmt: skip
 STRUCK = (*_BOTH, *_SOURCE, *_INSTRUCTION)
 _FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits of their bits
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightRecord:
+    """The sections of a result.json. A section without content is empty, or None if it is a value.
+
+    A mission that crashed or hung before it could write its record lacks most of them.
+    """
+
+    outcome: str = ""
+    reason: str = ""
+    simulated_s: float | None = None
+    goal_enu_m: Sequence[float] | None = None
+    config: Record = field(default_factory=dict)
+    quality_of_flight: Record = field(default_factory=dict)
+    pilot: Record = field(default_factory=dict)
+    events: Sequence[dict[str, Any]] = ()
+    plans: Sequence[Record] = ()
+    fault: Record = field(default_factory=dict)
+    detection: Record = field(default_factory=dict)
+    nodes: Record = field(default_factory=dict)
+    kernels: Record = field(default_factory=dict)
+    response_time_s: Record = field(default_factory=dict)
+    measured_platform: Record = field(default_factory=dict)
+    world: Record = field(default_factory=dict)
+    referee: Record | None = field(default_factory=dict)  # None: the vehicle left no truth
+    versions: Mapping[str, str] = field(default_factory=dict)
+    host: Record = field(default_factory=dict)
+
+    @property
+    def succeeded(self) -> bool:
+        """True if the vehicle reached the goal."""
+        return self.outcome == "success"
+
+    @property
+    def golden(self) -> bool:
+        """True if the flight has neither a fault nor a detector."""
+        return not (self.fault or self.detection)
+
+
+_SECTIONS = frozenset(each.name for each in fields(FlightRecord))
+
+
+def record_of(result: Record) -> FlightRecord:
+    """Read the sections of a result.json."""
+    known = {name: result[name] for name in _SECTIONS & result.keys()}
+    return FlightRecord(
+        **{name: value for name, value in known.items() if value is not None or name == "referee"}
+    )
 
 
 def measures_of(record: Record) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_json
+from mavfi_cli.mission.record.measures import FlightRecord, record_of
 from mavfi_cli.mission.record.trace import read_trace
 from mavfi_cli.spec.stack import FIRST
 
@@ -111,6 +112,11 @@ class Run:
     folder: RunFolder
     result: dict[str, Any]
     trace: pa.Table | None
+
+    @property
+    def record(self) -> FlightRecord:
+        """The sections of the result."""
+        return record_of(self.result)
 
 
 def load_run(path: str | Path) -> Run:

@@ -10,7 +10,7 @@ from mavfi_cli.analysis.groups import INACTIVE, METRICS
 from mavfi_cli.campaign.missions import label_text
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
-from mavfi_cli.report.tables.cells import number, percent, spread
+from mavfi_cli.report.tables.columns import number, percent, spread
 from mavfi_cli.report.tables.settings import SettingColumns
 from mavfi_cli.stats.paired import McNemar
 

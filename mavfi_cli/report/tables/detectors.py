@@ -11,9 +11,15 @@ import pyarrow as pa
 from mavfi_cli.analysis.detector_pairs import CSV, NONE
 from mavfi_cli.analysis.detectors import ALL
 from mavfi_cli.analysis.flights import rows_of
-from mavfi_cli.core.columns import columns
-from mavfi_cli.report.tables.cells import fraction, number, percent, rate, spread
-from mavfi_cli.report.tables.rows import csv_text
+from mavfi_cli.report.tables.columns import (
+    columns,
+    csv_text,
+    fraction,
+    number,
+    percent,
+    rate,
+    spread,
+)
 
 Row = Mapping[str, Any]
 _INTERVALS = "in brackets: 95 % intervals (Wilson for shares, bootstrap for the rest)"

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.core.columns import columns as aligned
-from mavfi_cli.core.columns import wrapped
-from mavfi_cli.report.tables.rows import csv_text
+from mavfi_cli.report.tables.columns import columns as aligned
+from mavfi_cli.report.tables.columns import csv_text, wrapped
 from mavfi_cli.vpm.report import schemes_of
 
 

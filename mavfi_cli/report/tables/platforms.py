@@ -8,9 +8,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, QUANTITIES
-from mavfi_cli.core.columns import columns
-from mavfi_cli.report.tables.cells import number, p_value, percent, rate, spread
-from mavfi_cli.report.tables.rows import csv_text
+from mavfi_cli.report.tables.columns import (
+    columns,
+    csv_text,
+    number,
+    p_value,
+    percent,
+    rate,
+    spread,
+)
 from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.stats.bootstrap import FEW
 
@@ -19,12 +25,12 @@ Row = Mapping[str, Any]
 PAPER = "paper, Fig. 16: worst case x 2.8 on the TX2, of which GAD recovers 79.3 %, AAD 88.0 %"
 
 
-def setting_title(setting: str) -> str:
+def _setting_title(setting: str) -> str:
     """The name of a setting."""
     return {GOLDEN: "golden", NONE: "faults"}.get(setting, f"faults, {setting}")
 
 
-def titles_of(told: Row) -> dict[str, str]:
+def _titles_of(told: Row) -> dict[str, str]:
     """The names of the platforms."""
     return {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
 
@@ -95,9 +101,9 @@ def _head(told: Row) -> list[str]:
 
 def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -> list[str]:
     """A table of all platforms and settings; the first label is printed once."""
-    titles, last, rows = titles_of(told), "", []
+    titles, last, rows = _titles_of(told), "", []
     for row in told[name]:
-        labels = [titles[row["platform"]], setting_title(row["setting"])]
+        labels = [titles[row["platform"]], _setting_title(row["setting"])]
         labels = labels if first == "platform" else labels[::-1]
         rows.append([labels[0] if labels[0] != last else "", labels[1], *cells(row)])
         last = labels[0]
@@ -108,8 +114,8 @@ def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: An
     """A title, and a table of a platform compared with the first one."""
     rows = [row for row in told[name] if row["platform"] == platform["platform"]]
     title, *names = head
-    told_rows = [[setting_title(row["setting"]), *cells(row)] for row in rows]
-    reference = titles_of(told)[rows[0]["reference"]]
+    told_rows = [[_setting_title(row["setting"]), *cells(row)] for row in rows]
+    reference = _titles_of(told)[rows[0]["reference"]]
     return [
         title.format(platform["title"], reference),
         *columns([["", *names], *told_rows], 1),
@@ -181,7 +187,7 @@ def _worst_cells(row: Row) -> list[str]:
 
 def _again(told: Row) -> list[str]:
     """How to repeat the most expensive flights."""
-    titles, lines = titles_of(told), []
+    titles, lines = _titles_of(told), []
     for row in told["costs"]:
         if row["setting"] != NONE or row["worst_flight"] is None:
             continue

@@ -6,10 +6,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.core.columns import wrapped
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
+from mavfi_cli.report.tables.columns import csv_text, wrapped
 from mavfi_cli.report.tables.model import columns
-from mavfi_cli.report.tables.rows import csv_text
 
 MANY_ALARMS = 10.0  # alarms of an error-free flight; more is not the detector's usual rate
 _NUMBERS = (

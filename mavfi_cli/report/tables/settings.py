@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavfi_cli.campaign.missions import label_text, label_value, ordered
-from mavfi_cli.core.columns import blocks
+from mavfi_cli.report.tables.columns import blocks
 
 
 @dataclass(frozen=True, slots=True)

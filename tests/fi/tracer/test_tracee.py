@@ -14,7 +14,7 @@ from mavfi_cli.fi.tracer.alarm import ProcessTimer
 from mavfi_cli.fi.tracer.breakpoints import ExecutionCounter, Mechanism
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
-from mavfi_cli.fi.tracer.spawn import Command, spawn
+from mavfi_cli.fi.tracer.spawn import Program, spawn
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 
@@ -196,7 +196,7 @@ def test_attaching_to_nothing_is_a_clear_error():
 
 def test_a_program_that_is_not_there_is_a_clear_error():
     with pytest.raises(TargetError, match="no such program"):
-        Command.of(["/nowhere/at/all"])
+        Program.of(["/nowhere/at/all"])
 
 
 def test_a_file_that_cannot_be_executed_is_a_clear_error(tmp_path, native_program):
@@ -205,14 +205,14 @@ def test_a_file_that_cannot_be_executed_is_a_clear_error(tmp_path, native_progra
     broken.write_bytes(b"\x7fELF nonsense")
     broken.chmod(0o755)
     with pytest.raises(TargetError, match="cannot be executed"):
-        spawn(Command.of([str(broken)]), stdout=tmp_path / "o", stderr=tmp_path / "e")
+        spawn(Program.of([str(broken)]), stdout=tmp_path / "o", stderr=tmp_path / "e")
 
 
 _TRACER = """
 import sys
 from pathlib import Path
-from mavfi_cli.fi.tracer.spawn import Command, run_to_entry, spawn
-tracee = spawn(Command.of([sys.argv[1]]), stdout=Path(sys.argv[2]), stderr=Path(sys.argv[2]))
+from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
+tracee = spawn(Program.of([sys.argv[1]]), stdout=Path(sys.argv[2]), stderr=Path(sys.argv[2]))
 run_to_entry(tracee)
 print(tracee.pid, flush=True)
 sys.stdin.read()

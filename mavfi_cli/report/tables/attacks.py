@@ -8,9 +8,9 @@ from typing import Any
 from mavfi_cli.attack.campaign import Record, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.outcome import Outcome, counted, shares, shares_to_json, signal_name
+from mavfi_cli.attack.outcome import RunOutcome, counted, shares, shares_to_json, signal_name
 from mavfi_cli.attack.plan import Plan
-from mavfi_cli.core.columns import blocks
+from mavfi_cli.report.tables.columns import blocks, csv_text
 
 SCHEMA = 1
 _OF_EVERY_RUN = (
@@ -21,17 +21,17 @@ KERNEL_COLUMNS = (
     "kernel run outcome signal error relative absolute unit text within_tolerance " + _OF_EVERY_RUN
 ).split()
 PROGRAM_COLUMNS = f"run outcome signal exit_code magnitude {_OF_EVERY_RUN}".split()
-_SHOWN = (Outcome.BENIGN, Outcome.CRASH, Outcome.HANG, Outcome.SDC, Outcome.NOT_INJECTED)
+_SHOWN = tuple(RunOutcome)
 
 
 def _counts(runs: TargetRuns) -> dict[str, Any]:
     """The counts of one target."""
     records, profile = runs.records, runs.profile
     windows = [] if profile is None else [profile.window_of(entry) for entry in records]
-    found = shares((Outcome(entry["outcome"]) for entry in records), windows)
+    found = shares((RunOutcome(entry["outcome"]) for entry in records), windows)
     return {
         "outcomes": shares_to_json(found),
-        "crashes": counted(_crash(entry) for entry in _with(records, Outcome.CRASH)),
+        "crashes": counted(_crash(entry) for entry in _with(records, RunOutcome.CRASH)),
         "not_injected": counted(
             entry["not_injected_reason"] for entry in records if entry["not_injected_reason"]
         ),
@@ -39,7 +39,7 @@ def _counts(runs: TargetRuns) -> dict[str, Any]:
     }
 
 
-def _with(records: Iterable[Record], outcome: Outcome) -> Iterator[Record]:
+def _with(records: Iterable[Record], outcome: RunOutcome) -> Iterator[Record]:
     return (entry for entry in records if entry["outcome"] == outcome.value)
 
 
@@ -74,7 +74,7 @@ def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
 def _kernel(runs: TargetRuns) -> dict[str, Any]:
     target, records, profile = runs.target, runs.records, runs.profile
     assert isinstance(target, KernelTarget)
-    sizes = [entry["magnitude"]["relative"] for entry in _with(records, Outcome.SDC)]
+    sizes = [entry["magnitude"]["relative"] for entry in _with(records, RunOutcome.SDC)]
     finite = sorted(size for size in sizes if size is not None)
     run_s = sum(entry["run_s"] for entry in records)
     return {
@@ -184,7 +184,7 @@ def program_table(summary: Mapping[str, Any]) -> str:
         share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
         low, high = (100 * edge for edge in row["wilson95"])
         lines.append(
-            f"{Outcome(name).title:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %"
+            f"{RunOutcome(name).title:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %"
         )
     lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
     if summary["executed_in_scope"] is not None:
@@ -198,13 +198,17 @@ def program_table(summary: Mapping[str, Any]) -> str:
 # -- both
 
 
-def csv_rows(columns: Sequence[str], campaign: Iterable[TargetRuns]) -> Iterator[list[str]]:
-    """Header and one row a run; entries that a record lacks are empty."""
-    yield list(columns)
-    for entry in (entry for runs in campaign for entry in runs.records):
-        flat = {**entry, **(entry.get("corruption") or {}), **entry["injection"]}
-        if isinstance(entry["magnitude"], Mapping):
-            flat.update(entry["magnitude"])
-        flat["activation"] = entry["activation"]["activation"]
-        flat["bits"] = " ".join(str(bit) for bit in flat.get("bits", ()))
-        yield ["" if flat.get(name) is None else str(flat[name]) for name in columns]
+def runs_csv(columns: Sequence[str], campaign: Iterable[TargetRuns]) -> str:
+    """Return one line per run below the names of the columns; entries without a value are empty."""
+    return csv_text(
+        (_cells(entry, columns) for runs in campaign for entry in runs.records), columns
+    )
+
+
+def _cells(entry: Record, columns: Sequence[str]) -> dict[str, str]:
+    flat = {**entry, **(entry.get("corruption") or {}), **entry["injection"]}
+    if isinstance(entry["magnitude"], Mapping):
+        flat.update(entry["magnitude"])
+    flat["activation"] = entry["activation"]["activation"]
+    flat["bits"] = " ".join(str(bit) for bit in flat.get("bits", ()))
+    return {name: "" if flat.get(name) is None else str(flat[name]) for name in columns}

@@ -1,9 +1,13 @@
-"""Format rows of cells as aligned columns of text."""
+"""Formats numbers as cells, and rows of cells as aligned columns of text or as CSV."""
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 WIDTH = 100  # characters; default maximum width of a table
 _GAP = 2
@@ -79,3 +83,67 @@ def _aligned(cells: Sequence[Sequence[str]], labels: int | None) -> list[str]:
         .rstrip()
         for row in cells
     ]
+
+
+# Numbers ------------------------------------------------------------------------------------------
+
+Row = Mapping[str, Any]
+
+
+def number(value: float, shape: str = "", scale: float = 1.0, unit: str = "") -> str:
+    """A value in a format specification, with its unit."""
+    return "-" if not math.isfinite(value) else f"{scale * value:{shape}}{unit}"
+
+
+def percent(share: float, shape: str = ".1f") -> str:
+    """A share of one as per cent."""
+    return number(share, shape, 100.0, " %")
+
+
+def fraction(share: Row) -> str:
+    """A count and its total."""
+    return f"{share['count']}/{share['total']}" if share["total"] else "-"
+
+
+def rate(share: Row, digits: int = 1) -> str:
+    """A share as per cent, with its interval."""
+    if math.isnan(share["share"]):
+        return "-"
+    told = f"{100 * share['share']:.{digits}f} %"
+    return f"{told} ({100 * share['low']:.0f} to {100 * share['high']:.0f})"
+
+
+def spread(
+    each: Row, digits: int, scale: float = 1.0, sign: str = "", chance: float | None = None
+) -> str:
+    """A value, with its interval and p-value if there are any."""
+    if math.isnan(each["value"]):
+        return "-"
+    shape = f"{sign or 'z'}.{digits}f"  # the sign of -0.00 shows its side of zero
+    value, low, high = (f"{scale * each[end]:{shape}}" for end in ("value", "low", "high"))
+    told = [] if math.isnan(each["low"]) else [f"{low} to {high}"]
+    told += [] if chance is None else [p_value(chance)]
+    return f"{value} ({', '.join(told)})" if told else value
+
+
+def p_value(chance: float) -> str:
+    """A p-value in short form."""
+    return "p<.001" if chance < 0.001 else f"p {chance:.1g}".replace("p 0.", "p .")
+
+
+# CSV ----------------------------------------------------------------------------------------------
+
+
+def csv_text(rows: Iterable[Mapping[str, Any]], names: Sequence[str] = ()) -> str:
+    """One line per row, below the names of the columns.
+
+    Args:
+        names: names of the columns; None takes the keys of all rows, in order.
+    """
+    told = list(rows)
+    keys = names or list(dict.fromkeys(key for row in told for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, keys, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(told)
+    return text.getvalue()

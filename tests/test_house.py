@@ -1,0 +1,132 @@
+"""The rules of the house that a type checker and the import contracts cannot hold."""
+
+import ast
+import functools
+import graphlib
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+SOURCES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for package in ("mavfi_cli", "sitl")
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+LONGEST_CHAIN = 16  # modules, each of which imports the next when it is loaded
+# Functions that nothing in the product calls by name, with the reason to keep them.
+UNCALLED = {
+    "__getattr__": "Python calls it: names of the library are imported when they are first used",
+    "__dir__": "Python calls it: completion of the library's names",
+    "list_commands": "click calls it",
+    "get_command": "click calls it",
+    "format_commands": "click calls it",
+    "format_options": "click calls it",
+    "checkMotion": "OMPL calls it",
+    "library_scope": "for kernels of users (CONTRIBUTING.md)",
+    "explicit_corruption": "for faults that are written by hand; the tests of the tracer do",
+    "occupied_voxels": "what a map holds, for tests of the map",
+    "capturing": "what a camera does, for tests of the camera",
+}
+COMMANDS = ("mavfi_cli/cli/", "sitl/world/command.py")  # functions that click calls by decorator
+
+
+@functools.cache
+def tree(module):
+    return ast.parse(SOURCES[module].read_text())
+
+
+def on_loading(body):
+    """The statements that run when a module is loaded, without those for type checkers."""
+    for statement in body:
+        if isinstance(statement, ast.If) and "TYPE_CHECKING" in ast.unparse(statement.test):
+            continue
+        yield statement
+        for inner in ("body", "orelse", "finalbody"):
+            if not isinstance(statement, ast.FunctionDef | ast.ClassDef):
+                yield from on_loading(getattr(statement, inner, ()))
+
+
+@functools.cache
+def imports(module):
+    """Our modules that a module imports when it is loaded."""
+    found = set()
+    for statement in on_loading(tree(module).body):
+        if isinstance(statement, ast.Import):
+            found |= {each.name for each in statement.names}
+        elif isinstance(statement, ast.ImportFrom):
+            names = {f"{statement.module}.{each.name}" for each in statement.names}
+            found |= {name if name in SOURCES else statement.module for name in names}
+    return found & SOURCES.keys() - {module}
+
+
+def mentions(pattern, room=""):
+    """Modules outside a room whose code has the pattern."""
+    expression = re.compile(pattern, re.MULTILINE)
+    return {
+        module for module, path in SOURCES.items()
+        if not (room and module.startswith(room)) and expression.search(path.read_text())
+    }  # fmt: skip
+
+
+def test_a_public_class_name_exists_once():
+    names = Counter(
+        statement.name
+        for module in SOURCES
+        for statement in tree(module).body
+        if isinstance(statement, ast.ClassDef) and not statement.name.startswith("_")
+    )
+    assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_a_chain_of_imports_is_short():
+    chains = {}
+    graph = {module: imports(module) for module in SOURCES}
+    for module in graphlib.TopologicalSorter(graph).static_order():
+        behind = max((chains[each] for each in imports(module)), key=len, default=())
+        chains[module] = (module, *behind)
+    longest = max(chains.values(), key=len)
+    assert len(longest) <= LONGEST_CHAIN, longest
+
+
+def test_one_module_forks():
+    forking = mentions(r"\bos\.fork(pty)?\(|get_context\(\"fork")
+    assert {module.rpartition(".")[2] for module in forking} == {"processes", "node_process"}
+
+
+def test_tables_csv_and_pictures_are_made_in_report_only():
+    made = (
+        r"^\s*(import csv|from csv|from pyarrow import .*csv|from rich\.table|.*import.*matplotlib)"
+    )
+    assert mentions(made, room="mavfi_cli.report") == {"sitl.world.draw"}  # the vehicle's own
+    assert mentions(r"report\.tables\.columns import", room="mavfi_cli.report") <= {
+        "mavfi_cli.cli.doctor"
+    }
+
+
+def test_the_command_line_holds_no_data():
+    assert {name for name in mentions(r"@dataclass") if name.startswith("mavfi_cli.cli")} == set()
+
+
+def test_every_public_function_has_a_caller():
+    told = subprocess.run(
+        [sys.executable, "-m", "vulture", "mavfi_cli", "sitl", "--min-confidence", "60"],
+        capture_output=True, text=True, cwd=ROOT, check=False,
+    )  # fmt: skip
+    uncalled = re.findall(
+        r"^(\S+):\d+: unused (?:function|method|property|class) '(\w+)'", told.stdout, re.M
+    )
+    assert uncalled, told.stderr
+    public = {(path, name) for path, name in uncalled if not re.match("_[a-z]", name)}
+    dead = {name for path, name in public if not path.startswith(COMMANDS)}
+    listed = {name for _, name in uncalled}
+    assert dead - UNCALLED.keys() == set()
+    assert UNCALLED.keys() - listed == set()  # no reason for what has a caller
+
+
+def test_a_record_is_read_in_one_module():
+    """Others take sections and measures from `mission.record.measures`."""
+    reads = r"\bresult(\[|\.get\()[\"']"
+    assert mentions(reads) == {"mavfi_cli.mission.record.run_folder"}  # upgrades older records
