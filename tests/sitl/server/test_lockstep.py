@@ -133,9 +133,9 @@ def test_garbage_between_frames_changes_nothing(companion):
 def test_speed_paces_lockstep(companion):
     import time
 
-    vehicle = companion("--speed", "10")
+    vehicle = companion("--speed", "2")
     vehicle.fly(5)
     start = time.monotonic()
     vehicle.fly(100)
-    assert time.monotonic() - start >= 0.18  # 2 s of flight at ten times real time
+    assert time.monotonic() - start >= 0.5  # 2 s of flight; 0.5 s of an earlier stall are made good
     assert vehicle.finish() == (0, "")
