@@ -93,7 +93,7 @@ def test_a_chain_of_imports_is_short():
 
 def test_one_module_forks():
     forking = mentions(r"\bos\.fork(pty)?\(|get_context\(\"fork")
-    assert {module.rpartition(".")[2] for module in forking} == {"processes", "node_process"}
+    assert {module.rpartition(".")[2] for module in forking} == {"processes"}
 
 
 def test_tables_csv_and_pictures_are_made_in_report_only():

@@ -19,9 +19,9 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
+from typing import Any, NoReturn
 
-from mavfi_cli.core.processes import receive, send
+from mavfi_cli.core.processes import fork, receive, send
 
 Run = Callable[[Any, float], Any]
 
@@ -100,10 +100,13 @@ class NodeProcess:
             runs: Kernels by node name; the child uses its own copies.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        pid = os.fork()
-        if pid == 0:
+
+        def child() -> int:
+            """Serve the parent until it closes the connection."""
             ours.close()
             serve(theirs, runs)
+
+        pid = fork(child)
         theirs.close()
         return cls(ours, pid)
 
@@ -201,7 +204,7 @@ class NodeProcess:
                 os.waitpid(self._pid, 0)
 
 
-def serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
+def serve(connection: socket.socket, runs: Mapping[str, Run]) -> NoReturn:
     """Process orders in the child until the parent closes the connection. Does not return."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # only the parent ends this process
@@ -231,11 +234,12 @@ def serve(connection: socket.socket, runs: Mapping[str, Run]) -> None:
 
 
 def _rehearse(connection: socket.socket, runs: Mapping[str, Run]) -> None:
-    pid = os.fork()
-    if pid:
-        send(connection, pid)
-        os.waitpid(pid, 0)
-        return
-    order: _Order = receive(connection)
-    runs[order.node](order.input, order.start_s)
-    os._exit(0)
+    def run() -> int:
+        """Process the next order without an answer."""
+        order: _Order = receive(connection)
+        runs[order.node](order.input, order.start_s)
+        return 0
+
+    pid = fork(run)
+    send(connection, pid)
+    os.waitpid(pid, 0)
