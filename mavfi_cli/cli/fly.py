@@ -201,7 +201,8 @@ def _mission_of(path: Path | None) -> MissionConfig:
     except ConfigError as error:
         if error.path is not None:
             raise
-        raise click.UsageError(f"{spelling(error.key)}: {error.problem}") from None
+        named = f"{spelling(error.key)}: " if error.key else ""
+        raise click.UsageError(f"{named}{error.problem}") from None
     except FaultSpecError as error:
         raise click.UsageError(str(error)) from None
 

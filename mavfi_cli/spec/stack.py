@@ -180,12 +180,13 @@ def load_stack(text: str) -> Stack:
     name, colon, changes = text.partition(":")
     path = shipped_path("stack", name, _FOLDER)
     values, source = _values(path)
-    if colon:
-        changed = _changes(changes)
-        sources = {**values.get("sources", {}), **dict.fromkeys(changed, "this variant's name")}
-        about = {"name": text, "base": name, "description": "", "sources": sources}
-        values = {**values, **changed, **about}
-    return structure(values, Stack, path=path, text=source)
+    stack = structure(values, Stack, path=path, text=source)
+    if not colon:
+        return stack
+    changed = _changes(changes)
+    sources = {**values.get("sources", {}), **dict.fromkeys(changed, "this variant's name")}
+    about = {"name": text, "base": name, "description": "", "sources": sources}
+    return structure({**values, **changed, **about}, Stack)  # its errors are not the file's
 
 
 def lineage(stack: Stack) -> Iterator[Stack]:
