@@ -20,7 +20,7 @@ import numpy as np
 from golden_runs import MATERIAL, Run, apart, fresh_rows, golden_runs
 
 from mavfi_cli.core.states import DType
-from mavfi_cli.detect import registry
+from mavfi_cli.detect import base
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.offline import replay
 from mavfi_cli.detect.preprocess import DETECTED, NAMES
@@ -95,7 +95,7 @@ def found(held: list[Run], count: int = 3000) -> None:
     struck = list(strikes(held, count))
     hours = sum(run.duration_s for run in held) / 3600.0
     kept: dict[str, np.ndarray] = {}
-    for name in registry.names():
+    for name in base.detector_names():
         seen = []
         detector = detector_of(DetectorConfig(name=name), STACK)
         for strike in struck:
@@ -147,7 +147,7 @@ def reference(held: list[Run], count: int = 1500) -> None:
     ):
         found = later = 0
         for strike in struck:
-            detector: Any = GaussianDetector.cold() if cold else registry.find("gad")
+            detector: Any = GaussianDetector.cold() if cold else base.find_detector("gad")
             alarms = set()
             for judged in replay(strike.columns, detector, patience=0 if follows else 1000):
                 if judged.alarm is None:

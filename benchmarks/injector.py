@@ -21,14 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.attack.campaign import TargetRuns, run_campaign
-from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.campaign import Plan, TargetRuns, run_campaign
 from mavfi_cli.attack.outcome import RunOutcome
-from mavfi_cli.attack.plan import Plan
-from mavfi_cli.attack.program import ProgramTarget, Workplace
-from mavfi_cli.fi.tracer.breakpoints import Mechanism
+from mavfi_cli.attack.program import OutputComparison, ProgramTarget, Workplace
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.spawn import Program
+from mavfi_cli.fi.tracer.tracee import Mechanism
 
 SOURCE = r"""
 #include <stdio.h>

@@ -30,12 +30,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mavfi_cli.attack.campaign import one_processor
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
-from mavfi_cli.attack.workers import one_processor
-from mavfi_cli.fi.tracer.breakpoints import PerfBreakpoint
 from mavfi_cli.fi.tracer.inject import instruction_at
-from mavfi_cli.fi.tracer.tracee import Tracee
+from mavfi_cli.fi.tracer.tracee import PerfBreakpoint, Tracee
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 from mavfi_cli.spec.mission import MissionConfig
 

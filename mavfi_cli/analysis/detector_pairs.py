@@ -54,14 +54,14 @@ def harm_of(golden: Flight, flown: Flight) -> Harm:
     A mission that succeeds although its golden flight failed is not harmed.
     """
     if flown["succeeded"]:
-        longer = golden["succeeded"] and (lengthening(golden, flown) or 0.0) > LONGER
+        longer = golden["succeeded"] and (_lengthening(golden, flown) or 0.0) > LONGER
         return Harm.LONGER if longer else Harm.NONE
     if golden["succeeded"]:
         return Harm.LOST
     return Harm.NONE if flown["outcome"] == golden["outcome"] else Harm.OTHERWISE
 
 
-def lengthening(golden: Flight, flown: Flight) -> float | None:
+def _lengthening(golden: Flight, flown: Flight) -> float | None:
     """Flight time over golden flight time, minus 1; None if either flight failed."""
     if not (golden["succeeded"] and flown["succeeded"]):
         return None
@@ -92,7 +92,7 @@ def error_free_pair(
         "detector": detector,
         **_ended("golden_", golden),
         **_ended("", watched),
-        "lengthening": lengthening(golden, watched),
+        "lengthening": _lengthening(golden, watched),
         "alarms": watched["alarm_count"] or 0,
         "episodes": watched["episodes"],
         "golden_won": golden["succeeded"],
@@ -117,7 +117,6 @@ def fault_pair(
     after the strike. `by_chance`: the detector also raises one after that time without the fault.
 
     Args:
-        labels: KEY and the detector.
         watched: the golden flight with the detector.
         protected: the faulty flight itself for the detector `none`.
         complete: whether all faults of its mission are flown with detectors; otherwise only
@@ -138,7 +137,7 @@ def fault_pair(
         **_ended("golden_", golden),
         **_ended("faulty_", faulty),
         **_ended("", protected),
-        "lengthening": lengthening(golden, protected),
+        "lengthening": _lengthening(golden, protected),
         "struck_s": struck_s,
         "alarm_s": alarm and alarm["stamp_s"],
         "alarm_stage": alarm and alarm["stage"],
@@ -155,7 +154,7 @@ def fault_pair(
         "seen": alarm is not None,
         "undone": remaining is Harm.NONE,
         "complete": complete,
-        "faulty_lengthening": lengthening(golden, faulty),
+        "faulty_lengthening": _lengthening(golden, faulty),
         "faulty_struck_s": faulty["struck_s"],
         "faulty_path": faulty["path"],
     }

@@ -19,16 +19,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.detector_pairs import KEY, LONGER, NONE, Harm
-from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers
-from mavfi_cli.analysis.pairs import paired
+from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers, paired
 from mavfi_cli.campaign.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.stats.bootstrap import Interval, interval, interval_of_rows, median
-from mavfi_cli.stats.paired import McNemar, holm, mcnemar
+from mavfi_cli.stats.paired import McNemar, holm, mcnemar, worst_over_own
 from mavfi_cli.stats.roc import curves
 from mavfi_cli.stats.shares import Share, mixture, rate
-from mavfi_cli.stats.worst_case import worst_over_own
 
 RESAMPLES = 999
 TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick per state message
@@ -235,7 +233,6 @@ def recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McN
     harm = here["harm"]
 
     def test(among: pa.Array, column: str) -> McNemar:
-        """McNemar's test of a column of flags over the selected pairs."""
         return mcnemar(*(flags(each.filter(among), column) for each in (here, there)))
 
     lost, harmful = pc.equal(harm, Harm.LOST.value), pc.not_equal(harm, Harm.NONE.value)
@@ -247,7 +244,6 @@ def _share(pairs: pa.Table, column: str, *, wanted: bool = True) -> Share:
 
 
 def _ends(pairs: pa.Table, first: str) -> McNemar:
-    """McNemar's test of success without and with the detector."""
     return mcnemar(flags(pairs, first), flags(pairs, "won"))
 
 

@@ -20,8 +20,7 @@ from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import COUNTED, Injected, canonical
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.layers import cross_layer, failures_per_hour
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.shares import cross_layer, failures_per_hour, rate
 
 KERNELS = "kernels.json"  # written by `mavfi kernels --out`
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
@@ -38,8 +37,6 @@ def failures(
     """Failures of every setting with faults that has golden flights.
 
     Args:
-        found: the settings of the ledger.
-        kernels: folder of `mavfi kernels --out`.
         upsets_per_hour: bit flips that reach the injection sites per flight hour.
 
     Returns:

@@ -14,8 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers
-from mavfi_cli.analysis.pairs import paired
+from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers, paired
 from mavfi_cli.campaign.ledger import Ledger
 from mavfi_cli.campaign.missions import COUNTED, Injected, canonical, label_text
 from mavfi_cli.core.errors import UnknownName

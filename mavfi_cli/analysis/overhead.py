@@ -40,9 +40,6 @@ def flight_overheads(
 ) -> list[dict[str, Any]]:
     """Overheads of every setting with a detector; one row for each detector of a setting.
 
-    Args:
-        found: the settings of the ledger.
-
     Returns:
         Plain values; shares are relative to flight time, and 0.01 is one per cent. `labels`:
         labels of the setting and the detector. `flights`: flights with checks. `checks_per_s`:
@@ -67,7 +64,6 @@ def _of_setting(
     labels: Mapping[str, Any], costs: Sequence[DetectionCost], confidence: float
 ) -> dict[str, Any]:
     def mean(values: Iterable[float]) -> dict[str, Any]:
-        """Mean over the flights, with its interval."""
         return asdict(interval([*values], confidence=confidence, resamples=RESAMPLES))
 
     return {
@@ -151,7 +147,6 @@ def compute_overheads(
     Flights with a fault are ignored, because the fault may cause their alarms.
 
     Args:
-        records: result.json of flights.
         platform: use only flights on this platform; None uses all.
     """
     counted: dict[str, list[DetectionCost]] = {}

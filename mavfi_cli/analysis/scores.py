@@ -66,8 +66,6 @@ class Scores:
 
     Args:
         detectors: all except `none`.
-        stack: stack of the flights.
-        folder: folder of the evaluation.
     """
 
     def __init__(self, detectors: Sequence[DetectorConfig], stack: str, folder: Path) -> None:

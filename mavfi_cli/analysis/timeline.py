@@ -30,11 +30,7 @@ _SAME_S = 1e-9
 
 
 def timelines(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """Timelines of the platforms that answered, one row each, over the same time.
-
-    Args:
-        runs: run of each platform.
-    """
+    """Timelines of the platforms that answered, one row each, over the same time."""
     alone = {name: timeline_of(run) for name, run in runs.items()}
     longest_s = max((row["shown_s"][1] for row in alone.values() if row), default=LEAST_S)
     return [

@@ -74,11 +74,7 @@ def _told(numbers: Sequence[int]) -> str:
 
 
 def _most_prolonged(ledger: Ledger) -> int:
-    """A mission of the pair that is drawn by default.
-
-    Raises:
-        RecordError: no pair has all of its run folders.
-    """
+    """A mission of the pair that is drawn by default."""
     kept: dict[str, bool] = {}
     first: dict[str, int] = {}
     golden_s: dict[str, float] = {}

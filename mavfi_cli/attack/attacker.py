@@ -17,17 +17,10 @@ from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.alarm import ProcessTimer
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
-from mavfi_cli.fi.tracer.inject import (
-    NOTHING,
-    Followed,
-    Injection,
-    instruction_at,
-    reach,
-    strike,
-)
+from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, instruction_at, reach, strike
+from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.sampling import Rule, Strategy
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
@@ -233,10 +226,6 @@ def attack_live(
     tells the tracer first: take its end from the result, not from `Popen.wait`.
 
     Args:
-        pid: id of the process.
-        fault: the fault; its trigger counts from now on.
-        path: path of the record.
-        regions: the regions, as `Image` takes them.
         window: number of instructions for which a destination fault is followed.
         armed: called once the process runs towards the trigger.
         leave_stopped: detach with the process stopped (SIGSTOP) after the flip, for a debugger.

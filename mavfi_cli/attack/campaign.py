@@ -1,26 +1,66 @@
 """Runs many faults on each of several targets: golden run, profile, fault list, runs.
 
 Fault number i of a target depends on the seed, the target's own stream and i only. So the results
-depend neither on the number of workers nor on the other targets.
+depend neither on the number of workers nor on the other targets. A worker process keeps a target
+open and runs its faults in order.
 """
 
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
+import os
+import pickle
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mavfi_cli.attack.attacker import Attacker, RunResult, golden_run
 from mavfi_cli.attack.journal import Journal
-from mavfi_cli.attack.plan import Plan
-from mavfi_cli.attack.profile import TargetProfile, steps_told
-from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace
-from mavfi_cli.attack.workers import AttackWorkers, Bench, one_processor
+from mavfi_cli.attack.profile import steps_told
+from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, TargetProfile
+from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.sampling import Rule
+from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault
+from mavfi_cli.fi.tracer.sampling import Rule, Strategy, strategy
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """Which faults are drawn; `runs` is the number of runs of each target."""
+
+    runs: int
+    seed: int
+    rule: str = Rule.INSTRUCTION.value
+    compat: str | None = None
+    model: FaultModel | None = None
+    windows: int = 16  # number of stepped windows, if not the whole run is stepped
+    null: bool = False  # everything but the flip
+
+    def strategy(self) -> Strategy:
+        """The sampling strategy."""
+        return strategy(self.rule, self.model, compat=self.compat)
+
+    def to_json(self, target: AttackTarget) -> dict[str, Any]:
+        """The entries that results depend on, without number of runs and choice of targets."""
+        return {
+            "seed": self.seed,
+            "rule": self.rule,
+            "compat": self.compat,
+            "windows": self.windows,
+            "null": self.null,
+            "model": self.strategy().model.to_json(),
+            **target.known(),
+        }
+
 
 Record = dict[str, Any]
 Progress = Callable[[str, int], None]
@@ -52,14 +92,11 @@ def run_campaign(
     """Make golden run, profile, fault list and runs of every target.
 
     Args:
-        plan: which faults are drawn, and how.
         targets: one or more; if there are several, each has its own stream.
-        jobs: worker processes.
         folder: the faults are flushed there before the first run, and each run when it is over.
             Runs that are already there are not repeated.
         progress: called with the target and the number of its completed runs; with 0 before its
             golden run and profile.
-        stage: called with the present step before a target's first run.
 
     Raises:
         TracingForbidden: the operating system refuses.
@@ -70,14 +107,14 @@ def run_campaign(
     if folder is not None:
         names = [target.stream[0] for target in targets if target.stream]
         journal = Journal(folder, plan.to_json(targets[0]), runs=plan.runs, kernels=names or None)
-    with AttackWorkers(jobs) as workers:
+    with _AttackWorkers(jobs) as workers:
         return [_attack(plan, each, workers, journal, progress, stage) for each in targets]
 
 
 def _attack(
     plan: Plan,
     target: AttackTarget,
-    workers: AttackWorkers,
+    workers: _AttackWorkers,
     journal: Journal | None,
     progress: Progress,
     stage: Stage,
@@ -87,7 +124,7 @@ def _attack(
     with one_processor():
         prepared, place = _prepare(plan, target, stage)
     stage(f"drawing {plan.runs} faults")
-    bench = Bench(plan=plan, target=prepared.target, golden=prepared.golden)
+    bench = _Bench(plan=plan, target=prepared.target, golden=prepared.golden)
     workers.take(bench, Attacker(place=place, golden=prepared.golden))
     planned = _draw(plan, bench, prepared)
     done: dict[int, Record] = {}
@@ -114,7 +151,7 @@ def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns
         golden, profile = golden_run(place), None
         if plan.strategy().rule is Rule.INSTRUCTION:
             stage("profile")
-            rng = Bench(plan=plan, target=target, golden=golden).generator("profile")
+            rng = _Bench(plan=plan, target=target, golden=golden).generator("profile")
             profile = place.profile(rng, windows=plan.windows, watch=steps_told(stage))
         undo.pop_all()
     stream = {"kernel": target.stream[0]} if target.stream else {}
@@ -128,7 +165,7 @@ def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns
     return prepared, place
 
 
-def _draw(plan: Plan, bench: Bench, prepared: TargetRuns) -> list[Record]:
+def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
     """Make the records of all faults before they run; time rules draw at the stop."""
     chosen, profile, records = plan.strategy(), prepared.profile, []
     for index in range(plan.runs):
@@ -173,3 +210,133 @@ def completed(planned: Mapping[str, Any], result: RunResult) -> Record:
         not_injected_reason=result.reason,
         run_s=result.run_s,
     )
+
+
+# -- worker processes
+
+_CHUNK = 32  # tasks that are sent at once
+Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn at its moment
+
+
+@contextmanager
+def one_processor() -> Iterator[None]:
+    """Stay on one processor: tracer and target switch all the time, which is fastest there."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, [max(before)])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bench:
+    """A target with its golden run, as plain values for a worker process."""
+
+    plan: Plan
+    target: AttackTarget
+    golden: Golden
+
+    def generator(self, *what: str | int) -> np.random.Generator:
+        """The target's own random numbers; those of fault number i depend on i only."""
+        return generator(self.plan.seed, Stream.FAULT, *self.target.stream, *what)
+
+
+class _Open:
+    """The one target that a worker process keeps open between chunks."""
+
+    stream: tuple[str, ...] | None = None
+    attacker: Attacker | None = None
+
+    @classmethod
+    def of(cls, bench: _Bench) -> Attacker:
+        """The attacker of a bench: the open one, or a new one in its place."""
+        if cls.attacker is None or cls.stream != bench.target.stream:
+            cls.keep(bench, Attacker(place=bench.target.open(), golden=bench.golden))
+        assert cls.attacker is not None
+        return cls.attacker
+
+    @classmethod
+    def keep(cls, bench: _Bench, attacker: Attacker) -> None:
+        """Keep an attacker open for later chunks, and close the previous one."""
+        cls.close()
+        cls.attacker, cls.stream = attacker, bench.target.stream
+
+    @classmethod
+    def close(cls) -> None:
+        if cls.attacker is not None:
+            cls.attacker.place.close()
+            cls.attacker = None
+
+
+def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
+    bench, tasks = job
+    attacker, results = _Open.of(bench), []
+    for index, fault in tasks:
+        if fault is not None:
+            results.append((index, attacker.run(fault)))
+        else:
+            timed = attacker.run_timed(bench.plan.strategy(), bench.generator(index))
+            results.append((index, timed))
+    return results
+
+
+def _settle(queue: Any) -> None:
+    os.sched_setaffinity(0, [queue.get()])
+
+
+class _AttackWorkers:
+    """The workers of one campaign, or this process if one is enough; a context manager."""
+
+    def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> _AttackWorkers:
+        if self._jobs > 1:
+            context = multiprocessing.get_context("spawn")
+            processors, queue = sorted(os.sched_getaffinity(0)), context.Queue()
+            for worker in range(self._jobs):
+                queue.put(processors[worker % len(processors)])
+            self._pool = ProcessPoolExecutor(
+                self._jobs, mp_context=context, initializer=_settle, initargs=(queue,)
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _Open.close()
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def take(self, bench: _Bench, attacker: Attacker) -> None:
+        """Keep an attacker prepared in this process, or close it if no worker here needs it."""
+        if self._pool is None:
+            _Open.keep(bench, attacker)
+        else:
+            attacker.place.close()
+
+    def run(self, bench: _Bench, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
+        """The results in the order of the tasks.
+
+        Raises:
+            FaultError: something killed a worker.
+            TargetError: the target cannot be sent to a worker.
+        """
+        size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
+        jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
+        if self._pool is None:
+            for job in jobs:
+                with one_processor():
+                    results = _work(job)
+                yield from results
+            return
+        try:
+            pickle.dumps(bench)
+        except Exception as error:  # the target may raise anything
+            problem = f"cannot be handed to a worker process: {error}"
+            raise TargetError(bench.target.name, problem) from None
+        try:
+            for results in self._pool.map(_work, jobs):
+                yield from results
+        except BrokenProcessPool:
+            raise FaultError("a worker process was killed; the campaign is incomplete") from None

@@ -8,7 +8,6 @@ where it stopped.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,10 +33,8 @@ class Journal:
         """Open the folder, or create it.
 
         Args:
-            folder: folder of the campaign.
             known: everything that its results depend on, as plain values.
             runs: number of runs of each kernel when the campaign is complete.
-            kernels: names of the kernels; None for a program.
 
         Raises:
             ConfigError: it holds another campaign, or runs beyond this one.
@@ -97,11 +94,8 @@ class Journal:
         path = self._folder / RUNS
         line = (json.dumps(entry) + "\n").encode()
         try:
-            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-            try:
-                os.write(file, line)
-            finally:
-                os.close(file)
+            with path.open("ab", buffering=0) as file:
+                file.write(line)
         except OSError as error:
             raise RecordError(f"{path}: {error.strerror}") from None
 

@@ -13,107 +13,23 @@ times their mean length, and an instruction uniformly from its stepped windows.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.attack.outcome import Window
-from mavfi_cli.attack.target import AttackPlace
+from mavfi_cli.attack.target import AttackPlace, TargetProfile, Watch
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
-from mavfi_cli.fi.tracer.image import Image, Location
-from mavfi_cli.fi.tracer.sampling import Strategy, draw_fault
-from mavfi_cli.fi.tracer.symbols import short_name
-from mavfi_cli.fi.tracer.windows import Segment, Stratum, record_window
+from mavfi_cli.fi.tracer.fault import CountedStop
+from mavfi_cli.fi.tracer.image import Location, short_name
+from mavfi_cli.fi.tracer.sampling import Segment, Stratum, record_window
+from mavfi_cli.fi.tracer.tracee import Tracee
 
 STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
 _FIRST = np.array([1])
-Watch = Callable[[int], None]  # called with the instructions stepped since the last call
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TargetProfile:
-    """The instructions that can be hit in one run, with what is needed to draw from them."""
-
-    strata: tuple[Stratum, ...]
-    image: Image
-    code: tuple[tuple[int, bytes], ...]  # start address and bytes of the code in scope
-    cost_s: float
-
-    @property
-    def complete(self) -> bool:
-        """True if every window of the run was stepped."""
-        return all(stratum.complete for stratum in self.strata)
-
-    @property
-    def windows(self) -> str:
-        """Stepped windows and all windows, in words."""
-        stepped = sum(len(stratum.segments) for stratum in self.strata)
-        return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
-
-    @property
-    def executed(self) -> int:
-        """Number of executed instructions in scope, over the stepped windows."""
-        return sum(stratum.executed for stratum in self.strata)
-
-    @property
-    def instructions(self) -> float:
-        """Number of executed instructions in scope; estimated if the profile is not complete."""
-        return sum(stratum.instructions for stratum in self.strata)
-
-    def code_at(self, address: int) -> bytes:
-        """16 bytes of code."""
-        for start, data in self.code:
-            if start <= address < start + len(data):
-                return data[address - start : address - start + 16]
-        return b""
-
-    def window_of(self, record: Mapping[str, Any]) -> Window | None:
-        """The sampled window of a fault; None if no sample of windows was taken."""
-        first = record["trigger"][0]
-        for number, stratum in enumerate(self.strata):
-            at = stratum.marker
-            if at is not None and (at.object, at.offset) == (first["object"], first["offset"]):
-                return None if stratum.complete else (number, int(first["count"]))
-        return None
-
-    def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
-        """Draw one fault, uniformly over the executed instructions."""
-        shares = np.array([stratum.instructions for stratum in self.strata])
-        which = int(rng.choice(len(shares), p=shares / shares.sum())) if len(shares) > 1 else 0
-        stratum, locate = self.strata[which], self.image.locate
-        return draw_fault(stratum, plan, rng, code_at=self.code_at, locate=locate)
-
-    def after(self, begin: CountedStop) -> TargetProfile:
-        """Make the same profile for a run that has to reach `begin` first."""
-
-        def later(stratum: Stratum) -> Stratum:
-            """The stratum with the new stage before each segment's start."""
-            segments = (replace(each, start=(begin, *each.start)) for each in stratum.segments)
-            return replace(stratum, segments=tuple(segments))
-
-        return replace(self, strata=tuple(map(later, self.strata)))
-
-    def in_words(self) -> str:
-        """How the population of faults was found, in words."""
-        if self.complete:
-            return f"all {self.instructions:.0f} executed instructions in scope"
-        parts = []
-        for stratum in self.strata:
-            if stratum.marker is None:
-                parts.append("the beginning")
-                continue
-            name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
-            stepped = f"{len(stratum.segments)} of {stratum.windows_in_run}"
-            parts.append(f"{stepped} windows from {name}")
-        return (
-            f"about {self.instructions:.3g} executed instructions in scope, by sample: "
-            f"{', '.join(parts)}; {self.executed} stepped"
-        )
 
 
 def steps_told(stage: Callable[[str], None]) -> Watch:
@@ -121,7 +37,6 @@ def steps_told(stage: Callable[[str], None]) -> Watch:
     total = 0
 
     def watch(steps: int) -> None:
-        """Add these steps and tell the sum."""
         nonlocal total
         total += steps
         stage(f"profile, {total} instructions stepped")
@@ -142,13 +57,9 @@ def profile_run(
     """Step a golden run, or a sample of the windows that markers cut it into.
 
     Args:
-        place: the place where it runs.
-        rng: draws the windows.
         markers: instructions in scope; none for the whole run.
         windows: the least number of windows of each marker to step.
         enough: more windows are stepped while they have at most this many instructions together.
-        limit: refuse longer windows, instructions.
-        watch: called with the progress.
 
     Raises:
         TargetError: no instruction in scope executes, or the run does not repeat itself.
@@ -194,12 +105,7 @@ def profile_calls(
     """Step calls of one function, which is drawn in proportion to its calls.
 
     Args:
-        place: the place where the target runs.
-        rng: draws the function and its calls.
-        functions: entries of the functions to draw from.
         windows: the most calls to step.
-        limit: refuse longer calls, instructions.
-        watch: called with the progress.
 
     Raises:
         WindowTooLong: too many instructions.
@@ -209,7 +115,8 @@ def profile_calls(
     steppers = [_Stepper(place, entry, None, limit, watch) for entry in functions]
     counts = [stepper.count() for stepper in steppers]
     if not any(counts):
-        image = _image(place)
+        with _started(place) as tracee:
+            image = place.image(tracee)
         names = " or ".join(short_name(image.symbol(entry)) for entry in functions)
         raise TargetError(place.name, f"never calls {names}")
     which = 0
@@ -227,30 +134,26 @@ def function_of(place: AttackPlace, name: str) -> Location:
     Raises:
         UnknownName: there is no function of that name; names the nearest.
     """
-    tracee = place.start()
-    try:
+    with _started(place) as tracee:
         image = place.image(tracee)
         return image.function(name, place.scope(image).objects)
-    finally:
-        tracee.kill()
 
 
-def _image(place: AttackPlace) -> Image:
+@contextmanager
+def _started(place: AttackPlace) -> Iterator[Tracee]:
+    """A run of the place, which is killed afterwards."""
     tracee = place.start()
     try:
-        return place.image(tracee)
+        yield tracee
     finally:
         tracee.kill()
 
 
 def _profile(place: AttackPlace, strata: Iterable[Stratum], begun: float) -> TargetProfile:
-    tracee = place.start()
-    try:
+    with _started(place) as tracee:
         image = place.image(tracee)
         spans = place.scope(image).spans
-        code = tuple((s.start, tracee.read_memory(s.start, len(s) + 16)) for s in spans)
-    finally:
-        tracee.kill()
+        code = tuple((s.start, tracee.memory.read(s.start, len(s) + 16)) for s in spans)
     return TargetProfile(
         strata=tuple(strata), image=image, code=code, cost_s=time.perf_counter() - begun
     )
@@ -269,11 +172,8 @@ class _Stepper:
     def count(self) -> int:
         """Count the windows of a run."""
         assert self.marker is not None
-        tracee = self.place.start()
-        try:
+        with _started(self.place) as tracee:
             return tracee.count_to_end(self.place.image(tracee).address(self.marker))
-        finally:
-            tracee.kill()
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
         """Step the windows of these numbers, from 1, out of `count`."""
@@ -287,8 +187,7 @@ class _Stepper:
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:
         """Step windows of one run, until one lies inside the window before it."""
-        tracee = self.place.start()
-        try:
+        with _started(self.place) as tracee:
             image = self.place.image(tracee)
             address = -1 if self.marker is None else image.address(self.marker)
             passed = 0
@@ -311,5 +210,3 @@ class _Stepper:
                 )
                 passed = number + int(np.count_nonzero(trace == address)) - 1
                 yield Segment(start=start, trace=trace)
-        finally:
-            tracee.kill()

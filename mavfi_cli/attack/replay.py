@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
-from mavfi_cli.attack.campaign import completed
+from mavfi_cli.attack.campaign import completed, one_processor
 from mavfi_cli.attack.journal import read_plan, read_runs
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.inputs import INPUTS
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.workers import one_processor
 from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.fi.tracer import record
@@ -28,20 +27,17 @@ _INJECTION = ("applied", "reason", "address", "before", "after")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Replay:
-    """One repeated run."""
-
+class _Replay:
     kernel: str
     run: int
     differs: tuple[str, ...]  # keys of the record that differ; empty if it is identical
     record: dict[str, Any]
 
 
-def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> Iterator[Replay]:
+def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> Iterator[_Replay]:
     """Repeat the runs of a campaign's folder.
 
     Args:
-        folder: folder of the campaign.
         kernels: names of the kernels; all of ours if none is named.
         runs: number of runs of each kernel, from the first; 0 for all.
 
@@ -72,9 +68,9 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
         raise RecordError(f"{folder}: no runs that can be repeated")
 
 
-def _replay(attacker: Attacker, entry: dict[str, Any]) -> Replay:
+def _replay(attacker: Attacker, entry: dict[str, Any]) -> _Replay:
     again = completed(entry, attacker.run(record.fault_of(entry)))
     differs = [name for name in _COMPARED if again[name] != entry[name]]
     was, now = entry["injection"], again["injection"]
     differs += [name for name in _INJECTION if now.get(name) != was.get(name)]
-    return Replay(kernel=entry["kernel"], run=entry["run"], differs=tuple(differs), record=again)
+    return _Replay(kernel=entry["kernel"], run=entry["run"], differs=tuple(differs), record=again)

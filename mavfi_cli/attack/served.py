@@ -75,10 +75,6 @@ class ServedProcess:
     def begin(self, message: Any, name: str) -> Any:
         """Send the first message, wait until the program is ready, and return its answer.
 
-        Args:
-            message: the message.
-            name: name of the program, for the error.
-
         Raises:
             TargetError: the program could not start; says why.
         """

@@ -9,17 +9,18 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 
-from mavfi_cli.attack.outcome import RunOutcome
-from mavfi_cli.fi.tracer.image import Image, Scope
+from mavfi_cli.attack.outcome import RunOutcome, Window
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
+from mavfi_cli.fi.tracer.image import Image, Scope, short_name
+from mavfi_cli.fi.tracer.sampling import Strategy, Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
-if TYPE_CHECKING:
-    from mavfi_cli.attack.profile import TargetProfile, Watch
+Watch = Callable[[int], None]  # called with the instructions stepped since the last call
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +62,86 @@ class RunVerdict:
     outcome: RunOutcome
     output_sha256: str
     details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetProfile:
+    """The instructions that can be hit in one run, with what is needed to draw from them."""
+
+    strata: tuple[Stratum, ...]
+    image: Image
+    code: tuple[tuple[int, bytes], ...]  # start address and bytes of the code in scope
+    cost_s: float
+
+    @property
+    def complete(self) -> bool:
+        """True if every window of the run was stepped."""
+        return all(stratum.complete for stratum in self.strata)
+
+    @property
+    def windows(self) -> str:
+        """Stepped windows and all windows, in words."""
+        stepped = sum(len(stratum.segments) for stratum in self.strata)
+        return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
+
+    @property
+    def executed(self) -> int:
+        """Number of executed instructions in scope, over the stepped windows."""
+        return sum(stratum.executed for stratum in self.strata)
+
+    @property
+    def instructions(self) -> float:
+        """Number of executed instructions in scope; estimated if the profile is not complete."""
+        return sum(stratum.instructions for stratum in self.strata)
+
+    def code_at(self, address: int) -> bytes:
+        """16 bytes of code."""
+        for start, data in self.code:
+            if start <= address < start + len(data):
+                return data[address - start : address - start + 16]
+        return b""
+
+    def window_of(self, record: Mapping[str, Any]) -> Window | None:
+        """The sampled window of a fault; None if no sample of windows was taken."""
+        first = record["trigger"][0]
+        for number, stratum in enumerate(self.strata):
+            at = stratum.marker
+            if at is not None and (at.object, at.offset) == (first["object"], first["offset"]):
+                return None if stratum.complete else (number, int(first["count"]))
+        return None
+
+    def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
+        """Draw one fault, uniformly over the executed instructions."""
+        shares = np.array([stratum.instructions for stratum in self.strata])
+        which = int(rng.choice(len(shares), p=shares / shares.sum())) if len(shares) > 1 else 0
+        stratum, locate = self.strata[which], self.image.locate
+        return draw_fault(stratum, plan, rng, code_at=self.code_at, locate=locate)
+
+    def after(self, begin: CountedStop) -> TargetProfile:
+        """Make the same profile for a run that has to reach `begin` first."""
+
+        def later(stratum: Stratum) -> Stratum:
+            segments = (replace(each, start=(begin, *each.start)) for each in stratum.segments)
+            return replace(stratum, segments=tuple(segments))
+
+        return replace(self, strata=tuple(map(later, self.strata)))
+
+    def in_words(self) -> str:
+        """How the population of faults was found, in words."""
+        if self.complete:
+            return f"all {self.instructions:.0f} executed instructions in scope"
+        parts = []
+        for stratum in self.strata:
+            if stratum.marker is None:
+                parts.append("the beginning")
+                continue
+            name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
+            stepped = f"{len(stratum.segments)} of {stratum.windows_in_run}"
+            parts.append(f"{stepped} windows from {name}")
+        return (
+            f"about {self.instructions:.3g} executed instructions in scope, by sample: "
+            f"{', '.join(parts)}; {self.executed} stepped"
+        )
 
 
 class AttackPlace(Protocol):
@@ -175,7 +256,6 @@ def judged(
     """Judge a run: its outcome, and the size of its difference if it is known.
 
     Args:
-        golden: the golden run.
         ended: how the run ended; None if it exceeded its limit.
         output: its output; None if that is not complete.
         compare: function from golden and other output to their difference, or to None.

@@ -79,7 +79,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
 
 def _plan(options: dict[str, Any]) -> Any:
     from mavfi_cli.core.errors import ConfigError
-    from mavfi_cli.studies.compare_plan import ComparePlan
+    from mavfi_cli.studies.compare import ComparePlan
 
     names = ("world", "field", "missions", "first_seed", "seed", "stack")
     chosen: dict[str, Any] = {name: options[name] for name in names}

@@ -24,7 +24,7 @@ def detect() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON, with the full provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
     """List the detectors with model files, stacks, thresholds and origin."""
-    from mavfi_cli.detect.listing import listing
+    from mavfi_cli.detect.model import listing
 
     rows = listing(models)
     if as_json:
@@ -113,7 +113,7 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
 
 def _plan(options: dict[str, Any]) -> Any:
     from mavfi_cli.spec.mission import MissionConfig
-    from mavfi_cli.studies.evaluation_plan import DETECTORS, WORLDS, EvaluationPlan
+    from mavfi_cli.studies.evaluate import DETECTORS, WORLDS, EvaluationPlan
 
     base = {key: options[key] for key in ("platform", "stack") if options[key] is not None}
     named = options["detectors"]

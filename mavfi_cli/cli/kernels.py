@@ -18,8 +18,7 @@ from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
 from mavfi_cli.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from mavfi_cli.attack.campaign import TargetRuns
-    from mavfi_cli.attack.plan import Plan
+    from mavfi_cli.attack.campaign import Plan, TargetRuns
     from mavfi_cli.attack.target import AttackTarget
 
 
@@ -114,7 +113,7 @@ def _refuse(names: Sequence[str], why: str) -> None:
 
 
 def _plan(options: dict[str, Any]) -> Plan:
-    from mavfi_cli.attack.plan import Plan
+    from mavfi_cli.attack.campaign import Plan
     from mavfi_cli.fi.tracer.fault import FaultModel
 
     plan = Plan(
@@ -197,8 +196,7 @@ def _attack_program(options: dict[str, Any]) -> None:
 
 
 def _program(options: dict[str, Any]) -> AttackTarget:
-    from mavfi_cli.attack.comparison import OutputComparison, absolute_arguments
-    from mavfi_cli.attack.program import ProgramTarget
+    from mavfi_cli.attack.program import OutputComparison, ProgramTarget, absolute_arguments
     from mavfi_cli.fi.tracer.spawn import Program
 
     comparison = OutputComparison.of(

@@ -98,8 +98,8 @@ def vpm(
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.tables.model import model_csv, model_lines
     from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
+    from mavfi_cli.vpm.model import schemes_with
     from mavfi_cli.vpm.report import report
-    from mavfi_cli.vpm.schemes import schemes_with
     from mavfi_cli.vpm.vehicle import load_vehicle
 
     if as_json and as_csv:
@@ -156,7 +156,7 @@ def overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, 
 
 def _measured(path: str, platform: str | None) -> dict[str, tuple[float, str]]:
     from mavfi_cli.analysis.overhead import recorded_overheads
-    from mavfi_cli.vpm.schemes import DETECTORS
+    from mavfi_cli.vpm.model import DETECTORS
 
     known = recorded_overheads(Path(path), DETECTORS, platform)
     return {name: (100.0 * each.share, each.told(path)) for name, each in known.items()}
@@ -188,8 +188,7 @@ def _flown(
 ) -> dict[str, Any]:
     from mavfi_cli.campaign.run import Options
     from mavfi_cli.cli.missions_view import missions_view
-    from mavfi_cli.studies.redundancy import fly_and_report
-    from mavfi_cli.studies.redundancy_plan import WORLDS, RedundancyPlan
+    from mavfi_cli.studies.redundancy import WORLDS, RedundancyPlan, fly_and_report
 
     plan = RedundancyPlan(
         vehicles=vehicles,
@@ -208,8 +207,8 @@ def _flown(
 
 def _choices(options: dict[str, Any]) -> Any:
     from mavfi_cli.spec.platform import load_platform
-    from mavfi_cli.vpm.board import load_board
     from mavfi_cli.vpm.report import Choices
+    from mavfi_cli.vpm.vehicle import load_board
 
     platform, board = options["platform"], options["board"]
     return Choices(

@@ -13,9 +13,7 @@ from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import Message
 from mavfi_cli.core.types import Briefing, Trajectory
 from mavfi_cli.detect.gate import Gate
-from mavfi_cli.fi.source.activation import Follower, Reader
-from mavfi_cli.fi.source.injector import SourceInjector, Strike
-from mavfi_cli.fi.source.memory import MemoryInjector
+from mavfi_cli.fi.source.injector import Follower, MemoryInjector, Reader, SourceInjector, Strike
 from mavfi_cli.fi.source.schedule import Moment, Schedule
 from mavfi_cli.spec.fault import DETECTOR, PROCESS, FaultConfig
 from mavfi_cli.spec.mission import MissionConfig

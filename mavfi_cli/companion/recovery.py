@@ -26,7 +26,7 @@ from mavfi_cli.autonomy.trajectory import without_waypoint
 from mavfi_cli.companion.protection import Decision, NoProtection, Response
 from mavfi_cli.core.states import Message
 from mavfi_cli.core.types import CollisionReport, Stage, Trajectory, VehicleState
-from mavfi_cli.fi.source.activation import Follower
+from mavfi_cli.fi.source.injector import Follower
 
 
 class Recovery:

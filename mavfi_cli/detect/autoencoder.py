@@ -63,7 +63,7 @@ def _reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
 
 
 @compiled
-def judge_tick(
+def _judge_tick(
     memory: FloatArray,
     work: Codes,
     waypoints: FloatArray,
@@ -79,7 +79,7 @@ def judge_tick(
 
 
 @compiled
-def judge_plan(
+def _judge_plan(
     memory: FloatArray,
     work: Codes,
     waypoints: FloatArray,
@@ -106,8 +106,8 @@ class AutoencoderDetector(FittedDetector):
     scratch: ClassVar[int] = COUNT + HIDDEN + CODED
     shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,), **WEIGHTS}
     divisors: ClassVar[tuple[str, ...]] = ("scale",)
-    tick_judge = staticmethod(judge_tick)
-    plan_judge = staticmethod(judge_plan)
+    tick_judge = staticmethod(_judge_tick)
+    plan_judge = staticmethod(_judge_plan)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the reconstruction error: the mean square over the 13 scaled deltas."""

@@ -2,6 +2,12 @@
 
 Flights are split by seed into three disjoint parts: `train` fits weights, means and scales,
 `validation` selects the epoch of the autoencoder, and `threshold` sets the thresholds.
+
+Only the autoencoder needs torch: `pip install mavfi[train]`. Adam minimises the mean squared
+reconstruction error of all distinct error-free vectors in one batch, from several initial weights.
+The threshold will be a largest error, so the training keeps the weights, over all epochs and
+starts, with the lowest largest error on the validation vectors. It runs on one thread in double
+precision with a fixed seed, so the same data and the same version of torch give the same weights.
 """
 
 from __future__ import annotations
@@ -10,6 +16,7 @@ import math
 import platform
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -19,14 +26,14 @@ from mavfi_cli.core.errors import ModelError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import DType
 from mavfi_cli.core.types import FloatArray, Stage
-from mavfi_cli.detect import gaussian, span, train_autoencoder
-from mavfi_cli.detect.autoencoder import AutoencoderDetector
+from mavfi_cli.detect import gaussian, span
+from mavfi_cli.detect.autoencoder import CODED, HIDDEN, AutoencoderDetector
 from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.model import Model, checked_threshold
 from mavfi_cli.detect.norm import NormDetector
-from mavfi_cli.detect.preprocess import DETECTED, NAMES, Codes
+from mavfi_cli.detect.preprocess import COUNT, DETECTED, NAMES, Codes
 from mavfi_cli.detect.span import RangeDetector
 from mavfi_cli.detect.watch import ranges_of
 
@@ -42,7 +49,7 @@ KINDS = ("gad", "aad", "range", "l2")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Split:
+class _Split:
     """Indices of the flights of a data set by their use."""
 
     train: tuple[int, ...]
@@ -50,7 +57,7 @@ class Split:
     threshold: tuple[int, ...]
 
 
-def split(dataset: Dataset, seed: int) -> Split:
+def split(dataset: Dataset, seed: int) -> _Split:
     """Split by flight, in the same way for each world.
 
     Raises:
@@ -63,16 +70,14 @@ def split(dataset: Dataset, seed: int) -> Split:
     parts: dict[str, list[int]] = {"train": [], "validation": [], "threshold": []}
     for number, place in enumerate(ordered):
         parts[_TURNS[number % len(_TURNS)]].append(place)
-    return Split(**{name: tuple(sorted(places)) for name, places in parts.items()})
+    return _Split(**{name: tuple(sorted(places)) for name, places in parts.items()})
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
     """Check before the flights that `fit` will be able to use them.
 
     Args:
-        kinds: Kinds of detector to fit.
         flights: Maximum number of flights.
-        n_sigma: Threshold of the Gaussian model.
 
     Raises:
         UnknownName: A kind is unknown.
@@ -86,7 +91,7 @@ def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) ->
     if n_sigma is not None:
         checked_threshold(n_sigma, "n sigma")
     if "aad" in kinds:
-        train_autoencoder.require_torch()
+        _require_torch()
 
 
 def _refuse_few(flights: int) -> None:
@@ -103,7 +108,6 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
 
     Args:
         kind: Kind of detector: gad, aad, range or l2.
-        dataset: Error-free flights.
         seed: Seed of the autoencoder's initial weights and of the split.
         n_sigma: Threshold of the Gaussian model. None selects the smallest integer that the
             flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
@@ -126,7 +130,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
             if n_sigma is None
             else GaussianDetector.cold(checked_threshold(n_sigma, "n sigma"))
         )
-        detector = warmed(cold, [*train, *validation])
+        detector = _warmed(cold, [*train, *validation])
         largest = _largest(detector, held_out)
         details["largest_distance_sigma"] = largest
         if n_sigma is None:
@@ -145,7 +149,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         detector.memory["threshold"][0] = _largest(detector, held_out)
     elif kind == "aad":
         scale = scale_of(train)
-        trained = train_autoencoder.train(
+        trained = train_autoencoder(
             mirrored(_all(train)) / scale, mirrored(_all(validation)) / scale, seed=seed
         )
         detector = AutoencoderDetector({"threshold": np.ones(1), "scale": scale, **trained.weights})
@@ -164,7 +168,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     )
 
 
-def warmed(detector: GaussianDetector, flights: list[FlightSamples]) -> GaussianDetector:
+def _warmed(detector: GaussianDetector, flights: list[FlightSamples]) -> GaussianDetector:
     """Return the detector after it has learned all samples of the flights."""
     for flight in flights:
         for stage in Stage:
@@ -228,7 +232,6 @@ def _flags(flight: FlightSamples) -> tuple[list[bool], list[bool], list[bool]]:
 
 
 def _all(flights: list[FlightSamples]) -> Codes:
-    """Return the deltas (n, COUNT) of all samples of some flights."""
     return np.concatenate([flight.deltas for flight in flights])
 
 
@@ -244,10 +247,9 @@ def _largest(detector: Detector, flights: list[FlightSamples]) -> float:
 
 
 def _provenance(
-    dataset: Dataset, parts: Split, seed: int, threshold: float, details: Mapping[str, Any]
+    dataset: Dataset, parts: _Split, seed: int, threshold: float, details: Mapping[str, Any]
 ) -> dict[str, Any]:
     def named(places: tuple[int, ...]) -> list[str]:
-        """Return the names of flights as world/seed."""
         return [f"{dataset.flights[p].world}/{dataset.flights[p].seed}" for p in places]
 
     return {
@@ -268,3 +270,97 @@ def _provenance(
         },
         **{name: value for name, value in details.items() if name != "versions"},
     }
+
+
+EPOCHS = 1000
+STARTS = 5
+LEARNING_RATE = 0.01
+CURVE_EVERY = 20  # epochs between two points of the recorded loss curve
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _TrainedWeights:
+    """Weights, named as in `autoencoder.WEIGHTS`, and the provenance of the training."""
+
+    weights: Mapping[str, FloatArray]
+    provenance: Mapping[str, Any]
+
+
+def _require_torch() -> None:
+    """Check that torch is installed, without the seconds that its import takes."""
+    if find_spec("torch") is None:
+        raise ModelError("training the autoencoder needs torch: pip install 'mavfi[train]'")
+
+
+def train_autoencoder(inputs: FloatArray, validation: FloatArray, *, seed: int) -> _TrainedWeights:
+    """Train on scaled vectors (n, 13) and keep the best weights for the validation (m, 13).
+
+    Args:
+        inputs, validation: Scaled deltas, each vector once.
+        seed: Seed of the first start; each further start uses the next.
+
+    Raises:
+        ModelError: torch is not installed.
+    """
+    _require_torch()
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        starts = [_train_once(torch, inputs, validation, seed + number) for number in range(STARTS)]
+    finally:
+        torch.set_num_threads(threads)
+    return min(starts, key=lambda start: float(start.provenance["validation_error"]))
+
+
+def _train_once(
+    torch: Any, inputs: FloatArray, validation: FloatArray, seed: int
+) -> _TrainedWeights:
+    source = torch.Generator().manual_seed(seed)
+    sizes = ((COUNT, HIDDEN), (HIDDEN, CODED), (CODED, COUNT))
+    names = ("hidden", "coded", "output")
+    weights = {}
+    for name, (before, after) in zip(names, sizes, strict=True):
+        reach = (6.0 / (before + after)) ** 0.5  # Glorot, uniform
+        drawn = torch.rand((after, before), generator=source, dtype=torch.float64)
+        weights[f"{name}_weights"] = (reach * (2.0 * drawn - 1.0)).requires_grad_()
+        weights[f"{name}_biases"] = torch.zeros(after, dtype=torch.float64).requires_grad_()
+
+    def loss_of(rows: Any) -> Any:
+        """Return the mean squared error (n,) of each of the vectors (n, COUNT)."""
+        hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
+        coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
+        output = coded @ weights["output_weights"].T + weights["output_biases"]
+        return ((output - rows) ** 2).mean(dim=1)  # one error per vector
+
+    rows, checked = torch.tensor(inputs), torch.tensor(validation)
+    optimiser = torch.optim.Adam(list(weights.values()), lr=LEARNING_RATE)
+    best, best_epoch, kept = np.inf, 0, {}
+    curve: list[list[float]] = []
+    for epoch in range(EPOCHS + 1):
+        with torch.no_grad():
+            met = float(loss_of(checked).max())
+        if met < best:
+            best, best_epoch = met, epoch
+            kept = {name: w.detach().numpy().copy() for name, w in weights.items()}
+        loss = loss_of(rows).mean()
+        if epoch % CURVE_EVERY == 0:
+            curve.append([epoch, float(loss.detach()), met])
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return _TrainedWeights(
+        weights=kept,
+        provenance={
+            "epochs": EPOCHS,
+            "learning_rate": LEARNING_RATE,
+            "best_epoch": best_epoch,
+            "validation_error": best,
+            "starts": STARTS,
+            "start_seed": seed,
+            "distinct_vectors": {"train": len(inputs), "validation": len(validation)},
+            "loss_curve": {"columns": ["epoch", "train_mean", "validation_largest"], "rows": curve},
+            "versions": {"torch": str(torch.__version__)},
+        },
+    )

@@ -70,7 +70,6 @@ class Gate:
         detector: New detector for this mission only, because it learns.
         protect: Stages to watch. The deltas of the others stay 0.
         params: Preprocessing parameters; must be those of the detector's model.
-        watch: Watch of the extended states; None for no watch.
 
     Attributes:
         fresh: Stages with a new sample in the last judged message.
@@ -173,7 +172,6 @@ class Gate:
         not change the gate, and the detector does not learn.
 
         Args:
-            trajectory: Active plan.
             first: Index of the present waypoint.
 
         Returns:

@@ -42,7 +42,7 @@ _PLANNING, _CONTROL = SPANS[Stage.PLANNING]
 
 
 @compiled
-def farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
+def _farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
     """Return the largest distance from the mean in sigmas; NaN if a model is corrupted."""
     worst = 0.0
     for place in range(first, end):
@@ -75,7 +75,7 @@ def _welford(memory: FloatArray, deltas: Codes, first: int, end: int) -> None:
 
 
 @compiled
-def judge_tick(
+def _judge_tick(
     memory: FloatArray,
     work: Codes,
     waypoints: FloatArray,
@@ -88,11 +88,11 @@ def judge_tick(
     take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
     deltas = work[DELTA]
     if row >= 0:
-        score = farthest(memory, deltas, _PLANNING, _CONTROL)
+        score = _farthest(memory, deltas, _PLANNING, _CONTROL)
         if not score <= memory[0]:
             return score, OF_PLANNING
         _welford(memory, deltas, _PLANNING, _CONTROL)
-    score = farthest(memory, deltas, _CONTROL, COUNT)
+    score = _farthest(memory, deltas, _CONTROL, COUNT)
     if not score <= memory[0]:
         return score, OF_CONTROL
     _welford(memory, deltas, _CONTROL, COUNT)
@@ -100,7 +100,7 @@ def judge_tick(
 
 
 @compiled
-def judge_plan(
+def _judge_plan(
     memory: FloatArray,
     work: Codes,
     waypoints: FloatArray,
@@ -112,7 +112,7 @@ def judge_plan(
     """Compute the steps of a plan and their scores; see `FittedDetector.plan_judge`."""
     count = plan_deltas(waypoints, first, work, steps, changes)
     for number in range(count):
-        scores[number] = farthest(memory, changes[number], _PLANNING, _CONTROL)
+        scores[number] = _farthest(memory, changes[number], _PLANNING, _CONTROL)
     return count
 
 
@@ -129,8 +129,8 @@ class GaussianDetector(FittedDetector):
         "sum_of_squares": (COUNT,),
     }
     divisors: ClassVar[tuple[str, ...]] = ("sigma_floor",)
-    tick_judge = staticmethod(judge_tick)
-    plan_judge = staticmethod(judge_plan)
+    tick_judge = staticmethod(_judge_tick)
+    plan_judge = staticmethod(_judge_plan)
 
     @classmethod
     def cold(cls, n_sigma: float = N_SIGMA) -> GaussianDetector:
@@ -144,7 +144,7 @@ class GaussianDetector(FittedDetector):
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the distance of the stage's most anomalous delta from its mean, in sigmas."""
         first, end = span(stage)
-        distance: float = farthest(self._flat, deltas, first, end)
+        distance: float = _farthest(self._flat, deltas, first, end)
         return distance
 
     def learn(self, deltas: Codes, stage: Stage) -> None:

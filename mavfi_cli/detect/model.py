@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +23,8 @@ from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import FloatArray, StackMark
+from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.base import detector_names, find_detector
 from mavfi_cli.detect.preprocess import LIMIT, PreprocessParams, states_digest
 from mavfi_cli.detect.watch import EXTENDED, Ranges
 
@@ -86,10 +88,7 @@ def save(path: Path, model: Model) -> None:
 
 
 def load(
-    path: Path,
-    detector: str,
-    shapes: Mapping[str, tuple[int, ...]],
-    positive: Collection[str] = (),
+    path: Path, detector: str, shapes: Mapping[str, tuple[int, ...]], positive: Collection[str] = ()
 ) -> Model:
     """Read a model of a kind with arrays of the given shapes.
 
@@ -235,3 +234,63 @@ def _arrays(
             raise ModelError(f"array {name!r} holds a number that is not finite", path=path)
         arrays[name] = array
     return arrays
+
+
+def listing(models: Path | None = None) -> list[dict[str, Any]]:
+    """A row a model: detector, file, stack, threshold, provenance, and a line about it.
+
+    A detector without a model has one row. One that cannot be used is told with the reason instead
+    of its threshold.
+
+    Args:
+        models: folder of model files `NAME.json`; None takes those that are shipped.
+    """
+    return [_row(name, path) for name in detector_names() for path in _paths(name, models)]
+
+
+def _paths(name: str, models: Path | None) -> list[Path | None]:
+    """The model files of a detector; None stands for none."""
+    if models is not None:
+        return [models / f"{name}.json"]
+    shipped = [model_file.shipped(name, stack) for stack in model_file.shipped_stacks()]
+    return [path for path in shipped if path.is_file()] or [None]
+
+
+def _row(name: str, path: Path | None) -> dict[str, Any]:
+    has_model = path is not None and path.is_file()
+    row: dict[str, Any] = {
+        "name": name,
+        "model": str(path) if has_model else None,
+        "stack": None,
+        "threshold": None,
+        "provenance": None,
+    }
+    try:
+        row["threshold"] = find_detector(name, model=path).threshold
+        if path is not None:
+            row["provenance"] = model_file.provenance(path)
+            row["stack"] = row["provenance"].pop("stack")["name"]
+    except ModelError as error:
+        return {**row, "told": f"cannot be used: {error}"}
+    return {**row, "told": _told(row["provenance"])}
+
+
+def _told(provenance: dict[str, Any] | None) -> str:
+    if provenance is None:
+        return "needs no training"
+    flights = training_flights(provenance)
+    seeds = sorted({int(end) for f in flights if (end := f.rpartition("/")[2]).isdigit()})
+    span = f", seeds {seeds[0]} to {seeds[-1]}" if seeds else ""
+    return (
+        f"{provenance.get('flights', len(flights))} flights in "
+        f"{', '.join(provenance.get('worlds', [])) or 'unknown worlds'}{span}; "
+        f"mavfi {provenance['mavfi']}"
+    )
+
+
+def training_flights(provenance: Mapping[str, Any]) -> Sequence[str]:
+    """Flights `world/seed` that a model has seen, of all parts of its split."""
+    parts = provenance.get("split", {})
+    if not isinstance(parts, Mapping):
+        return []
+    return [str(flight) for part in parts.values() for flight in part]

@@ -21,7 +21,7 @@ class NormDetector(FittedDetector):
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the norm of the scaled deltas."""
-        length: float = norm(self._flat, deltas)
+        length: float = _norm(self._flat, deltas)
         return length
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
@@ -29,7 +29,7 @@ class NormDetector(FittedDetector):
 
 
 @compiled
-def norm(memory: FloatArray, deltas: Codes) -> float:
+def _norm(memory: FloatArray, deltas: Codes) -> float:
     """Return the Euclidean norm of the scaled deltas (COUNT,)."""
     total = 0.0
     for place in range(COUNT):

@@ -53,9 +53,7 @@ class PlanStrike:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judgement:
-    """The gate's judgement of one message."""
-
+class _Judgement:
     stamp_s: float
     report: bool  # True for a collision report, False for a control tick
     new_waypoint: bool
@@ -75,12 +73,10 @@ class _Probe:
 
     @property
     def threshold(self) -> float:
-        """Threshold of the detector; infinite without one."""
         return np.inf if self._detector is None else self._detector.threshold
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
-        """Memory of the detector."""
         return {} if self._detector is None else self._detector.memory
 
     def score(self, deltas: Codes, stage: Stage) -> float:
@@ -91,7 +87,6 @@ class _Probe:
         return score
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Pass the sample to the detector."""
         if self._detector is not None:
             self._detector.learn(deltas, stage)
 
@@ -110,13 +105,12 @@ def replay(
     patience: int = 0,
     plans: Sequence[Trajectory] = (),
     strikes: Sequence[PlanStrike] = (),
-) -> Iterator[Judgement]:
+) -> Iterator[_Judgement]:
     """Judge every message of a trace in the order of arrival.
 
     Nothing is recomputed; the messages are those of the flight.
 
     Args:
-        trace: Trace of the flight.
         detector: New detector; None computes the deltas only.
         patience: Maximum number of consecutive alarms for one kind of message. The next message is
             accepted. With 0 every message becomes the reference, so that scores do not depend on
@@ -148,7 +142,7 @@ def replay(
                 if ahead is not None:
                     gate.judge_ahead(*ahead)
                 alarm = gate.judge_tick(messages.waypoint(row), 0, command)
-            judged = Judgement(
+            judged = _Judgement(
                 stamp_s=stamp_s,
                 report=is_report,
                 new_waypoint=Stage.PLANNING in gate.fresh,
@@ -279,7 +273,6 @@ class _Messages:
 
     @property
     def reports(self) -> list[CollisionReport]:
-        """Return all reports, oldest first."""
         found = (self.report(row) for row in range(len(self.stamps_s)))
         return [report for report in found if report is not None]
 
@@ -308,7 +301,6 @@ class _Messages:
         return self._trajectory if self._has_waypoint[row] else None
 
     def command(self, row: int) -> Command | None:
-        """Return the command of this tick."""
         if not self._has_command[row]:
             return None
         return Command(

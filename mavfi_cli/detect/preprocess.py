@@ -156,7 +156,7 @@ def encode(value: float, floor: int, ceiling: int, kind: int) -> int:
 
 
 @compiled
-def take(work: Codes, place: int, value: float) -> None:
+def _take(work: Codes, place: int, value: float) -> None:
     """Encode a new sample of a state and make it the reference."""
     floor, kind = work[FLOOR, place], work[KIND, place]
     code = encode(value, floor, work[CEILING, place], kind)
@@ -182,8 +182,8 @@ def difference(before: int, code: int, floor: int, kind: int) -> int:
 @compiled
 def take_report(time_to_collision_s: float, future_collision_seq: float, work: Codes) -> None:
     """Compute the deltas of a collision report. Those of the other stages become 0."""
-    take(work, 0, time_to_collision_s)
-    take(work, 1, future_collision_seq)
+    _take(work, 0, time_to_collision_s)
+    _take(work, 1, future_collision_seq)
     work[DELTA, _PLANNING:] = 0
 
 
@@ -205,12 +205,12 @@ def take_tick(
         work[DELTA, :_PLANNING] = 0
     if index >= 0:
         for column in range(_CONTROL - _PLANNING):
-            take(work, _PLANNING + column, waypoints[index, column])
+            _take(work, _PLANNING + column, waypoints[index, column])
     else:
         work[DELTA, _PLANNING:_CONTROL] = 0
     for axis in range(3):
-        take(work, _CONTROL + axis, velocity_enu_mps[axis])
-    take(work, _CONTROL + 3, yaw_rad)
+        _take(work, _CONTROL + axis, velocity_enu_mps[axis])
+    _take(work, _CONTROL + 3, yaw_rad)
 
 
 @compiled

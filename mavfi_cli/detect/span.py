@@ -23,7 +23,7 @@ class RangeDetector(FittedDetector):
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the largest distance of the stage's deltas from their ranges, in codes."""
         first, end = span(stage)
-        distance: float = outside(self._flat, deltas, first, end)
+        distance: float = _outside(self._flat, deltas, first, end)
         return distance
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
@@ -31,7 +31,7 @@ class RangeDetector(FittedDetector):
 
 
 @compiled
-def outside(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
+def _outside(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
     """Return the largest distance of a delta from its range, 0 inside; NaN if one is corrupted."""
     worst = 0.0
     for place in range(first, end):

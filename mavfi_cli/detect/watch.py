@@ -47,9 +47,6 @@ class Finding:
 class ExtendedWatch:
     """Watch of the extended states of one mission's messages.
 
-    Args:
-        ranges: Ranges of the changes in error-free flights.
-
     Attributes:
         memory: Last accepted codes, smallest and largest changes, (3, 3) int16 with one column per
             state. A modification takes effect at once.
@@ -57,8 +54,7 @@ class ExtendedWatch:
 
     def __init__(self, ranges: Ranges) -> None:
         self.memory: Codes = np.array(
-            [[0] * len(EXTENDED), *zip(*(ranges[s.name] for s in EXTENDED), strict=True)],
-            np.int16,
+            [[0] * len(EXTENDED), *zip(*(ranges[s.name] for s in EXTENDED), strict=True)], np.int16
         )
         self._lost = dict.fromkeys(_PLACES, 0)  # messages since the last accepted one
         self._accepted: dict[float, dict[str, Scalar]] = {}  # states of each plan by its stamp

@@ -7,7 +7,7 @@ Layouts of binary32 and binary64: IEEE 754-2019, section 3.4.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -64,9 +64,10 @@ def _float_type(name: str, mantissa: int, exponent: int) -> BitType:
 
 FLOAT64 = _float_type("float64", 52, 11)
 FLOAT32 = _float_type("float32", 23, 8)
-INT16 = BitType(name="int16", width=16, fields={Field.SIGN: range(15, 16), Field.ANY: range(16)})
-INT32 = BitType(name="int32", width=32, fields={Field.SIGN: range(31, 32), Field.ANY: range(32)})
-INT64 = BitType(name="int64", width=64, fields={Field.SIGN: range(63, 64), Field.ANY: range(64)})
+INT16, INT32, INT64 = (
+    BitType(name=f"int{w}", width=w, fields={Field.SIGN: range(w - 1, w), Field.ANY: range(w)})
+    for w in (16, 32, 64)
+)
 BOOL = BitType(name="bool", width=1, fields={Field.ANY: range(1)})
 
 
@@ -117,38 +118,19 @@ def flip_pattern(pattern: int, bits: Iterable[int], kind: BitType) -> int:
     return pattern ^ mask_of(bits, kind)
 
 
-@dataclass(frozen=True, slots=True)
-class _Coding:
-    to_pattern: Callable[[Scalar], int]
-    to_value: Callable[[int], Scalar]
-
-
-def _struct_coding(value_format: str, pattern_format: str) -> _Coding:
-    def to_pattern(value: Scalar) -> int:
-        """The bits of a value, as an unsigned integer."""
-        return int(struct.unpack(pattern_format, struct.pack(value_format, value))[0])
-
-    def to_value(pattern: int) -> Scalar:
-        """The value of these bits."""
-        value: Scalar = struct.unpack(value_format, struct.pack(pattern_format, pattern))[0]
-        return value
-
-    return _Coding(to_pattern, to_value)
-
-
-_CODINGS = {
-    FLOAT64.name: _struct_coding("<d", "<Q"),
-    FLOAT32.name: _struct_coding("<f", "<I"),
-    INT16.name: _struct_coding("<h", "<H"),
-    INT32.name: _struct_coding("<i", "<I"),
-    INT64.name: _struct_coding("<q", "<Q"),
-    BOOL.name: _Coding(int, bool),
-}
+# How struct packs a value, and the unsigned integer with the same bits.
+_FORMATS = {
+    "float64": ("<d", "<Q"), "float32": ("<f", "<I"), "int16": ("<h", "<H"), "int32": ("<i", "<I"),
+    "int64": ("<q", "<Q"),
+}  # fmt: skip
 
 
 def pattern_of(value: Scalar, kind: BitType) -> int:
     """The bits of a value; a float32 is rounded to the nearest representable first."""
-    return _CODINGS[kind.name].to_pattern(value)
+    if kind.name == BOOL.name:
+        return int(value)
+    of_value, of_pattern = _FORMATS[kind.name]
+    return int(struct.unpack(of_pattern, struct.pack(of_value, value))[0])
 
 
 def value_of(pattern: int, kind: BitType) -> Scalar:
@@ -156,7 +138,11 @@ def value_of(pattern: int, kind: BitType) -> Scalar:
 
     A signalling float32 NaN may come back quiet, because Python holds every float as binary64.
     """
-    return _CODINGS[kind.name].to_value(pattern)
+    if kind.name == BOOL.name:
+        return bool(pattern)
+    of_value, of_pattern = _FORMATS[kind.name]
+    value: Scalar = struct.unpack(of_value, struct.pack(of_pattern, pattern))[0]
+    return value
 
 
 def flip(value: Scalar, bits: Iterable[int], kind: BitType) -> Scalar:
@@ -170,11 +156,4 @@ def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
     return pattern.to_bytes(len(data), "little")
 
 
-NUMPY_TYPES: dict[str, BitType] = {
-    "float64": FLOAT64,
-    "float32": FLOAT32,
-    "int16": INT16,
-    "int32": INT32,
-    "int64": INT64,
-    "bool": BOOL,
-}
+NUMPY_TYPES = {kind.name: kind for kind in (FLOAT64, FLOAT32, INT16, INT32, INT64, BOOL)}

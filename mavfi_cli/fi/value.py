@@ -31,7 +31,6 @@ def inject(
     Args:
         value: Python float (binary64), int (int64) or bool, a numpy scalar, or an array of any
             shape with dtype float64, float32, int64, int32, int16 or bool. It is not changed.
-        bits: Number of distinct bits to flip.
         field: Field of the bits: sign, exponent, mantissa or any.
         seed: Seed from which the element and the bits are drawn, 0 or more.
         exact_bits: Bits to flip instead of drawn ones; bit 0 is the least significant.

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any
 
-from mavfi_cli.fi.tracer.symbols import short_name
+from mavfi_cli.fi.tracer.image import short_name
 from mavfi_cli.mission.record.detection_cost import DetectionCost, detection_cost
 from mavfi_cli.mission.record.measures import FlightRecord, record_of
 from mavfi_cli.mission.record.run_folder import Run

@@ -91,11 +91,11 @@ def detector_of(config: DetectorConfig, stack: str) -> Detector:
         ModelError: The model cannot be used.
         ConfigError: The threshold is out of range, or the model lacks ranges of extended states.
     """
+    from mavfi_cli.detect.base import find_detector
     from mavfi_cli.detect.fitted import FittedDetector
-    from mavfi_cli.detect.registry import find
 
     path = model_path(config, stack)
-    detector = find(config.name, model=path, threshold=config.threshold)
+    detector = find_detector(config.name, model=path, threshold=config.threshold)
     made_for = detector.stack if isinstance(detector, FittedDetector) else None
     if made_for is not None and not config.any_stack:
         flown = load_stack(stack).mark

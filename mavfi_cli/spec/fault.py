@@ -9,14 +9,15 @@ from typing import Any
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.states import BY_NAME
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.source.draw import GROUPS, draw_fault
 from mavfi_cli.fi.source.fault import (
+    GROUPS,
     Corruption,
     Effect,
     Persistence,
     SourceFault,
     Trigger,
     When,
+    draw_fault,
 )
 from mavfi_cli.spec.platform import KERNELS
 

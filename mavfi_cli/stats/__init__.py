@@ -1,11 +1,9 @@
 """Statistics: pure functions of numbers, without flights, files or ledgers.
 
-shares      proportions and their intervals, sample sizes
-paired      the same missions under two treatments; families of tests
+shares      proportions and their intervals, sample sizes; from an SDC of a kernel to lost missions
+paired      the same missions under two treatments; families of tests; the paper's worst case
 bootstrap   intervals of means, medians and paired differences
-worst_case  the paper's worst case and its recovery
 roc         detection against false alarms, over all thresholds
-layers      from an SDC of a kernel to the loss of a vehicle
 
 If SciPy has a statistic, the tests compare it with ours, to 1e-12. SciPy is not needed at run time,
 because its import takes longer than any of these and records must keep their digits.

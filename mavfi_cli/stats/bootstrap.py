@@ -115,21 +115,15 @@ def _left_out(sample: FloatArray, statistic: Statistic) -> FloatArray:
 
 
 def interval_of_rows(
-    count: int,
-    statistic: Callable[[IntArray], FloatArray],
-    *,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
+    count: int, statistic: Callable[[IntArray], FloatArray], *, resamples: int = RESAMPLES
 ) -> Interval:
     """A statistic of several columns with its interval, by resampling their rows together.
 
     Args:
-        count: number of rows.
         statistic: takes row indices (..., n) and reduces the last axis.
     """
     return interval(
         np.arange(count, dtype=np.float64),
         lambda rows: statistic(rows.astype(np.int64)),
-        confidence=confidence,
         resamples=resamples,
     )

@@ -23,7 +23,7 @@ _HALVINGS = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Curves:
+class _Curves:
     """One detector's curves, in descending order of threshold, from one without alarms.
 
     Attributes:
@@ -51,14 +51,14 @@ class Curves:
     operating_point: tuple[float, float]
 
 
-def curves(harmful: Sequence[float], error_free: Sequence[float]) -> Curves:
+def curves(harmful: Sequence[float], error_free: Sequence[float]) -> _Curves:
     """Curves from scores in units of the threshold; empty unless both kinds have flights."""
     positive, negative = np.sort(np.asarray(harmful, np.float64)), np.sort(
         np.asarray(error_free, np.float64)
     )  # fmt: skip
     if not len(positive) or not len(negative):
         nan = math.nan
-        return Curves(
+        return _Curves(
             positives=len(positive), negatives=len(negative), thresholds=[],
             false_positive_rate=[], recall=[], precision=[], area=nan, area_low=nan, area_high=nan,
             average_precision=nan, operating_point=(nan, nan),
@@ -73,7 +73,7 @@ def curves(harmful: Sequence[float], error_free: Sequence[float]) -> Curves:
     area = _area(positive, negative)
     low, high = _area_interval(area, len(positive), len(negative))
     below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
-    return Curves(
+    return _Curves(
         positives=len(positive),
         negatives=len(negative),
         thresholds=[float(levels[0]), *below.tolist()],

@@ -1,4 +1,4 @@
-"""Proportions with their Wilson intervals, and sample sizes."""
+"""Proportions with their Wilson intervals, sample sizes, and failures across the layers."""
 
 from __future__ import annotations
 
@@ -24,11 +24,7 @@ class Share:
 
 
 def wilson(
-    count: int,
-    total: int,
-    *,
-    design_effect: float = 1.0,
-    confidence_z: float = 1.959963984540054,
+    count: int, total: int, *, design_effect: float = 1.0, confidence_z: float = 1.959963984540054
 ) -> Share:
     """Wilson score interval (E. B. Wilson, JASA 22, 1927), 95 % by default.
 
@@ -79,7 +75,6 @@ def design_effect(hits: Sequence[bool], clusters: Sequence[Cluster | None]) -> f
     into each stratum.
 
     Args:
-        hits: whether each run is a hit.
         clusters: stratum and cluster of each run; None for a run that stands for itself.
     """
     total = len(hits)
@@ -101,7 +96,7 @@ def design_effect(hits: Sequence[bool], clusters: Sequence[Cluster | None]) -> f
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Mixture:
+class _Mixture:
     """A rate over differently sampled parts, with its interval."""
 
     share: float
@@ -109,7 +104,7 @@ class Mixture:
     high: float
 
 
-def mixture(parts: Sequence[tuple[int, Share]]) -> Mixture:
+def mixture(parts: Sequence[tuple[int, Share]]) -> _Mixture:
     """The rate of a whole from the rates of its parts, each weighted by its true size.
 
     The interval adds the distances to the ends of the parts' Wilson intervals in squares (MOVER,
@@ -118,12 +113,12 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> Mixture:
     """
     whole = sum(size for size, _ in parts)
     if not whole:
-        return Mixture(share=math.nan, low=0.0, high=1.0)
+        return _Mixture(share=math.nan, low=0.0, high=1.0)
     weighted = [(size / whole, part) for size, part in parts if size]
     share = math.fsum(weight * part.share for weight, part in weighted)
     below = math.hypot(*(weight * (part.share - part.low) for weight, part in weighted))
     above = math.hypot(*(weight * (part.high - part.share) for weight, part in weighted))
-    return Mixture(share=share, low=max(0.0, share - below), high=min(1.0, share + above))
+    return _Mixture(share=share, low=max(0.0, share - below), high=min(1.0, share + above))
 
 
 def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: float = 0.95) -> int:
@@ -170,3 +165,62 @@ def pairs_for_difference(
     z_b = NormalDist().inv_cdf(power)
     root = z_of(confidence) * math.sqrt(discordant) + z_b * math.sqrt(discordant - difference**2)
     return math.ceil(root**2 / difference**2 - 1e-9)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _CrossLayer:
+    """Effects of a fault in a kernel on the kernel and on the mission.
+
+    Attributes:
+        corruption: share of faults that cause an SDC of the kernel.
+        failure: share of faults that fail the mission.
+        failure_given_corruption: failure / corruption, with the ends of the failure's interval over
+            the corruption's point estimate; None if the estimate would be above 1 (crashes and
+            hangs fail missions too) or no output was corrupted.
+    """
+
+    corruption: Share
+    failure: Share
+    failure_given_corruption: tuple[float, float, float] | None
+
+
+def cross_layer(
+    corrupted: int, kernel_faults: int, failed: int, mission_faults: int, confidence: float = 0.95
+) -> _CrossLayer:
+    """The probability that a mission fails, given an SDC of a kernel.
+
+    Both campaigns must sample the same population: the same kernel, level and sampling rule.
+
+    Args:
+        corrupted, kernel_faults: SDCs and injected faults of the isolated kernel (`mavfi kernels`).
+        failed, mission_faults: failures beyond the golden ones and applied faults of missions.
+    """
+    corruption = rate(corrupted, kernel_faults, confidence)
+    failure = rate(failed, mission_faults, confidence)
+    given = None
+    if corrupted and failure.share <= corruption.share:
+        ends = (failure.share, failure.low, failure.high)
+        point, low, high = (min(1.0, each / corruption.share) for each in ends)
+        given = point, low, high
+    return _CrossLayer(corruption=corruption, failure=failure, failure_given_corruption=given)
+
+
+def failures_per_hour(upsets_per_hour: float, failure: Share) -> tuple[float, float, float]:
+    """Failed missions per flight hour at a rate of upsets: point, low, high.
+
+    The extrapolation assumes at most one upset per mission, as harmful as in the campaign.
+
+    Args:
+        upsets_per_hour: bit flips that reach the attacked kernels per flight hour.
+        failure: failure rate of missions with one fault each.
+
+    Raises:
+        ConfigError: the rate is negative.
+    """
+    if not upsets_per_hour >= 0.0:
+        raise ConfigError(f"must not be negative, got {upsets_per_hour:g}", key="upsets_per_hour")
+    return (
+        upsets_per_hour * failure.share,
+        upsets_per_hour * failure.low,
+        upsets_per_hour * failure.high,
+    )

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import chosen, flags, known, numbers
+from mavfi_cli.analysis.flights import both_succeed, chosen, flags, known, numbers, paired, ratio
 from mavfi_cli.analysis.overhead import ComputeOverhead
-from mavfi_cli.analysis.pairs import both_succeed, paired, ratio
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import Interval, interval
 from mavfi_cli.stats.shares import rate
 from mavfi_cli.studies.flight_plan import NOT_SCALED, FlightPlan
-from mavfi_cli.vpm.schemes import REFERENCE, SCHEMES, named
+from mavfi_cli.vpm.model import REFERENCE, SCHEMES, named
 
 BASE = "none"  # reference of ratios: one board without protection
 MODEL = {"velocity": "velocity_mps", "flight_time": "flight_time_s", "energy": "energy_j"}
@@ -58,15 +57,12 @@ class Beside:
 
 
 def side_by_side(
-    told: Mapping[str, Any],
-    flown: Mapping[Key, Beside],
-    overheads: Mapping[str, ComputeOverhead],
+    told: Mapping[str, Any], flown: Mapping[Key, Beside], overheads: Mapping[str, ComputeOverhead]
 ) -> dict[str, Any]:
     """Unscaled properties, overheads, and one flat row per vehicle and scheme.
 
     Args:
         told: the model's report, with the overheads of the plans.
-        flown: flights by vehicle and scheme.
         overheads: overheads measured in these flights, by detector.
     """
     return {

@@ -7,22 +7,116 @@ with the whole record.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.flights import flights, rows_of
-from mavfi_cli.analysis.platforms import compared, figures
+from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.platforms import GOLDEN, NONE, compared, figures, platforms_told
 from mavfi_cli.analysis.timeline import timeline_seed, timelines
 from mavfi_cli.campaign.begin import begin, resumed
 from mavfi_cli.campaign.missions import PlannedMission, ResultState
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaign.specification import Keep, Setting, Spec
+from mavfi_cli.core.config import require_distinct
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.types import Stage
 from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.studies.compare_plan import ComparePlan
+from mavfi_cli.spec.stack import DEFAULT
+
+FAULTY = "FI"  # names of settings, as in the presets
+_SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings
+STAGES = tuple(stage.value for stage in Stage)
+MOST = 100_000  # missions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparePlan:
+    """Plan of a comparison. The defaults are the preset fig16: the paper's Fig. 16.
+
+    Attributes:
+        platforms: names or files; the others are compared with the first.
+        inject: stages, states or groups to corrupt, one per flight; empty flies golden
+            missions only.
+        detectors: names; `none` is always flown, named or not.
+        missions: number per platform, setting and target of `inject`.
+        first_seed: seed of the first mission; each further mission adds 1.
+        seed: root of the faults' seeds.
+        field: field of the bits; None draws any bit.
+        stack: stack of all missions: a name, a file or a variant.
+
+    Raises:
+        ConfigError: there is nothing to fly, or a name appears twice.
+    """
+
+    platforms: tuple[str, ...] = ("x86", "tx2")
+    world: str = "sparse"
+    inject: tuple[str, ...] = STAGES
+    detectors: tuple[str, ...] = (NONE, "gad", "aad")
+    missions: int = 100
+    first_seed: int = 1
+    seed: int = 1
+    field: str | None = None
+    stack: str = DEFAULT
+
+    def __post_init__(self) -> None:
+        named: dict[str, tuple[str, ...]] = {
+            "platform": self.platforms,
+            "detector": self.detectors,
+            "inject": self.inject,
+        }
+        for key, names in named.items():
+            if not names and key != "inject":
+                raise ConfigError("name at least one", key=key)
+        if not 1 <= self.missions <= MOST:
+            limit = "least 1" if self.missions < 1 else f"most {MOST}"
+            raise ConfigError(f"must be at {limit}, got {self.missions}", key="missions")
+        for key in ("first_seed", "seed"):
+            if getattr(self, key) < 0:
+                raise ConfigError(f"must not be negative, got {getattr(self, key)}", key=key)
+        if self.field is not None and not self.inject:
+            raise ConfigError(f"{self.field}: there is no fault", key="field")
+        files = [str(Path(n).resolve()) if n.endswith(".toml") else n for n in self.platforms]
+        for key, names in (*named.items(), ("platform", tuple(files))):
+            require_distinct(names, key)
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The settings of each platform: golden, `none`, and the detectors."""
+        protectors = tuple(name for name in self.detectors if name != NONE)
+        return (GOLDEN, NONE, *protectors) if self.inject else (GOLDEN,)
+
+    def told(self) -> dict[str, Any]:
+        """The plan, with descriptions of the platforms, as plain values."""
+        platforms = platforms_told(self.platforms)
+        return {**asdict(self), "platforms": platforms, "settings": list(self.settings)}
+
+    def spec(self) -> Spec:
+        """The specification of the campaign."""
+        axis = "stage" if set(self.inject) <= set(STAGES) else "site"
+        faults: dict[str, tuple[Any, ...]] = {axis: self.inject}
+        if self.field is not None:
+            faults["field"] = (self.field,)
+        settings = [Setting(name=GOLDEN)]
+        for name in self.settings[1:]:
+            detector = {} if name == NONE else {"detector": (name,)}
+            told = FAULTY if name == NONE else f"D&R({_SHORT.get(name, name)})"
+            settings.append(Setting(name=told, axes={**faults, **detector}))
+        return Spec(
+            name="compare",
+            about="The same missions on several computers",
+            seed=self.seed,
+            first_seed=self.first_seed,
+            repetitions=self.missions,
+            keep=Keep.NONE,
+            fixed={} if self.stack == DEFAULT else {"stack": self.stack},
+            axes={"world": (self.world,), "platform": self.platforms},
+            settings=tuple(settings),
+        )
+
 
 SCHEMA = 2  # version 1 listed the costs of faults with the worst cases
 TIMELINE = "timeline"
@@ -52,7 +146,7 @@ def compare(
         "versions": installed_versions(),
         "errors": [
             f"mission {row['number']}: {row['reason']}"
-            for row in rows_of(table, ["number", "state", "reason"])
+            for row in table.select(["number", "state", "reason"]).to_pylist()
             if row["state"] == ResultState.ERROR.value
         ],
         **found,

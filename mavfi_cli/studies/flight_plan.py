@@ -19,9 +19,7 @@ from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import DEFAULT
-from mavfi_cli.vpm.model import safe_velocity_mps
-from mavfi_cli.vpm.schemes import DETECTORS, Scheme
-from mavfi_cli.vpm.setting import ModelInputs, outcome
+from mavfi_cli.vpm.model import DETECTORS, ModelInputs, Scheme, outcome, safe_velocity_mps
 
 # Parts of the model that the simulation omits; printed with every report of flights.
 NOT_SCALED = (
@@ -76,7 +74,6 @@ def flight_plan(
         chain_s: response time of that platform in the model.
         folder: absolute path of the folder for the files.
         models: folder of model files NAME.json; None takes the shipped ones.
-        stack: stack of the mission.
 
     Raises:
         CannotLift: the rotors cannot lift this many boards.
@@ -89,9 +86,9 @@ def flight_plan(
     range_m, cut_r = _within("map_range_m", setting.range_m, "sensing range", "m")
     rate_hz, cut_f = _within("camera_rate_hz", setting.vehicle.sensor_hz, "sensor rate", "Hz")
     stem = f"{_safe(setting.vehicle.name)}-{scheme.name}"
-    vehicle = _file(folder, stem, vehicle_text(setting, scheme, accel_mps2))
+    vehicle = _file(folder, stem, _vehicle_text(setting, scheme, accel_mps2))
     factor = setting.compute_s * (1.0 + scheme.overhead) / chain_s
-    computer = _file(folder, f"{stem}-{_safe(platform.name)}", platform_text(platform, factor))
+    computer = _file(folder, f"{stem}-{_safe(platform.name)}", _platform_text(platform, factor))
     detector = None
     if scheme.name in DETECTORS:
         model = None if models is None else str(models.absolute() / f"{scheme.name}.json")
@@ -133,7 +130,7 @@ def write_files(plan: FlightPlan) -> None:
         write_text(path, text)
 
 
-def vehicle_text(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> str:
+def _vehicle_text(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> str:
     """TOML of the simulated equivalent of the model's vehicle, with a scheme's boards."""
     vehicle, boards = setting.vehicle, scheme.copies
     told = f"{vehicle.name} of the performance model with {boards} x {setting.board.name}"
@@ -154,7 +151,7 @@ def vehicle_text(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float)
     )
 
 
-def platform_text(platform: PlatformProfile, factor: float) -> str:
+def _platform_text(platform: PlatformProfile, factor: float) -> str:
     """TOML of a platform whose latencies are those of another times a factor."""
     lines = [
         f"name = {_quoted(f'{platform.name}{TIMES}{factor:.6g}')}",
@@ -189,6 +186,5 @@ def _safe(name: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A TOML basic string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else " " for c in escaped) + '"'

@@ -1,22 +1,183 @@
-"""`mavfi vpm --fly`: fly every row of the model and compare."""
+"""`mavfi vpm --fly`: fly every row of the model, one plan per vehicle and scheme, and compare."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.flights import chosen, flights
 from mavfi_cli.analysis.overhead import compute_overheads
-from mavfi_cli.campaign.missions import ResultState
+from mavfi_cli.campaign.begin import ask_vehicle
+from mavfi_cli.campaign.factors import check_names
+from mavfi_cli.campaign.missions import PlannedMission, ResultState, canonical, changes_of
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options, run_campaign
 from mavfi_cli.campaign.specification import Keep
-from mavfi_cli.studies.beside_model import Beside, side_by_side
-from mavfi_cli.studies.flight_plan import FlightPlan
-from mavfi_cli.studies.redundancy_plan import RedundancyPlan, make_plans
-from mavfi_cli.vpm.report import report
-from mavfi_cli.vpm.schemes import DETECTORS, schemes_with
+from mavfi_cli.core.config import require_distinct
+from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
+from mavfi_cli.spec.detector import detector_of
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.spec.stack import DEFAULT
+from mavfi_cli.studies.beside_model import BASE, Beside, Key, side_by_side
+from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan, write_files
+from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS
+from mavfi_cli.studies.train import TrainingPlan, train
+from mavfi_cli.vpm.model import DETECTORS, Scheme, schemes_with
+from mavfi_cli.vpm.report import CHAINS, Choices, report, setting_of
+from mavfi_cli.vpm.vehicle import ModelVehicle
+
+WORLDS = ("sparse", "dense")
+FLOWN, TRAINING = "flown", "training"
+PLATFORM = "x86"  # platform whose latencies are scaled by default
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RedundancyPlan:
+    """Plan of the flights of all vehicles and schemes.
+
+    Attributes:
+        missions: number per scheme and world.
+        folder: folder of flights and pictures; recorded missions are not flown again.
+        models: folder of the detectors' models; None takes the shipped ones.
+        train: flights of each training world to which detectors are fitted for each vehicle; 0
+            fits none.
+        stack: stack of all flights.
+    """
+
+    vehicles: Sequence[ModelVehicle]
+    choices: Choices
+    worlds: tuple[str, ...] = WORLDS
+    missions: int
+    first_seed: int
+    folder: Path
+    models: Path | None = None
+    train: int = 0
+    stack: str = DEFAULT
+
+    @property
+    def models_told(self) -> str:
+        """Origin of the detectors' models."""
+        if self.train:
+            worlds = ", ".join(TRAINING_WORLDS)
+            flown = f"{self.train} error-free flights in each of {worlds} at its safe velocity"
+            return f"fitted for each vehicle to {flown}"
+        if self.models is not None:
+            return f"of {self.models}"
+        return "the shipped ones, fitted to flights of the Solo at 3 m/s"
+
+    def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
+        """The list mission by mission, so that pairs are complete if it is cut off."""
+        seeds = range(self.first_seed, self.first_seed + self.missions)
+        return [
+            PlannedMission(
+                config=replace(plan.mission, world=world, seed=seed),
+                labels={"group": vehicle, "arm": scheme, "world": world},
+                pair=f"{world}/{seed}",
+            )
+            for seed in seeds
+            for world in self.worlds
+            for (vehicle, scheme), plan in flown.items()
+        ]
+
+
+def _make_plans(
+    plan: RedundancyPlan, schemes: Sequence[Scheme], options: Options, spectator: Spectator
+) -> dict[Key, FlightPlan | str]:
+    """Make a plan, or a reason for its absence, for each vehicle and scheme; write the files.
+
+    Args:
+        options, spectator: for the flights to which detectors are fitted, if requested.
+    """
+    require_distinct(plan.worlds, "world")
+    if plan.train:
+        _require_held_out(plan)
+    for world in plan.worlds:
+        check_names(MissionConfig(world=world, seed=plan.first_seed, stack=plan.stack), ask_vehicle)
+    return {
+        (vehicle.name, scheme): each
+        for vehicle in plan.vehicles
+        for scheme, each in _plans_of(plan, vehicle, schemes, options, spectator)
+    }
+
+
+def _plans_of(
+    plan: RedundancyPlan,
+    vehicle: ModelVehicle,
+    schemes: Sequence[Scheme],
+    options: Options,
+    spectator: Spectator,
+) -> Iterator[tuple[str, FlightPlan | str]]:
+    """The schemes of a vehicle, one board without protection first."""
+    platform = plan.choices.platform or load_platform(PLATFORM)
+    chain = CHAINS[plan.choices.chain][0]
+    chain_s = chain([kernel.latency_s for kernel in platform.kernels.values()])
+    setting, models = setting_of(vehicle, plan.choices), plan.models
+    folder = plan.folder.absolute() / FLOWN
+    refused: dict[int, str | None] = {}  # number of boards -> the simulator's answer
+    for scheme in schemes:
+        try:
+            each = flight_plan(setting, scheme, platform, chain_s, folder, models, plan.stack)
+        except CannotLift as error:
+            if scheme.name == BASE:
+                raise
+            yield scheme.name, str(error)
+            continue
+        if each.mission.detector is not None:
+            detector_of(each.mission.detector, each.mission.stack)
+        write_files(each)
+        if scheme.copies not in refused:
+            refused[scheme.copies] = _refusal(plan, each, bare=scheme.name == BASE)
+        yield scheme.name, refused[scheme.copies] or each
+        if scheme.name == BASE and plan.train:
+            models = fitted(plan, vehicle.name, each, options, spectator)
+
+
+def _refusal(plan: RedundancyPlan, flown: FlightPlan, *, bare: bool) -> str | None:
+    """Why the simulator cannot fly this many boards; an error for one board."""
+    try:
+        ask_vehicle(replace(flown.mission, world=plan.worlds[0], seed=plan.first_seed))
+    except VehicleProcessError as error:
+        if bare:
+            raise
+        return str(error)
+    return None
+
+
+def fitted(
+    plan: RedundancyPlan, vehicle: str, flown: FlightPlan, options: Options, spectator: Spectator
+) -> Path:
+    """The folder of detectors fitted to error-free flights of a plan.
+
+    Existing models are reused, because the folder's name contains a digest of the mission and of
+    the number of flights.
+
+    Raises:
+        ModelError: too few flights reached their goals, or torch is missing.
+    """
+    text = canonical([changes_of(flown.mission), plan.train])
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    folder = plan.folder / TRAINING / f"{vehicle}-{digest}"
+    if not all((folder / f"{name}.json").is_file() for name in DETECTORS):
+        spectator.on_note(f"{vehicle}: error-free flights to which its detectors are fitted")
+        training = TrainingPlan(flights=plan.train, kinds=DETECTORS, base=flown.mission)
+        train(training, folder, options, spectator)
+    return folder
+
+
+def _require_held_out(plan: RedundancyPlan) -> None:
+    """Reject missions with the seeds of training flights, in any world."""
+    first = TrainingPlan().first_seed
+    last = first + plan.train * len(TRAINING_WORLDS) - 1
+    if plan.first_seed <= last and first <= plan.first_seed + plan.missions - 1:
+        raise ConfigError(
+            f"seeds {first} to {last} are for training: choose another --first-seed",
+            key="first seed",
+        )
+
 
 FLIGHTS = "flights"
 
@@ -39,7 +200,7 @@ def fly_and_report(
         MavfiError: as `run_campaign`; a world or vehicle that does not exist.
     """
     schemes = schemes_with(overheads)
-    plans = make_plans(plan, schemes, options, spectator)
+    plans = _make_plans(plan, schemes, options, spectator)
     flown = {key: each for key, each in plans.items() if isinstance(each, FlightPlan)}
     missions = plan.list_of(flown)
     with run_campaign(

@@ -67,7 +67,7 @@ class TrainingPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrainedDetectors:
+class _TrainedDetectors:
     """The result of a training.
 
     Attributes:
@@ -87,12 +87,6 @@ def _fly_training(
 
     Returns:
         The data set, also written to the folder, and the number of flights outside it.
-
-    Raises:
-        ModelError: no flight can be used.
-        UnknownName: the stack does not exist.
-        ConfigError: the folder has the flights of another plan, or the stack is not valid.
-        RecordError: a file cannot be written.
     """
     missions, stack = plan.missions(), load_stack(plan.base.stack).mark
     ledger = run_campaign(
@@ -117,11 +111,8 @@ def _fly_training(
 
 
 def train(
-    plan: TrainingPlan,
-    folder: Path,
-    options: Options,
-    spectator: Spectator,
-) -> TrainedDetectors:
+    plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
+) -> _TrainedDetectors:
     """Fly, fit the detectors, and write the models with their provenance.
 
     Raises:
@@ -141,4 +132,4 @@ def train(
         path = folder / f"{kind}.json"
         model_file.save(path, model)
         models[kind] = (model, path)
-    return TrainedDetectors(dataset=dataset, models=models, failed=failed)
+    return _TrainedDetectors(dataset=dataset, models=models, failed=failed)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ConfigError, ModelError, OtherStack
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect import registry
+from mavfi_cli.detect import base
 from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.fitted import FittedDetector
 from mavfi_cli.detect.preprocess import COUNT, DETECTED, LIMIT, NAN_CODE
@@ -71,17 +71,19 @@ class DetectorContract:
         return self.detector
 
     def test_says_who_it_is(self, name: str) -> None:
-        detector = registry.find(name)
+        detector = base.find_detector(name)
         assert detector.name == name
         assert isinstance(detector.per_stage, bool)
         assert np.isfinite(detector.threshold)
 
     def test_is_deterministic(self, name: str) -> None:
-        assert _run(registry.find(name), _samples()) == _run(registry.find(name), _samples())
+        assert _run(base.find_detector(name), _samples()) == _run(
+            base.find_detector(name), _samples()
+        )
 
     @pytest.mark.parametrize("stage", _STAGES)
     def test_no_change_is_no_alarm(self, name: str, stage: Stage) -> None:
-        detector = registry.find(name)
+        detector = base.find_detector(name)
         for _ in range(50):
             assert not _alarms(detector, _zeros(), stage)
             detector.learn(_zeros(), stage)
@@ -91,20 +93,20 @@ class DetectorContract:
     def test_an_extreme_change_of_any_state_is_an_alarm(
         self, name: str, place: int, delta: int
     ) -> None:
-        assert _alarms(registry.find(name), _single(place, delta), DETECTED[place].stage)
+        assert _alarms(base.find_detector(name), _single(place, delta), DETECTED[place].stage)
 
     @pytest.mark.parametrize("place", range(COUNT), ids=[state.name for state in DETECTED])
     def test_a_state_that_became_nan_is_an_alarm(self, name: str, place: int) -> None:
-        assert _alarms(registry.find(name), _single(place, NAN_CODE), DETECTED[place].stage)
+        assert _alarms(base.find_detector(name), _single(place, NAN_CODE), DETECTED[place].stage)
 
     def test_a_stage_is_blind_to_the_others_if_it_is_judged_alone(self, name: str) -> None:
-        detector = registry.find(name)
+        detector = base.find_detector(name)
         for place, state in enumerate(DETECTED):
             for stage in set(Stage) - {state.stage}:
                 assert _alarms(detector, _single(place, 1000), stage) is not detector.per_stage
 
     def test_scoring_changes_nothing(self, name: str) -> None:
-        detector = registry.find(name)
+        detector = base.find_detector(name)
         before = {key: array.copy() for key, array in detector.memory.items()}
         for deltas in _samples():
             given = deltas.copy()
@@ -115,7 +117,7 @@ class DetectorContract:
             np.testing.assert_array_equal(array, before[key])
 
     def test_memory_is_all_that_decides(self, name: str) -> None:
-        taught, fresh = registry.find(name), registry.find(name)
+        taught, fresh = base.find_detector(name), base.find_detector(name)
         _run(taught, _samples())
         assert set(fresh.memory) == set(taught.memory)
         for key, array in fresh.memory.items():
@@ -124,7 +126,7 @@ class DetectorContract:
         assert fresh.threshold == taught.threshold
 
     def test_a_flip_in_the_threshold_changes_decisions(self, name: str) -> None:
-        detector = registry.find(name, threshold=4.0)
+        detector = base.find_detector(name, threshold=4.0)
         change = _single(_PLACES["command_vx"], 1000)
         assert _alarms(detector, change, Stage.CONTROL)
         holders = [
@@ -140,9 +142,9 @@ class DetectorContract:
 
     def test_a_broken_memory_is_never_silent(self, name: str) -> None:
         """With a NaN in any number that a score depends on, that score raises an alarm."""
-        for key in registry.find(name).memory:
-            for place in range(registry.find(name).memory[key].size):
-                healthy, broken = registry.find(name), registry.find(name)
+        for key in base.find_detector(name).memory:
+            for place in range(base.find_detector(name).memory[key].size):
+                healthy, broken = base.find_detector(name), base.find_detector(name)
                 if broken.memory[key].dtype.kind != "f":
                     continue
                 broken.memory[key].reshape(-1)[place] = np.nan
@@ -152,7 +154,7 @@ class DetectorContract:
                     assert _alarms(broken, change, state.stage), (key, place, state.name)
 
     def test_pickles_with_what_it_has_learned(self, name: str) -> None:
-        detector = registry.find(name)
+        detector = base.find_detector(name)
         _run(detector, _samples())
         twin = pickle.loads(pickle.dumps(detector))
         assert _run(twin, _samples(seed=5)) == _run(detector, _samples(seed=5))
@@ -166,14 +168,14 @@ class DetectorContract:
         assert _alarms(twin, _single(0, 1000), Stage.PERCEPTION)
 
     def test_the_threshold_can_be_given_within_bounds(self, name: str) -> None:
-        assert registry.find(name, threshold=7.5).threshold == 7.5
+        assert base.find_detector(name, threshold=7.5).threshold == 7.5
         for bad in (0.0, -1.0, float("nan"), float("inf")):
             with pytest.raises(ConfigError, match=r"must be a finite number above 0, got"):
-                registry.find(name, threshold=bad)
+                base.find_detector(name, threshold=bad)
 
     def test_a_model_that_is_not_there_is_an_error(self, name: str, tmp_path: Path) -> None:
         with pytest.raises(ModelError, match=r"none\.json: "):
-            registry.find(name, model=tmp_path / "none.json")
+            base.find_detector(name, model=tmp_path / "none.json")
 
     def test_a_mission_takes_the_model_of_its_stack_or_needs_none(self, name: str) -> None:
         for stack in ("mavbench", "hardened"):
@@ -187,7 +189,7 @@ class DetectorContract:
     ) -> None:
         asked = DetectorConfig(name=name, any_stack=True)
         assert detector_of(asked, "mavbench-release").name == name
-        if isinstance(registry.find(name), FittedDetector):
+        if isinstance(base.find_detector(name), FittedDetector):
             with pytest.raises(OtherStack, match="mavfi train --stack mavbench-release"):
                 detector_of(DetectorConfig(name=name), "mavbench-release")
         else:
@@ -195,7 +197,7 @@ class DetectorContract:
 
     def test_extended_states_need_the_ranges_of_a_model(self, name: str) -> None:
         config = DetectorConfig(name=name, watch="extended")
-        if isinstance(registry.find(name), FittedDetector):
+        if isinstance(base.find_detector(name), FittedDetector):
             assert detector_of(config, "mavbench").name == name
         else:
             with pytest.raises(

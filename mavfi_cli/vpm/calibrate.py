@@ -7,11 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.vpm.board import Board, load_board
-from mavfi_cli.vpm.model import GRAVITY_MPS2
-from mavfi_cli.vpm.schemes import REFERENCE, SCHEMES, named
-from mavfi_cli.vpm.setting import ModelInputs
-from mavfi_cli.vpm.vehicle import ModelVehicle
+from mavfi_cli.vpm.model import GRAVITY_MPS2, REFERENCE, SCHEMES, ModelInputs, named
+from mavfi_cli.vpm.vehicle import Board, ModelVehicle, load_board
 
 _SPAN = 1.0e4  # ratio of the largest to the smallest tried value
 _STEPS = 200  # halvings of the interval; far below a float's resolution
@@ -36,7 +33,6 @@ def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated:
     The ratio falls as the free number grows, so bisection finds it.
 
     Args:
-        vehicle: a vehicle with a calibration.
         board: the board of the redundant computers; None: the calibration's own.
 
     Raises:

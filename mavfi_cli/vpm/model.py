@@ -1,16 +1,95 @@
 """The F-1 model (Krishnan et al., IEEE CAL 19(1), 2020): equations of floats and arrays.
 
 A vehicle that sees `range_m` far and takes `response_s` from sensing to acting may fly only as
-fast as it can stop in front of what it sees. All units are SI.
+fast as it can stop in front of what it sees. A protection scheme costs copies of the board, or
+compute time. All units are SI.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
+from mavfi_cli.spec.platform import LARGEST
+from mavfi_cli.vpm.vehicle import Board, ModelVehicle
+
+REFERENCE = "aad"  # the paper's Fig. 15 compares redundancy with it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scheme:
+    """One way to protect the computer."""
+
+    name: str
+    title: str
+    copies: int = 1  # boards with their heat sinks
+    overhead: float = 0.0  # additional compute time, as a fraction of it
+    source: str = ""
+
+
+_TABLE_V = "paper, Table V: Dense, the worst of four environments"
+SCHEMES = (
+    Scheme(name="none", title="no protection", source="one board"),
+    Scheme(name="dmr", title="DMR", copies=2, source="two boards; no time for the comparison"),
+    Scheme(name="tmr", title="TMR", copies=3, source="three boards; no time for the vote"),
+    Scheme(name="gad", title="detection (Gaussian)", overhead=0.022223, source=_TABLE_V),
+    Scheme(name="aad", title="detection (autoencoder)", overhead=0.000062, source=_TABLE_V),
+)
+
+DETECTORS = tuple(scheme.name for scheme in SCHEMES if scheme.overhead > 0.0)
+
+
+def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> tuple[Scheme, ...]:
+    """Return the schemes with measured overheads in place of the paper's.
+
+    Args:
+        overheads: detector name -> its overhead in per cent of the compute time, and the source
+            of that number.
+
+    Raises:
+        UnknownName: no scheme of this name detects and recovers.
+        ConfigError: an overhead is negative, not finite, or probably in the wrong unit.
+    """
+    for name, (percent, _) in overheads.items():
+        if name not in DETECTORS:
+            raise UnknownName("detector", name, DETECTORS)
+        if not 0.0 <= percent <= LARGEST:
+            raise ConfigError(
+                f"must be within 0 and {LARGEST:g} %, is {percent:g} %", key=f"overhead of {name}"
+            )
+    given = {name: (percent / 100.0, source) for name, (percent, source) in overheads.items()}
+    return tuple(
+        replace(scheme, overhead=given[scheme.name][0], source=given[scheme.name][1])
+        if scheme.name in given
+        else scheme
+        for scheme in SCHEMES
+    )
+
+
+def unlike_sources(schemes: tuple[Scheme, ...]) -> str | None:
+    """A note if one detector's overhead is from the paper and another's is not."""
+    detectors = [scheme for scheme in schemes if scheme.name in DETECTORS]
+    papers = [scheme.name for scheme in detectors if scheme.source == _TABLE_V]
+    others = [scheme.name for scheme in detectors if scheme.source != _TABLE_V]
+    if not papers or not others:
+        return None
+    return (
+        f"the overhead of {' and '.join(papers)} is the paper's and that of {' and '.join(others)} "
+        "is not: different sources, so these rows are not to be ranked"
+    )
+
+
+def named(schemes: tuple[Scheme, ...], name: str) -> Scheme:
+    """The scheme of this name, which must exist."""
+    return next(scheme for scheme in schemes if scheme.name == name)
+
 
 GRAVITY_MPS2 = 9.80665
 KNEE_SHARE = 0.97  # of the roof; CAL20 gives no closed form, its Fig. 4 shows 0.96 to 0.97
@@ -65,3 +144,117 @@ def hover_power_w(known_w: float, known_kg: float, mass_kg: float) -> float:
     Disc and figure of merit stay the same, so one known pair of power and mass is enough.
     """
     return float(known_w * (mass_kg / known_kg) ** 1.5)
+
+
+_J_PER_WH = 3600.0
+
+
+class _Bound(Enum):
+    BODY = "body dynamics"
+    SENSOR = "sensor"
+    COMPUTE = "compute"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelInputs:
+    """The model's inputs for one vehicle with its computer."""
+
+    vehicle: ModelVehicle
+    board: Board
+    pull_n: float
+    range_m: float
+    compute_s: float  # response time of the computer without protection
+    distance_m: float
+
+    def carried_kg(self, copies: int) -> float:
+        """Mass of the boards and their heat sinks, kg."""
+        return copies * self.board.total_kg
+
+    def mass_kg(self, copies: int) -> float:
+        """Mass of everything that flies, kg."""
+        return self.vehicle.mass_kg + self.carried_kg(copies)
+
+    def acceleration_mps2(self, copies: int) -> float:
+        """Largest acceleration, m/s^2; zero or less if the vehicle cannot lift its computer."""
+        return acceleration_mps2(self.pull_n, self.mass_kg(copies), self.vehicle.tilt_rad)
+
+    def response_s(self, overhead: float = 0.0) -> float:
+        """Time from sensing to acting, s, CAL20 equation 1: the slower of sensor and computer."""
+        return max(1.0 / self.vehicle.sensor_hz, self.compute_s * (1.0 + overhead))
+
+    def velocity_mps(self, scheme: Scheme) -> float | None:
+        """Safe velocity with a scheme, m/s; None if the vehicle cannot lift it."""
+        accel = self.acceleration_mps2(scheme.copies)
+        if accel <= 0.0:
+            return None
+        return safe_velocity_mps(accel, self.response_s(scheme.overhead), self.range_m)
+
+    def too_heavy(self, copies: int) -> CannotLift:
+        """The error that says why this many boards cannot be lifted."""
+        return CannotLift(
+            self.vehicle.name,
+            pull_n=self.pull_n,
+            mass_kg=self.vehicle.mass_kg,
+            compute_kg=self.carried_kg(copies),
+            limit_kg=self.mass_kg(copies) * (1.0 + self.acceleration_mps2(copies) / GRAVITY_MPS2),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SchemePerformance:
+    """Performance with a scheme, for hovering power and a straight path."""
+
+    scheme: Scheme
+    mass_kg: float
+    compute_kg: float
+    thrust_to_weight: float
+    acceleration_mps2: float
+    throughput_hz: float  # actions a second, the inverse of the response time
+    compute_hz: float  # rate of the computer alone
+    knee_hz: float
+    roof_mps: float
+    sensor_ceiling_mps: float
+    compute_ceiling_mps: float
+    bound: _Bound
+    velocity_mps: float
+    flight_time_s: float
+    power_w: float  # rotors and boards
+    energy_j: float
+    missions: float  # missions for each battery charge, not rounded
+
+
+def outcome(setting: ModelInputs, scheme: Scheme) -> SchemePerformance:
+    """Compute the performance of a vehicle with a scheme.
+
+    Raises:
+        CannotLift: the rotors do not lift this many boards.
+    """
+    vehicle, copies = setting.vehicle, scheme.copies
+    accel, velocity = setting.acceleration_mps2(copies), setting.velocity_mps(scheme)
+    if velocity is None:
+        raise setting.too_heavy(copies)
+    mass_kg, compute_s = setting.mass_kg(copies), setting.compute_s * (1.0 + scheme.overhead)
+    knee, response_s = knee_hz(accel, setting.range_m), setting.response_s(scheme.overhead)
+    rotors_w = hover_power_w(vehicle.hover_power_w, vehicle.mass_kg, mass_kg)
+    power_w = rotors_w + copies * setting.board.power_w
+    time_s = setting.distance_m / velocity
+    slower = _Bound.SENSOR if 1.0 / vehicle.sensor_hz > compute_s else _Bound.COMPUTE
+    return SchemePerformance(
+        scheme=scheme,
+        mass_kg=mass_kg,
+        compute_kg=setting.carried_kg(copies),
+        thrust_to_weight=setting.pull_n / (mass_kg * GRAVITY_MPS2),
+        acceleration_mps2=accel,
+        throughput_hz=1.0 / response_s,
+        compute_hz=1.0 / compute_s,
+        knee_hz=knee,
+        roof_mps=roof_mps(accel, setting.range_m),
+        sensor_ceiling_mps=safe_velocity_mps(accel, 1.0 / vehicle.sensor_hz, setting.range_m),
+        compute_ceiling_mps=safe_velocity_mps(accel, compute_s, setting.range_m),
+        bound=_Bound.BODY if 1.0 / response_s >= knee else slower,
+        velocity_mps=velocity,
+        flight_time_s=time_s,
+        power_w=power_w,
+        energy_j=power_w * time_s,
+        missions=vehicle.battery_wh * _J_PER_WH / (power_w * time_s),
+    )

@@ -4,7 +4,7 @@ import pyarrow as pa
 import pytest
 
 from mavfi_cli.analysis.platforms import SCHEMA, figures
-from mavfi_cli.studies.compare_plan import ComparePlan
+from mavfi_cli.studies.compare import ComparePlan
 
 PLAN = ComparePlan(inject=("planning",), missions=10)
 SEEDS = range(1, 11)

@@ -7,10 +7,9 @@ import re
 import pytest
 from plain_values import named
 
-from mavfi_cli.analysis.comparison import against_golden, protection
 from mavfi_cli.analysis.failures import failures
 from mavfi_cli.analysis.groups import METRICS, groups
-from mavfi_cli.analysis.summary import qualities, summarise
+from mavfi_cli.analysis.summary import against_golden, protection, qualities, summarise
 from mavfi_cli.campaign.begin import stopped
 from mavfi_cli.campaign.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName

@@ -7,7 +7,7 @@ import pytest
 from flown_twice import figures_of, flight
 from scipy import stats
 
-from mavfi_cli.studies.compare_plan import ComparePlan
+from mavfi_cli.studies.compare import ComparePlan
 
 PLAN = ComparePlan(inject=("planning", "control"), missions=40)
 SEEDS = range(1, 41)

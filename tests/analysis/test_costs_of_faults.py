@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from flown_twice import SEEDS, flight, table
 
-from mavfi_cli.analysis import costs as question
-from mavfi_cli.analysis.costs import cost_difference
+from mavfi_cli.analysis import platforms as question
+from mavfi_cli.analysis.platforms import cost_difference
 
 
 def struck(golden, counted):

@@ -6,8 +6,17 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mavfi_cli.analysis.flights import chosen, flags, known, numbers
-from mavfi_cli.analysis.pairs import both_succeed, difference, paired, ratio, success_test
+from mavfi_cli.analysis.flights import (
+    both_succeed,
+    chosen,
+    difference,
+    flags,
+    known,
+    numbers,
+    paired,
+    ratio,
+    success_test,
+)
 
 
 def flown(*ends, seeds=None):

@@ -7,10 +7,9 @@ import pytest
 from missions import POSTS
 from native_programs import native_program, start  # noqa: F401
 
-from mavfi_cli.attack.campaign import run_campaign
+from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.inputs import load_inputs, save_inputs
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.plan import Plan
 from mavfi_cli.mission.kernel_inputs import record_inputs
 from mavfi_cli.spec.mission import MissionConfig
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mavfi_cli.attack.kernels.difference import numbers, pack, paths, unpack, voxels
+from mavfi_cli.attack.kernels.catalogue import numbers, pack, paths, unpack, voxels
 from mavfi_cli.autonomy.occupancy import snapshot_of
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels import target as kernel_target
-from mavfi_cli.attack.kernels.difference import pack
+from mavfi_cli.attack.kernels.catalogue import pack
 from mavfi_cli.attack.kernels.inputs import load_inputs
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.replay import replay_runs

@@ -11,17 +11,14 @@ import pytest
 from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
-from mavfi_cli.attack.campaign import run_campaign
-from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.outcome import RunOutcome, shares
-from mavfi_cli.attack.plan import Plan
-from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.attack.program import OutputComparison, ProgramTarget, Workplace
 from mavfi_cli.attack.target import RunLimits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.fault import (
     DATA_REGISTERS,
     CountedStop,
@@ -34,6 +31,7 @@ from mavfi_cli.fi.tracer.fault import (
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.spawn import Program
+from mavfi_cli.fi.tracer.tracee import Mechanism
 from mavfi_cli.report.tables.attacks import PROGRAM_COLUMNS, runs_csv, summarise_program
 from mavfi_cli.stats.shares import design_effect, wilson
 
@@ -76,7 +74,7 @@ def victim_fault(place, target, bit):
     here = image.function("victim", [target.name])
     address = image.address(here)
     while True:
-        instruction = decode(tracee.read_memory(address, 16), address)
+        instruction = decode(tracee.memory.read(address, 16), address)
         if any(use.register == "r10" for use in instruction.writes):
             break
         address = instruction.next_address

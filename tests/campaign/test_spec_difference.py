@@ -6,7 +6,7 @@ import pytest
 
 from mavfi_cli.campaign.specification import differences
 from mavfi_cli.campaign.specification_file import parse_spec
-from mavfi_cli.studies.compare_plan import ComparePlan
+from mavfi_cli.studies.compare import ComparePlan
 
 STORED = """
 repetitions = 10

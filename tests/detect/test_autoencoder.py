@@ -1,7 +1,7 @@
 import numpy as np
 
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect import registry
+from mavfi_cli.detect import base
 from mavfi_cli.detect.autoencoder import AutoencoderDetector
 from mavfi_cli.detect.norm import NormDetector
 from mavfi_cli.detect.preprocess import COUNT
@@ -32,7 +32,7 @@ def test_the_net_is_the_papers():
 
 def test_it_reconstructs_changes_of_either_sign():
     """A delta is smaller after reconstruction than if the net put out nothing at all."""
-    detector = registry.find("aad")
+    detector = base.find_detector("aad")
     scale = detector.memory["scale"]
     for sign in (1, -1):
         deltas = np.zeros(COUNT, np.int16)

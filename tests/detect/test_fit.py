@@ -6,7 +6,7 @@ from detect_builders import STACK
 
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect import fit, model, registry, train_autoencoder
+from mavfi_cli.detect import base, fit, model
 from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import COUNT, NAMES, PreprocessParams
 from mavfi_cli.detect.watch import EXTENDED
@@ -43,8 +43,8 @@ def dataset():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(train_autoencoder, "EPOCHS", 40)
-    monkeypatch.setattr(train_autoencoder, "STARTS", 2)
+    monkeypatch.setattr(fit, "EPOCHS", 40)
+    monkeypatch.setattr(fit, "STARTS", 2)
 
 
 def parts_of(dataset, places):
@@ -93,7 +93,7 @@ def test_a_threshold_is_the_largest_score_of_flights_that_training_did_not_see(
 ):
     fitted = fit.fit(kind, dataset)
     model.save(tmp_path / "m.json", fitted)
-    detector = registry.find(kind, model=tmp_path / "m.json")
+    detector = base.find_detector(kind, model=tmp_path / "m.json")
     held_out = parts_of(dataset, fit.split(dataset, 1).threshold)
     images = fit.mirrored(np.concatenate([each.deltas for each in held_out])).astype(np.int16)
     largest = max(detector.score(deltas, Stage.CONTROL) for deltas in images)
@@ -163,7 +163,7 @@ def test_training_is_deterministic_and_tells_what_it_did(dataset, quick):
 
 def test_trained_weights_reconstruct_better_than_the_first_ones(quick):
     rows = fit.mirrored(flight("w", 1, 400).deltas).astype(float)
-    trained = train_autoencoder.train(rows, rows, seed=1)
+    trained = fit.train_autoencoder(rows, rows, seed=1)
     curve = np.array(trained.provenance["loss_curve"]["rows"])
     assert trained.provenance["validation_error"] < curve[0, 2]
 

@@ -3,7 +3,7 @@ import pytest
 from detect_builders import command, plan, report
 
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect import registry
+from mavfi_cli.detect import base
 from mavfi_cli.detect.gate import Gate
 from mavfi_cli.detect.preprocess import NAMES
 
@@ -208,7 +208,7 @@ def test_a_flip_in_the_gates_own_memory_takes_effect():
 
 @pytest.mark.parametrize("name", ["gad", "aad", "l2", "range"])
 def test_shipped_detectors_pass_a_quiet_flight_and_catch_a_wild_command(name):
-    gate = Gate(registry.find(name))
+    gate = Gate(base.find_detector(name))
     trajectory = plan()
     for tick in range(200):
         assert gate.judge_tick(trajectory, tick // 25, command(vx=2.2 + 0.001 * tick)) is None
@@ -233,9 +233,9 @@ class Plain:
 @pytest.mark.parametrize("name", ["aad", "gad"])
 @pytest.mark.parametrize("accepted", [False, True])
 def test_one_compiled_call_judges_as_single_ones_do(name, accepted):
-    detector = registry.find(name)
+    detector = base.find_detector(name)
     assert detector.tick_judge is not None
-    fused, plain = Gate(detector), Gate(Plain(registry.find(name)))
+    fused, plain = Gate(detector), Gate(Plain(base.find_detector(name)))
     rng = np.random.default_rng(4)
     kinds = set()
     for number in range(60):

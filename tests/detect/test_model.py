@@ -5,7 +5,7 @@ import pytest
 from detect_builders import RANGES, STACK
 
 from mavfi_cli.core.errors import ConfigError, ModelError
-from mavfi_cli.detect import model, registry
+from mavfi_cli.detect import base, model
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.preprocess import PreprocessParams
@@ -110,7 +110,7 @@ def test_thresholds_and_divisors_out_of_range_are_refused(tmp_path, name, array,
     path = tmp_path / "odd.json"
     path.write_text(json.dumps(data))
     with pytest.raises(ModelError, match=f"array '{array}' holds a number that is not above 0"):
-        registry.find(name, model=path)
+        base.find_detector(name, model=path)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1, 2]", b"\xff\xfe", b"null", b"[" * 100000])
@@ -147,14 +147,14 @@ def test_a_model_of_version_0_1_is_refused_by_its_schema(path):
 def test_models_are_shipped_for_these_stacks():
     assert model.shipped_stacks() == ["hardened", "mavbench"]
     for name in OURS:
-        assert registry.find(name).stack.name == model.DEFAULT_STACK
+        assert base.find_detector(name).stack.name == model.DEFAULT_STACK
 
 
 @pytest.mark.parametrize("stack", model.shipped_stacks())
 @pytest.mark.parametrize("name", OURS)
 def test_the_shipped_models_tell_where_they_come_from(name, stack):
     path = model.shipped(name, stack)
-    detector = registry.find(name, model=path)
+    detector = base.find_detector(name, model=path)
     loaded = model.load(path, name, type(detector).shapes)
     assert loaded.stack.name == stack
     assert (detector.stack, detector.extended) == (loaded.stack, loaded.extended)

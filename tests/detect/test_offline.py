@@ -5,7 +5,7 @@ from detect_builders import plan, trace
 
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect import registry
+from mavfi_cli.detect import base
 from mavfi_cli.detect.offline import PlanStrike, columns_of, flight_of, plan_steps, replay
 from mavfi_cli.detect.preprocess import NAMES, PreprocessParams
 
@@ -34,15 +34,15 @@ def test_without_the_telling_columns_equal_messages_are_one():
 def test_a_struck_waypoint_is_found_where_it_is(name):
     columns = trace(6.0)
     columns["waypoint_x"][100:125] = -1e99
-    alarms = [j for j in replay(columns, registry.find(name), patience=10**6) if j.alarm]
+    alarms = [j for j in replay(columns, base.find_detector(name), patience=10**6) if j.alarm]
     assert {each.stamp_s for each in alarms} == set(columns["stamp_s"][100:125].tolist())
     assert alarms[0].alarm.states[0] == "waypoint_x"
     # A score does not depend on the threshold where every message becomes the reference.
-    follows = [j.score for j in replay(columns, registry.find(name))]
-    lenient = [j.score for j in replay(columns, registry.find(name, threshold=1e9))]
+    follows = [j.score for j in replay(columns, base.find_detector(name))]
+    lenient = [j.score for j in replay(columns, base.find_detector(name, threshold=1e9))]
     if name != "gad":  # which learns from what its threshold lets pass
         assert follows == lenient
-    assert [s > registry.find(name).threshold for s in follows].count(True) == 2
+    assert [s > base.find_detector(name).threshold for s in follows].count(True) == 2
 
 
 @pytest.fixture
@@ -59,11 +59,11 @@ FAR = PlanStrike(stamp_s=1.0, state="waypoint_x", waypoint=8, before=13.6, after
 @pytest.mark.parametrize("name", ["gad", "aad", "l2", "range"])
 def test_a_struck_waypoint_is_seen_ahead_as_soon_as_it_is_struck(name, planned):
     columns, flown = planned
-    threshold = registry.find(name).threshold
+    threshold = base.find_detector(name).threshold
     assert flown.waypoints[8, 0] == FAR.before
 
     def high(strikes):
-        judged = replay(columns, registry.find(name), plans=[flown], strikes=strikes)
+        judged = replay(columns, base.find_detector(name), plans=[flown], strikes=strikes)
         return [each.stamp_s for each in judged if each.score > threshold]
 
     assert high([]) == []
@@ -74,7 +74,7 @@ def test_a_struck_waypoint_is_seen_ahead_as_soon_as_it_is_struck(name, planned):
 def test_a_plan_that_was_published_with_the_value_is_seen_when_it_is_new(planned):
     columns, flown = planned
     flown.waypoints[8, 0] = FAR.after
-    judged = replay(columns, registry.find("range"), plans=[flown], strikes=[FAR])
+    judged = replay(columns, base.find_detector("range"), plans=[flown], strikes=[FAR])
     assert next(each.stamp_s for each in judged if each.score > 1.0) == 0.0
 
 
@@ -89,7 +89,7 @@ def test_patience_is_how_many_alarms_in_a_row_are_obeyed():
     columns = trace(6.0)
     columns["command_vx"][100:] = -1e99
     for patience, expected in ((0, 1), (3, 4)):
-        judged = replay(columns, registry.find("range"), patience=patience)
+        judged = replay(columns, base.find_detector("range"), patience=patience)
         assert sum(j.alarm is not None for j in judged) == expected
 
 
@@ -97,7 +97,7 @@ def test_only_protected_stages_are_judged():
     columns = trace(6.0)
     columns["waypoint_x"][100:125] = -1e99
     alarms = [
-        j for j in replay(columns, registry.find("gad"), protect=frozenset({Stage.CONTROL}))
+        j for j in replay(columns, base.find_detector("gad"), protect=frozenset({Stage.CONTROL}))
         if j.alarm
     ]  # fmt: skip
     assert alarms == []
@@ -107,7 +107,7 @@ def test_a_nan_is_a_value_and_a_null_is_none():
     columns = trace(2.0)
     plain = {name: np.ma.array(column, mask=False) for name, column in columns.items()}
     plain["command_vy"][50] = np.nan
-    alarms = [j for j in replay(plain, registry.find("gad"), patience=9) if j.alarm]
+    alarms = [j for j in replay(plain, base.find_detector("gad"), patience=9) if j.alarm]
     assert [each.stamp_s for each in alarms] == [1.0]
     plain["command_yaw"][:50] = np.ma.masked
     assert sum(not j.report for j in replay(plain, None)) == 50

@@ -7,7 +7,7 @@ import pytest
 from detect_builders import RANGES, command, plan, report, trace
 
 from mavfi_cli.core.types import CollisionReport, Stage, Trajectory
-from mavfi_cli.detect import registry
+from mavfi_cli.detect import base
 from mavfi_cli.detect.gate import Gate
 from mavfi_cli.detect.offline import flight_of
 from mavfi_cli.detect.watch import EXTENDED, ExtendedWatch, changes, ranges_of
@@ -22,7 +22,7 @@ def numbered(seq, known=0, stamp_s=0.0):
 
 
 def gate_of(name, *, ranges=RANGES, **options):
-    return Gate(registry.find(name), watch=ExtendedWatch(ranges), **options)
+    return Gate(base.find_detector(name), watch=ExtendedWatch(ranges), **options)
 
 
 @pytest.mark.parametrize("name", OURS)
@@ -134,7 +134,7 @@ def test_only_protected_stages_are_watched(stage):
 
 
 def test_what_the_watch_decides_by_is_part_of_the_gates_memory():
-    assert "watch" not in Gate(registry.find("gad")).memory
+    assert "watch" not in Gate(base.find_detector("gad")).memory
     gate = gate_of("gad")
     gate.judge_plan(numbered(1))
     gate.memory["watch"][0, 1] += 1024  # the reference of trajectory_seq
@@ -145,7 +145,7 @@ def test_what_the_watch_decides_by_is_part_of_the_gates_memory():
 
 @pytest.mark.parametrize("name", OURS)
 def test_watching_more_changes_nothing_for_the_13_states(name):
-    plain, wide = Gate(registry.find(name)), gate_of(name)
+    plain, wide = Gate(base.find_detector(name)), gate_of(name)
     rng = np.random.default_rng(6)
     for number in range(40):
         flown = numbered(number + 1, stamp_s=float(number))

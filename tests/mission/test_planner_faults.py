@@ -15,7 +15,7 @@ from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.thread import TracerThread
-from mavfi_cli.mission.instruction.plan import draw_invocation
+from mavfi_cli.mission.instruction.injection import draw_invocation
 from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Watcher

@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 
 from mavfi_cli.report.compare_plot import draw_compare_plot, write_compare_plot
 from mavfi_cli.report.timeline import draw_timeline, write_timeline
-from mavfi_cli.studies.compare_plan import ComparePlan
+from mavfi_cli.studies.compare import ComparePlan
 
 SVG = "{http://www.w3.org/2000/svg}"
 KERNELS = ("point cloud", "OctoMap", "collision check", "planner", "control")

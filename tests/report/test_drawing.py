@@ -18,8 +18,8 @@ from mavfi_cli.report.drawing import (
     write_svg,
 )
 from mavfi_cli.report.redundancy_plot import draw_redundancy_plot
+from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.schemes import SCHEMES
 from mavfi_cli.vpm.vehicle import load_vehicle
 
 

@@ -10,10 +10,11 @@ from scipy import stats
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.stats.bootstrap import BLOCKS, FEW, LARGE, interval, mean, median
-from mavfi_cli.stats.layers import cross_layer, failures_per_hour
-from mavfi_cli.stats.paired import holm, mcnemar, sign_flips
+from mavfi_cli.stats.paired import holm, mcnemar, sign_flips, worst_case
 from mavfi_cli.stats.shares import (
+    cross_layer,
     design_effect,
+    failures_per_hour,
     half_width,
     missions_for_margin,
     mixture,
@@ -21,7 +22,6 @@ from mavfi_cli.stats.shares import (
     rate,
     wilson,
 )
-from mavfi_cli.stats.worst_case import worst_case
 
 COUNTS = st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 

@@ -15,8 +15,8 @@ from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.beside_model import Beside, side_by_side
 from mavfi_cli.studies.flight_plan import flight_plan
+from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report, setting_of
-from mavfi_cli.vpm.schemes import SCHEMES
 from mavfi_cli.vpm.vehicle import load_vehicle
 
 HOVER_SHAFT_W = 20.0  # of the simulated vehicle, with one board

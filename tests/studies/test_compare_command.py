@@ -14,8 +14,7 @@ from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import plain
-from mavfi_cli.studies.compare import compare
-from mavfi_cli.studies.compare_plan import ComparePlan
+from mavfi_cli.studies.compare import ComparePlan, compare
 
 WORLD = POSTS.replace("goal_enu_m = [20.0", "goal_enu_m = [16.0")
 FEW = ("--platform", "x86", "--platform", "tx2", "--inject", "waypoint_position", "--detector",

@@ -10,7 +10,7 @@ from mavfi_cli.analysis.platforms import titles
 from mavfi_cli.analysis.timeline import timeline_seed
 from mavfi_cli.campaign.specification_file import load_spec, replaced
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.studies.compare_plan import ComparePlan
+from mavfi_cli.studies.compare import ComparePlan
 
 
 def test_as_it_stands_it_is_the_preset_fig16_mission_for_mission():

@@ -16,8 +16,7 @@ from mavfi_cli.report.detection_plot import (
     write_roc_plot,
 )
 from mavfi_cli.report.tables.detectors import detector_csv, detector_lines
-from mavfi_cli.studies.evaluate import told
-from mavfi_cli.studies.evaluation_plan import EvaluationPlan
+from mavfi_cli.studies.evaluate import EvaluationPlan, told
 
 # The thresholds of the plan are not used: scores are given.
 PLAN = EvaluationPlan(worlds=("dense", "farm"), detectors=("gad",), flights=2, golden_flights=2)

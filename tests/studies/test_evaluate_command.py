@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from mavfi_cli.detect import model as model_file
-from mavfi_cli.detect.registry import find
+from mavfi_cli.detect.base import find_detector
 
 
 def refused(mavfi, tmp_path, *arguments):
@@ -66,5 +66,5 @@ def test_the_list_tells_of_a_model_that_cannot_be_used(mavfi, tmp_path):
     assert done.returncode == 0
     assert "cannot be used" in done.stdout
     assert "corrupt model file: not JSON" in done.stdout
-    assert f"threshold {find('gad').threshold:g}" in done.stdout
+    assert f"threshold {find_detector('gad').threshold:g}" in done.stdout
     assert done.stdout.count("No such file or directory") == 2  # l2 and range

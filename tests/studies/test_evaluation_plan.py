@@ -12,11 +12,10 @@ from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.states import BY_NAME, DType
 from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.gaussian import GaussianDetector
-from mavfi_cli.detect.listing import training_flights
-from mavfi_cli.detect.model import Model
+from mavfi_cli.detect.model import Model, training_flights
 from mavfi_cli.detect.watch import EXTENDED
 from mavfi_cli.spec.stack import load_stack
-from mavfi_cli.studies.evaluation_plan import INTEGER, EvaluationPlan, require_held_out
+from mavfi_cli.studies.evaluate import INTEGER, EvaluationPlan, require_held_out
 
 PLAN = EvaluationPlan(
     worlds=("dense", "farm"), detectors=(NONE, "gad"), flights=2, harmless_flights=1,

@@ -5,17 +5,17 @@ import pytest
 from mavfi_cli.campaign.progress import Spectator
 from mavfi_cli.campaign.run import Options
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies import redundancy_plan
+from mavfi_cli.studies import redundancy
 from mavfi_cli.studies.flight_plan import flight_plan
+from mavfi_cli.vpm.model import SCHEMES, named
 from mavfi_cli.vpm.report import Choices, setting_of
-from mavfi_cli.vpm.schemes import SCHEMES, named
 from mavfi_cli.vpm.vehicle import load_vehicle
 
 
 @pytest.fixture
 def ask(tmp_path):
     def of(train):
-        return redundancy_plan.RedundancyPlan(
+        return redundancy.RedundancyPlan(
             vehicles=[load_vehicle("spark")], choices=Choices(), worlds=("sparse",), missions=1,
             first_seed=1, folder=tmp_path, train=train,
         )  # fmt: skip
@@ -38,17 +38,17 @@ def test_they_are_fitted_once_to_the_bare_vehicle_s_flights(ask, bare, monkeypat
         for kind in plan.kinds:
             (folder / f"{kind}.json").write_text("{}")
 
-    monkeypatch.setattr(redundancy_plan, "train", train)
-    folder = redundancy_plan.fitted(ask(3), "spark", bare, Options(), Spectator())
+    monkeypatch.setattr(redundancy, "train", train)
+    folder = redundancy.fitted(ask(3), "spark", bare, Options(), Spectator())
     (plan,) = calls
     assert plan.base == bare.mission
     assert plan.kinds == ("gad", "aad")
     missions = plan.missions()
     assert len(missions) == 12
     assert {mission.config.v_max_mps for mission in missions} == {bare.mission.v_max_mps}
-    assert redundancy_plan.fitted(ask(3), "spark", bare, Options(), Spectator()) == folder
+    assert redundancy.fitted(ask(3), "spark", bare, Options(), Spectator()) == folder
     assert len(calls) == 1  # what is there is taken
-    assert redundancy_plan.fitted(ask(4), "spark", bare, Options(), Spectator()) != folder
+    assert redundancy.fitted(ask(4), "spark", bare, Options(), Spectator()) != folder
     assert len(calls) == 2
 
 

@@ -8,13 +8,10 @@ import pytest
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.flight_plan import flight_plan, write_files
-from mavfi_cli.studies.redundancy_plan import RedundancyPlan
-from mavfi_cli.vpm.board import load_board
-from mavfi_cli.vpm.model import hover_power_w
+from mavfi_cli.studies.redundancy import RedundancyPlan
+from mavfi_cli.vpm.model import SCHEMES, hover_power_w, named, outcome
 from mavfi_cli.vpm.report import Choices, setting_of
-from mavfi_cli.vpm.schemes import SCHEMES, named
-from mavfi_cli.vpm.setting import outcome
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import load_board, load_vehicle
 
 X86 = load_platform("x86")
 SUM_S = sum(kernel.latency_s for kernel in X86.kernels.values())

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from mavfi_cli.detect import fit, model, registry
+from mavfi_cli.detect import base, fit, model
 from mavfi_cli.detect.dataset import Dataset
 
 WORLD, FIRST_SEED, FLIGHTS = "train-0.2-5", 10_075, 10
@@ -47,18 +47,18 @@ def test_shipped_and_new_are_of_the_same_version_and_tell_the_same_things(folder
 
 @pytest.mark.slow
 def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_made_of(folder):
-    new, ours = (registry.find("range", model=p).memory for p in (folder / "range.json", None))
+    new, ours = (base.find_detector("range", model=p).memory for p in (folder / "range.json", None))
     assert (new["lowest"] >= ours["lowest"]).all()
     assert (new["highest"] <= ours["highest"]).all()
     assert (new["highest"] > 0.0).any()
-    new, ours = (registry.find("l2", model=p).memory for p in (folder / "l2.json", None))
+    new, ours = (base.find_detector("l2", model=p).memory for p in (folder / "l2.json", None))
     assert (new["scale"] <= ours["scale"]).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*KINDS, "aad"])
 def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
-    detector = registry.find(kind)
+    detector = base.find_detector(kind)
     setting = set(model.provenance(model.shipped(kind))["split"]["threshold"]) & FLOWN
     flights = Dataset.load(folder / "dataset.parquet").flights
     scores = [

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.spec.platform import load_platform, platform_names
+from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.schemes import SCHEMES
 from mavfi_cli.vpm.vehicle import load_vehicle
 
 TEXT = (Path(__file__).parents[2] / "docs" / "vpm.md").read_text()

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.vpm.board import load_board
 from mavfi_cli.vpm.model import (
     GRAVITY_MPS2,
     KNEE_SHARE,
@@ -17,7 +16,7 @@ from mavfi_cli.vpm.model import (
     roof_mps,
     safe_velocity_mps,
 )
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import load_board, load_vehicle
 
 ACCELERATIONS = st.floats(0.01, 200.0)
 RESPONSES = st.floats(1e-4, 50.0)

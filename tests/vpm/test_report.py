@@ -9,12 +9,10 @@ from mavfi_cli import vpm
 from mavfi_cli.core.config import shipped_names
 from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.vpm.board import Board, load_board
 from mavfi_cli.vpm.calibrate import calibrated
-from mavfi_cli.vpm.model import GRAVITY_MPS2
+from mavfi_cli.vpm.model import GRAVITY_MPS2, SCHEMES, schemes_with
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.schemes import SCHEMES, schemes_with
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import Board, load_board, load_vehicle
 
 VPM = Path(vpm.__file__).parent
 
@@ -78,9 +76,7 @@ def test_a_ratio_out_of_reach(tmp_path):
 
 
 def vehicle_file(name):
-    from mavfi_cli.vpm import vehicle
-
-    return vehicle._FOLDER / f"{name}.toml"
+    return VPM / "vehicles" / f"{name}.toml"
 
 
 @pytest.mark.parametrize("name", shipped_names(VPM / "vehicles"))

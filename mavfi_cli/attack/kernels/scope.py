@@ -14,37 +14,31 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from elftools.elf.elffile import ELFFile
 
 from mavfi_cli.core.errors import FaultError, UnknownName
-from mavfi_cli.fi.tracer.elf import ElfFacts, Function, elf_facts
-from mavfi_cli.fi.tracer.image import Image, Location, Part, Region, executable_mapping
+from mavfi_cli.fi.tracer.image import (
+    ElfFacts,
+    Function,
+    Image,
+    Location,
+    Part,
+    Region,
+    elf_facts,
+    executable_mapping,
+)
 
 PLANNERS = ("rrtstar", "rrt", "rrtconnect")
 KERNELS = ("point_cloud", "octomap", "collision_check", *PLANNERS, "control")
 
 # A planner's code in libompl is contiguous: it is compiled from one source file with its templates.
-# The classes that every planner here calls belong to it too.
-_OMPL_CLASS = {
-    "rrtstar": "ompl9geometric7RRTstar",
-    "rrt": "ompl9geometric3RRTE",
-    "rrtconnect": "ompl9geometric10RRTConnect",
-}
-_OMPL_MOTION = {
-    "rrtstar": "geometric7RRTstar6Motion",
-    "rrt": "geometric3RRT6Motion",
-    "rrtconnect": "geometric10RRTConnect6Motion",
-}
+# The classes that every planner here calls belong to it too. Mangled name, and what ends its class.
+_OMPL = {"rrtstar": ("7RRTstar", ""), "rrt": ("3RRT", "E"), "rrtconnect": ("10RRTConnect", "")}
 _OMPL_SHARED = ("4ompl4base20RealVectorStateSpace", "4ompl4base29PathLengthOptimizationObjective")
-_OMPL_SOLVE = {
-    "rrtstar": "_ZN4ompl9geometric7RRTstar5solveERKNS_4base27PlannerTerminationConditionE",
-    "rrt": "_ZN4ompl9geometric3RRT5solveERKNS_4base27PlannerTerminationConditionE",
-    "rrtconnect": "_ZN4ompl9geometric10RRTConnect5solveERKNS_4base27PlannerTerminationConditionE",
-}
 _OCTOMAP_INSERT = (
     "_ZN7octomap19OccupancyOcTreeBaseINS_10OcTreeNodeEE16insertPointCloudE"
     "RKNS_10PointcloudERKN8octomath7Vector3Edbb"
@@ -95,25 +89,17 @@ def kernel_scope(kernel: str) -> KernelScope:
         UnknownName: no such kernel; names the nearest.
         FaultError: the kernel has not run in this process yet.
     """
+    if kernel not in KERNELS:
+        raise UnknownName("kernel", kernel, KERNELS)
     if kernel in PLANNERS:
         return _planner(kernel)
-    known: dict[str, Callable[[], KernelScope]] = {
-        "point_cloud": _point_cloud,
-        "octomap": _octomap,
-        "collision_check": _collision_check,
-        "control": _control,
-    }
-    if kernel not in known:
-        raise UnknownName("kernel", kernel, KERNELS)
-    return known[kernel]()
+    if kernel == "octomap":
+        return _octomap()
+    return _collision_check() if kernel == "collision_check" else _compiled_kernel(kernel)
 
 
 def library_scope(library: str, function: str) -> KernelScope:
     """Find entry and scope of a function of a shared library; all the library's code counts.
-
-    Args:
-        library: file name of the library, which this process has loaded.
-        function: its symbol.
 
     Raises:
         UnknownName: no such library or function; names the nearest.
@@ -164,26 +150,17 @@ def kernel_of_node(node: str, planner: str) -> str:
     return name
 
 
-def _point_cloud() -> KernelScope:
+def _compiled_kernel(kernel: str) -> KernelScope:
     from mavfi_cli.autonomy.point_cloud import back_project
-
-    return _compiled_kernel("point_cloud", back_project)
-
-
-def _control() -> KernelScope:
     from mavfi_cli.autonomy.tracking import track
 
-    return _compiled_kernel("control", track)
-
-
-def _compiled_kernel(kernel: str, dispatcher: Any) -> KernelScope:
-    name, entry, region = compiled_region(dispatcher)
+    name, entry, region = compiled_region(track if kernel == "control" else back_project)
     return KernelScope(kernel=kernel, entry=entry, objects=(name,), regions={name: region})
 
 
 def _octomap() -> KernelScope:
     image = Image(os.getpid())
-    library = _object_of(image, "liboctomap", _package_of("pyoctomap"))
+    library = _object_of(image, "liboctomap", "/pyoctomap.libs/")
     inner = tuple(image.function(name, [library]) for name in _OCTOMAP_INNER)
     return KernelScope(
         kernel="octomap",
@@ -217,38 +194,36 @@ def _planner(kernel: str) -> KernelScope:
 
     image = Image(os.getpid())
     library = _object_of(image, "libompl")
-    wanted = (_OMPL_CLASS[kernel], _OMPL_MOTION[kernel], *_OMPL_SHARED)
+    name, end = _OMPL[kernel]
+    motion = f"geometric{name}6Motion"
+    wanted = (f"ompl9geometric{name}{end}", motion, *_OMPL_SHARED)
+    solve = f"_ZN4ompl9geometric{name}5solveERKNS_4base27PlannerTerminationConditionE"
     part = _part(_facts(image, library).functions_with(*wanted))
     segment, _, region = compiled_region(segment_free)
     return KernelScope(
         kernel=kernel,
-        entry=image.function(_OMPL_SOLVE[kernel], [library]),
+        entry=image.function(solve, [library]),
         objects=(library, segment),
         regions={library: part, segment: region},
-        inner=_nearest(image, library, kernel),
+        inner=_nearest(image, library, motion),
     )
 
 
-def _nearest(image: Image, library: str, kernel: str) -> tuple[Location, ...]:
+def _nearest(image: Image, library: str, motion: str) -> tuple[Location, ...]:
     """The nearest-neighbour searches that a planner's tree may call."""
-    found = [
+    return tuple(
         Location(library, function.start)
-        for function in _facts(image, library).functions_with(_OMPL_MOTION[kernel])
+        for function in _facts(image, library).functions_with(motion)
         if "NearestNeighborsGNATNoThreadSafety" in function.name
         and ("E7nearestE" in function.name or "E8nearestKE" in function.name)
         and "4Node" not in function.name
-    ]
-    return tuple(found)
+    )
 
 
 def _facts(image: Image, library: str) -> ElfFacts:
     path = image.named(library).path
     assert path is not None
     return elf_facts(path)
-
-
-def _package_of(module: str) -> str:
-    return f"/{module}.libs/"
 
 
 def _object_of(image: Image, prefix: str, folder: str = "") -> str:

@@ -18,32 +18,33 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.difference import unpack
+from mavfi_cli.attack.kernels.catalogue import unpack
 from mavfi_cli.attack.kernels.scope import KernelScope
-from mavfi_cli.attack.kernels.template import (
-    ASK_SCOPE,
-    GO,
-    PID_BYTES,
-    RAISED,
-    RUN,
-    TIMES,
-)
+from mavfi_cli.attack.kernels.template import ASK_SCOPE, GO, PID_BYTES, RAISED, RUN, TIMES
 from mavfi_cli.attack.outcome import RunOutcome
-from mavfi_cli.attack.profile import TargetProfile, Watch, profile_run
+from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.served import ServedProcess
-from mavfi_cli.attack.target import Difference, Golden, RunLimits, RunVerdict, digest, judged
+from mavfi_cli.attack.target import (
+    Difference,
+    Golden,
+    RunLimits,
+    RunVerdict,
+    TargetProfile,
+    Watch,
+    digest,
+    judged,
+)
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.processes import receive
-from mavfi_cli.fi.tracer.breakpoints import Mechanism
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
 
 _PROGRAM = "mavfi_cli.attack.kernels.template"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class _Layout:
     """Memory layout of a kernel's runs, the same in every template."""
 
     scope: KernelScope
@@ -69,7 +70,7 @@ class KernelTarget:
     tolerance: float = 0.0
     limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
-    layout: Layout | None = None
+    layout: _Layout | None = None
 
     @property
     def name(self) -> str:
@@ -96,7 +97,7 @@ class KernelTarget:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CallOutput:
+class _CallOutput:
     """The result of a run: the times of its call, and its packed output or its error."""
 
     cpu_s: float
@@ -128,7 +129,7 @@ class KernelPlace:
             self._closing = undo.pop_all()
         self.target = replace(target, layout=self.layout)
 
-    def _look_up(self, known: Layout | None) -> Layout:
+    def _look_up(self, known: _Layout | None) -> _Layout:
         """Find the memory layout; reuse the known one if it is the same."""
         pid, process = self._template.pid, self._template
         digest_of_code = _digest_of_code(pid)
@@ -139,7 +140,7 @@ class KernelPlace:
             scope: KernelScope = receive(process.connection)
         except (OSError, EOFError):
             raise TargetError(self.name, f"does not load: {process.last_words()}") from None
-        return Layout(scope=scope, image=Image(pid, scope.regions), digest=digest_of_code)
+        return _Layout(scope=scope, image=Image(pid, scope.regions), digest=digest_of_code)
 
     def start(self) -> Tracee:
         """Start a run, attached and stopped, that has not called the kernel yet.
@@ -202,13 +203,13 @@ class KernelPlace:
         """How two fault-free runs differ; empty if they are equal."""
         return "" if golden.output == again.output else "their outputs differ"
 
-    def left(self) -> CallOutput | None:
+    def left(self) -> _CallOutput | None:
         """The result of the ended run; None if it is not complete."""
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None
         cpu_s, wall_s = TIMES.unpack_from(data)
-        return CallOutput(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
+        return _CallOutput(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None if it exceeded its limit."""

@@ -25,8 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.catalogue import Call
-from mavfi_cli.attack.kernels.difference import pack
+from mavfi_cli.attack.kernels.catalogue import Call, pack
 from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
 from mavfi_cli.attack.served import channel, newest_cache_ns
 from mavfi_cli.core.processes import fork, receive, send

@@ -5,24 +5,33 @@ Every message passes through `pass_on` when it is published. The active plan als
 
 A listener hears of each strike *before* the changed message goes on, so that the record survives
 whatever the fault does.
+
+A `Follower` finds out whether a corrupted value was read before it was replaced: a flip in a value
+that nobody reads is not a fault that the system survived. Its words are those of the instruction
+level (`fi.tracer.inject.BitActivation`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import Message, Scalar, State
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
 from mavfi_cli.fi import bits as bit_operations
-from mavfi_cli.fi.source.fault import Persistence, SourceFault, When
+from mavfi_cli.fi.source.fault import Corruption, Effect, Persistence, SourceFault, Trigger, When
 from mavfi_cli.fi.source.schedule import Moment, Pattern, Schedule
 
 M = TypeVar("M")
 
-MAX_LISTED_STRIKES = 100
+_MAX_LISTED_STRIKES = 100
 _WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Command: "command"}
 
 
@@ -50,44 +59,23 @@ class Strike:
     changes: tuple[Change, ...]
 
 
-class SourceInjector:
-    """Carries one fault through one mission.
+Listener = Callable[[Strike], None]
 
-    Args:
-        fault: the fault.
-        seed: root of the fault's random stream.
-        shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
-            uniformly over it, so that the trigger always comes.
-        listener: called with every strike before its message goes on.
+
+class _Injector:
+    """The schedule and the strikes of one fault.
 
     Attributes:
-        strikes: the strikes, oldest first, at most MAX_LISTED_STRIKES.
+        strikes: the strikes, oldest first, at most _MAX_LISTED_STRIKES.
         count: number of strikes.
     """
 
-    def __init__(
-        self,
-        fault: SourceFault,
-        *,
-        seed: int,
-        shortest_flight_s: float,
-        listener: Callable[[Strike], None],
-    ) -> None:
-        self.fault = fault
+    _awaits: str  # what the fault waits for, in words
+
+    def __init__(self, schedule: Schedule, listener: Listener) -> None:
+        self._schedule, self._listener = schedule, listener
         self.strikes: list[Strike] = []
         self.count = 0
-        self._kind = fault.states[0].message
-        self._rng = generator(seed, Stream.FAULT, "strike")
-        self.drawn_time_s = float(self._rng.uniform(0.0, shortest_flight_s))
-        self._listener = listener
-        self._invocations = 0
-        self._schedule = Schedule(fault.trigger, fault.corruption, self.drawn_time_s)
-        self._index: int | None = None
-        self._patterns = [
-            Pattern(fault.corruption, self._rng, None if fault.bits is None else fault.bits[place])
-            for place in range(len(fault.states))
-        ]
-        self._struck: Message | None = None
 
     def watch(self, moment: Moment) -> None:
         """Note the mission's present state, once a control tick and for every report."""
@@ -96,7 +84,47 @@ class SourceInjector:
     @property
     def missed(self) -> str:
         """The reason if the fault never struck."""
-        return self._schedule.missed(_WORDS[self._kind])
+        return self._schedule.missed(self._awaits)
+
+    def _tell(self, moment: Moment, invocation: int, changes: Sequence[Change]) -> None:
+        strike = Strike(
+            stamp_s=moment.stamp_s,
+            tick=moment.tick,
+            phase=moment.phase,
+            invocation=invocation,
+            changes=tuple(changes),
+        )
+        self.count += 1
+        if len(self.strikes) < _MAX_LISTED_STRIKES:
+            self.strikes.append(strike)
+        self._listener(strike)
+
+
+class SourceInjector(_Injector):
+    """Carries one fault through one mission.
+
+    Args:
+        shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
+            uniformly over it, so that the trigger always comes.
+        listener: called with every strike before its message goes on.
+    """
+
+    def __init__(
+        self, fault: SourceFault, *, seed: int, shortest_flight_s: float, listener: Listener
+    ) -> None:
+        self.fault = fault
+        self._kind = fault.states[0].message
+        self._rng = generator(seed, Stream.FAULT, "strike")
+        self.drawn_time_s = float(self._rng.uniform(0.0, shortest_flight_s))
+        super().__init__(Schedule(fault.trigger, fault.corruption, self.drawn_time_s), listener)
+        self._awaits = _WORDS[self._kind]
+        self._invocations = 0
+        self._index: int | None = None
+        self._patterns = [
+            Pattern(fault.corruption, self._rng, None if fault.bits is None else fault.bits[place])
+            for place in range(len(fault.states))
+        ]
+        self._struck: Message | None = None
 
     def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
         """Return the message as its receiver gets it.
@@ -142,17 +170,7 @@ class SourceInjector:
             change = self._change(place, state, changed)
             changed = state.write(changed, self._index, change.after)
             changes.append(change)
-        strike = Strike(
-            stamp_s=moment.stamp_s,
-            tick=moment.tick,
-            phase=moment.phase,
-            invocation=self._invocations,
-            changes=tuple(changes),
-        )
-        self.count += 1
-        if len(self.strikes) < MAX_LISTED_STRIKES:
-            self.strikes.append(strike)
-        self._listener(strike)
+        self._tell(moment, self._invocations, changes)
         result: M = changed
         return result
 
@@ -160,10 +178,10 @@ class SourceInjector:
         assert self._index is not None
         kind = bit_operations.NUMPY_TYPES[state.dtype.value]
         before = state.read(message, self._index)
-        return change_of(state.name, self._index, before, kind, self._patterns[place])
+        return _change_of(state.name, self._index, before, kind, self._patterns[place])
 
 
-def change_of(
+def _change_of(
     name: str, index: int, before: Scalar, kind: bit_operations.BitType, corruption: Pattern
 ) -> Change:
     """Return the change that a strike makes to one value."""
@@ -178,3 +196,158 @@ def change_of(
         before_hex=f"{pattern:#0{kind.width // 4 + 2}x}",
         after_hex=f"{corrupted:#0{kind.width // 4 + 2}x}",
     )
+
+
+Memory = Mapping[str, NDArray[Any]]
+
+
+class MemoryInjector(_Injector):
+    """Carries one fault in a memory, an element of one of several arrays, through one mission.
+
+    It attacks a detector's memory (thresholds, means, weights): a detector can be hit as well.
+
+    Args:
+        memory: the arrays, which are changed in place.
+        array: the attacked array; None draws one in proportion to its bits.
+        trigger: when to strike; an invocation is a control tick.
+        shortest_flight_s: a random time is drawn over this time, s.
+
+    Attributes:
+        array, element: the attacked array, and the index of the element in C order.
+
+    Raises:
+        UnknownName: there is no such array.
+        BitOutsideWidth, FieldUnavailable: the array's elements do not have these bits.
+        FaultSpecError: the array has no elements.
+    """
+
+    _awaits = "control tick"
+
+    def __init__(
+        self,
+        memory: Memory,
+        array: str | None,
+        *,
+        trigger: Trigger,
+        corruption: Corruption,
+        bits: Sequence[int] | None,
+        seed: int,
+        shortest_flight_s: float,
+        listener: Listener,
+    ) -> None:
+        if array is not None and array not in memory:
+            raise UnknownName("part of the detector's memory", array, memory)
+        rng = generator(seed, Stream.FAULT, "memory")
+        self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
+        names = sorted(memory)
+        if array is None:
+            sizes = np.array([memory[name].nbytes for name in names], dtype=np.float64)
+            array = names[int(rng.choice(len(names), p=sizes / sizes.sum()))]
+        if memory[array].size == 0:
+            raise FaultSpecError(f"{array} has no elements")
+        self.array = array
+        self.element = int(rng.integers(memory[array].size))
+        self._kind = bit_operations.NUMPY_TYPES[memory[array].dtype.name]
+        if bits is not None:
+            bit_operations.mask_of(bits, self._kind)
+        elif corruption.effect is Effect.FLIP:
+            self._kind.field_bits(corruption.field)
+        self._memory = memory
+        super().__init__(Schedule(trigger, corruption, self.drawn_time_s), listener)
+        chosen = None if bits is None else tuple(sorted(bits))
+        self._pattern = Pattern(corruption, rng, chosen)
+
+    def strike(self, moment: Moment) -> None:
+        """Strike the memory if the fault is due."""
+        if not self._schedule.due(moment, moment.tick):
+            return
+        self._schedule.acted(moment)
+        place = self._memory[self.array]
+        before = place.flat[self.element].item()
+        change = _change_of(self.array, self.element, before, self._kind, self._pattern)
+        place.flat[self.element] = change.after
+        self._tell(moment, moment.tick, [change])
+
+
+class Activation(Enum):
+    """What happened to the corrupted values, over all strikes of a fault."""
+
+    READ = "read"  # a receiver worked with a corrupted value
+    WITHHELD = "withheld"  # the detector's gate kept it from its receivers
+    OVERWRITTEN = "overwritten"  # the message was replaced before anyone read it
+    NOT_READ = "not_read"  # the mission ended before anyone read it
+    UNCHANGED = "unchanged"  # the strike did not change the value
+    NOT_INJECTED = "not_injected"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reader:
+    """The first receiver that worked with a corrupted value, and when."""
+
+    name: str
+    stamp_s: float
+    state: str
+
+
+class Follower:
+    """Follows the struck message until one of its corrupted values is read.
+
+    Attributes:
+        activation: the activation so far; READ is final, WITHHELD holds until a value is read.
+        reader: the first one.
+    """
+
+    def __init__(self) -> None:
+        self.activation = Activation.NOT_INJECTED
+        self.reader: Reader | None = None
+        self._message: Message | None = None
+        self._corrupted: dict[str, int] = {}  # state -> waypoint
+
+    @property
+    def waits(self) -> bool:
+        """True while a struck message is on its way and nobody has read it."""
+        return self._message is not None
+
+    def struck(self, message: Message, strike: Strike) -> None:
+        """Note that a message was corrupted; it goes on as `message`."""
+        if self.activation is Activation.READ:
+            return
+        self._corrupted = {c.state: c.index for c in strike.changes if c.bits}
+        if self._corrupted:
+            self._message = message
+            self._become(Activation.NOT_READ)
+        elif self.activation is Activation.NOT_INJECTED:
+            self.activation = Activation.UNCHANGED
+
+    def read(
+        self,
+        message: Message | None,
+        by: str,
+        stamp_s: float,
+        states: Collection[str],
+        index: int | None = None,
+    ) -> None:
+        """Note that a receiver works with a message's states, at one waypoint or at all of them."""
+        if self._message is None or message is not self._message:
+            return
+        for state, at in self._corrupted.items():
+            if state in states and index in (None, at):
+                self.activation, self._message = Activation.READ, None
+                self.reader = Reader(name=by, stamp_s=stamp_s, state=state)
+                return
+
+    def withheld(self, message: Message) -> None:
+        """Note that the gate withheld a message, or the struck part of it."""
+        if message is self._message:
+            self.activation, self._message = Activation.WITHHELD, None
+
+    def settle(self, held: Callable[[Message], bool]) -> None:
+        """Note the message as overwritten if `held` says that it no longer counts."""
+        if self._message is not None and not held(self._message):
+            self._message = None
+            self._become(Activation.OVERWRITTEN)
+
+    def _become(self, activation: Activation) -> None:
+        """Raise the activation; a later strike never lowers that of an earlier one."""
+        if self.activation is not Activation.WITHHELD:
+            self.activation = activation

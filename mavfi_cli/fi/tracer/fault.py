@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -112,14 +112,7 @@ class FaultModel:
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Candidate:
-    site: Site
-    role: Role
-    register: str
-    operand: str
-    mask: int
-    memory_operand: int = 0
+_Operand = tuple[InstructionCorruption, int]  # a corruption without bits, and those to draw from
 
 
 def draw_corruption(
@@ -131,27 +124,19 @@ def draw_corruption(
         None if the instruction has no operand that the model allows.
     """
     candidates = [
-        candidate
-        for candidate in _candidates(instruction, model)
-        if candidate.mask.bit_count() >= model.count
+        (operand, mask)
+        for operand, mask in _operands(instruction, model)
+        if mask.bit_count() >= model.count
     ]
     if not candidates:
         return None
-    chosen = candidates[int(rng.integers(len(candidates)))]
-    available = bits.bits_of(chosen.mask)
+    operand, mask = candidates[int(rng.integers(len(candidates)))]
+    available = bits.bits_of(mask)
     picked = rng.choice(len(available), size=model.count, replace=False)
-    return InstructionCorruption(
-        site=chosen.site,
-        role=chosen.role,
-        register=chosen.register,
-        operand=chosen.operand,
-        bits=tuple(sorted(available[int(index)] for index in picked)),
-        memory_operand=chosen.memory_operand,
-    )
+    return replace(operand, bits=tuple(sorted(available[int(index)] for index in picked)))
 
 
 def _site_of(register: str) -> Site:
-    """The class of a full register."""
     return Site(register_kind(register))
 
 
@@ -173,12 +158,9 @@ def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> In
     )
 
 
-def _candidates(instruction: Instruction, model: FaultModel) -> list[_Candidate]:
-    found: list[_Candidate] = []
-    for role, uses in (
-        (Role.SOURCE, instruction.reads),
-        (Role.DESTINATION, instruction.writes),
-    ):
+def _operands(instruction: Instruction, model: FaultModel) -> list[_Operand]:
+    found: list[_Operand] = []
+    for role, uses in ((Role.SOURCE, instruction.reads), (Role.DESTINATION, instruction.writes)):
         if role in model.roles:
             found += _registers(instruction, model, role, uses)
             found += _memory(instruction, model, role)
@@ -187,24 +169,29 @@ def _candidates(instruction: Instruction, model: FaultModel) -> list[_Candidate]
     return found
 
 
+def _operand(
+    site: Site, role: Role, mask: int, operand: str, register: str = "", memory_operand: int = 0
+) -> _Operand:
+    corruption = InstructionCorruption(
+        site=site, role=role, register=register, operand=operand, bits=(),
+        memory_operand=memory_operand,
+    )  # fmt: skip
+    return corruption, mask
+
+
 def _registers(
     instruction: Instruction, model: FaultModel, role: Role, uses: tuple[RegisterUse, ...]
-) -> list[_Candidate]:
-    merged: dict[str, _Candidate] = {}
+) -> list[_Operand]:
+    merged: dict[str, _Operand] = {}
     for use in uses:
         site = _site_of(use.register)
-        if site not in model.sites:
+        if site not in model.sites or not (use.explicit or model.implicit):
             continue
-        if not (use.explicit or model.implicit):
-            continue
-        mask, operand = use.mask & _field_mask(instruction, model, site), use.operand
-        known = merged.get(use.register)
-        if known is not None:  # the flags of one instruction are one operand
-            mask, operand = mask | known.mask, use.register
-        merged[use.register] = _Candidate(
-            site=site, role=role, register=use.register, operand=operand, mask=mask
-        )
-    return [candidate for candidate in merged.values() if candidate.mask]
+        mask, name = use.mask & _field_mask(instruction, model, site), use.operand
+        if use.register in merged:  # the flags of one instruction are one operand
+            mask, name = mask | merged[use.register][1], use.register
+        merged[use.register] = _operand(site, role, mask, name, use.register)
+    return [operand for operand in merged.values() if operand[1]]
 
 
 def _field_mask(instruction: Instruction, model: FaultModel, site: Site) -> int:
@@ -219,44 +206,24 @@ def _field_mask(instruction: Instruction, model: FaultModel, site: Site) -> int:
     return sum(lane << shift for shift in range(0, TRAITS.vector_bits, kind.width))
 
 
-def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Candidate]:
+def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Operand]:
     if Site.MEMORY not in model.sites or model.field is not Field.ANY:
         return []
     return [
-        _Candidate(
-            site=Site.MEMORY,
-            role=role,
-            register="",
-            operand=use.operand,
-            mask=(1 << 8 * use.size) - 1,
-            memory_operand=index,
-        )
+        _operand(Site.MEMORY, role, (1 << 8 * use.size) - 1, use.operand, memory_operand=index)
         for index, use in enumerate(instruction.memory)
         if (use.reads if role is Role.SOURCE else use.writes)
     ]
 
 
-def _control(instruction: Instruction, model: FaultModel) -> list[_Candidate]:
+def _control(instruction: Instruction, model: FaultModel) -> list[_Operand]:
     found = []
     if Site.INSTRUCTION_POINTER in model.sites:
         pointer = TRAITS.instruction_pointer
-        found.append(
-            _Candidate(
-                site=Site.INSTRUCTION_POINTER,
-                role=Role.DESTINATION,
-                register=pointer,
-                operand=pointer,
-                mask=(1 << width_of(pointer)) - 1,
-            )
-        )
+        mask = (1 << width_of(pointer)) - 1
+        site = Site.INSTRUCTION_POINTER
+        found.append(_operand(site, Role.DESTINATION, mask, pointer, pointer))
     if Site.OPCODE in model.sites:
-        found.append(
-            _Candidate(
-                site=Site.OPCODE,
-                role=Role.SOURCE,
-                register="",
-                operand="opcode",
-                mask=(1 << 8 * len(instruction.raw)) - 1,
-            )
-        )
+        mask = (1 << 8 * len(instruction.raw)) - 1
+        found.append(_operand(Site.OPCODE, Role.SOURCE, mask, "opcode"))
     return found

@@ -8,14 +8,7 @@ from enum import Enum
 
 from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi import bits
-from mavfi_cli.fi.tracer.arch import (
-    TRAITS,
-    Instruction,
-    address_of,
-    decode,
-    erase_trap,
-    width_of,
-)
+from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, address_of, decode, erase_trap, width_of
 from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee, Trap
@@ -71,7 +64,7 @@ def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
 def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
     """Decode the instruction that the target is about to execute."""
     try:
-        return decode(tracee.read_memory(address, 16), address)
+        return decode(tracee.memory.read(address, 16), address)
     except OSError:
         return None
 
@@ -85,7 +78,7 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
         return tracee.ended
     result = tracee.step()
     if not isinstance(result, Ended) and instruction is not None:
-        erase_trap(tracee, instruction)
+        erase_trap(tracee.registers, tracee.memory, instruction)
     return result
 
 
@@ -132,9 +125,9 @@ def _invert(
         return _execute_corrupted(tracee, instruction, corruption)
     if corruption.site is Site.MEMORY:
         size = instruction.memory[corruption.memory_operand].size
-        data = tracee.read_memory(place, size)
-        tracee.write_memory(place, bits.flip_bytes(data, corruption.bits))
-        return _number(data), _number(tracee.read_memory(place, size))
+        data = tracee.memory.read(place, size)
+        tracee.memory.write(place, bits.flip_bytes(data, corruption.bits))
+        return _number(data), _number(tracee.memory.read(place, size))
     registers = tracee.registers
     before = registers.read(corruption.register)
     kind = bits.raw(width_of(corruption.register) // 8)
@@ -147,11 +140,11 @@ def _execute_corrupted(
 ) -> tuple[int, int]:
     """Execute the corrupted bytes once, then restore the code: a transient fetch error."""
     corrupted = bits.flip_bytes(instruction.raw, corruption.bits)
-    tracee.write_memory(instruction.address, corrupted)
-    seen = tracee.read_memory(instruction.address, len(corrupted))
-    decoded = decode(tracee.read_memory(instruction.address, 16), instruction.address)
+    tracee.memory.write(instruction.address, corrupted)
+    seen = tracee.memory.read(instruction.address, len(corrupted))
+    decoded = decode(tracee.memory.read(instruction.address, 16), instruction.address)
     if not isinstance(clean_step(tracee, decoded), Ended):
-        tracee.write_memory(instruction.address, instruction.raw)
+        tracee.memory.write(instruction.address, instruction.raw)
     return _number(instruction.raw), _number(seen)
 
 

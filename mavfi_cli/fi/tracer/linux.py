@@ -1,4 +1,4 @@
-"""ptrace and related system calls as typed functions, independent of the architecture.
+"""ptrace, a process's memory and its time limits: system calls, independent of the architecture.
 
 Request and option numbers: `<sys/ptrace.h>` of Linux; see ptrace(2), personality(2).
 A stopped thread is named by its thread id. ptrace obeys only the thread that attached.
@@ -9,13 +9,17 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import struct
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 
 from mavfi_cli.core.errors import TracingForbidden
+from mavfi_cli.fi.tracer import linux
 
 PEEKUSER, POKEUSER = 3, 6
 CONT, SINGLESTEP, DETACH = 7, 9, 17
@@ -27,6 +31,7 @@ TRACE_OPTIONS = (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4)  # fork, vfork, clone,
 EVENT_FORK, EVENT_VFORK, EVENT_CLONE, EVENT_EXEC, EVENT_STOP = 1, 2, 3, 4, 128
 WALL = 0x4000_0000
 ADDR_NO_RANDOMIZE = 0x0040000
+_AT_ENTRY = 9
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _ptrace = _libc.ptrace
@@ -61,11 +66,6 @@ def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
     return result & 0xFFFF_FFFF_FFFF_FFFF
 
 
-def peek_user(tid: int, offset: int) -> int:
-    """A word of a stopped thread's `struct user`."""
-    return request(PEEKUSER, tid, offset)
-
-
 def seize(tid: int, *, kill_with_tracer: bool) -> None:
     """Attach without stopping; new threads and children are attached by the kernel.
 
@@ -98,19 +98,40 @@ def set_registers(tid: int, note: int, data: bytes) -> None:
     request(SETREGSET, tid, note, ctypes.addressof(vector))
 
 
-@dataclass(frozen=True, slots=True)
-class SignalInfo:
-    """The kernel's information about the signal of a stop."""
-
-    number: int
-    code: int
-
-
-def signal_info(tid: int) -> SignalInfo:
-    """The siginfo of a signal-delivery stop."""
+def signal_code(tid: int) -> int:
+    """The `si_code` of a signal-delivery stop."""
     buffer = (ctypes.c_int * 32)()
     request(GETSIGINFO, tid, 0, ctypes.addressof(buffer))
-    return SignalInfo(buffer[0], buffer[2])
+    return int(buffer[2])
+
+
+class Memory:
+    """The memory of a process, whatever its protection; opened on first use.
+
+    Reading and writing raise OSError where nothing is mapped.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid, self._file = pid, -1
+
+    def _open(self) -> int:
+        if self._file < 0:
+            self._file = os.open(f"/proc/{self._pid}/mem", os.O_RDWR | os.O_CLOEXEC)
+        return self._file
+
+    def read(self, address: int, size: int) -> bytes:
+        """Bytes at an address."""
+        return os.pread(self._open(), size, address)
+
+    def write(self, address: int, data: bytes) -> None:
+        """Write bytes; the kernel makes a private copy of a file's page."""
+        os.pwrite(self._open(), data, address)
+
+    def close(self) -> None:
+        """Close the file; the next use opens it again."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
 
 
 @contextmanager
@@ -157,13 +178,10 @@ def cpu_time_s(pid: int) -> float:
         return 0.0
 
 
-def auxiliary(pid: int, key: int) -> int | None:
-    """One entry of the auxiliary vector of a process (AT_ENTRY is 9)."""
-    data = Path(f"/proc/{pid}/auxv").read_bytes()
-    for at in range(0, len(data) - 15, 16):
-        if int.from_bytes(data[at : at + 8], "little") == key:
-            return int.from_bytes(data[at + 8 : at + 16], "little")
-    return None
+def entry_point(pid: int) -> int | None:
+    """The address at which a program begins, from its auxiliary vector."""
+    words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
+    return next((value for key, value in words if key == _AT_ENTRY), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,3 +225,56 @@ def wait(tid: int) -> Status:
     """
     found, raw = os.waitpid(tid, WALL)
     return Status(found, raw)
+
+
+class ProcessTimer:
+    """A timer on one process; leaving its context cancels it.
+
+    It fires when the process has used `cpu_s` of CPU time since the timer was set, or when
+    `wall_s` have passed, whichever is set and comes first. `fired` is true once it has.
+    """
+
+    def __init__(
+        self, pid: int, number: signal.Signals, *, cpu_s: float | None, wall_s: float | None
+    ) -> None:
+        self.fired = False
+        self._pid = pid
+        self._signal = number
+        self._process = os.pidfd_open(pid)
+        self._cpu_end = None if cpu_s is None else linux.cpu_time_s(pid) + cpu_s
+        self._wall_end = None if wall_s is None else time.monotonic() + wall_s
+        self._cancelled = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> ProcessTimer:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._cancelled.set()
+        self._thread.join()
+        os.close(self._process)
+
+    def _watch(self) -> None:
+        while (left := self._left_s()) > 0:
+            if self._cancelled.wait(left):
+                return
+        self.fired = True
+        try:
+            signal.pidfd_send_signal(self._process, self._signal)
+        except ProcessLookupError:
+            self.fired = False  # the process had ended
+
+    def _left_s(self) -> float:
+        """Lower bound of the time left; CPU time passes no faster than wall time."""
+        left = []
+        if self._cpu_end is not None:
+            left.append(self._cpu_end - linux.cpu_time_s(self._pid))
+        if self._wall_end is not None:
+            left.append(self._wall_end - time.monotonic())
+        return min(left)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
     """Make the record before the flip.
 
     Args:
-        fault: the drawn fault.
         image: image of the process, for symbols and build ids.
         context: further entries: seed, sampling rule, scope, kernel, program, run.
     """
@@ -63,14 +63,8 @@ def corruption_to_json(corruption: InstructionCorruption | None) -> dict[str, An
     """The corruption part of a record; null for a null injection."""
     if corruption is None:
         return None
-    return {
-        "site": corruption.site.value,
-        "role": corruption.role.value,
-        "register": corruption.register,
-        "operand": corruption.operand,
-        "bits": list(corruption.bits),
-        "memory_operand": corruption.memory_operand,
-    }
+    names = {"site": corruption.site.value, "role": corruption.role.value}
+    return asdict(corruption) | names | {"bits": list(corruption.bits)}
 
 
 def completed(
@@ -79,19 +73,9 @@ def completed(
     """Make the record after the run; `injection` is None if the trigger was not reached."""
     what: dict[str, Any] = {"applied": False}
     if injection is not None:
-        what = {
-            "applied": injection.applied,
-            "reason": injection.reason,
-            "address": injection.address,
-            "before": hex(injection.before),
-            "after": hex(injection.after),
-            "stop_s": injection.stop_s,
-        }
-    activation = {
-        "activation": followed.activation.value,
-        "after_instructions": followed.after_instructions,
-        "instruction": followed.instruction,
-    }
+        values = {"before": hex(injection.before), "after": hex(injection.after)}
+        what = asdict(injection) | values
+    activation = asdict(followed) | {"activation": followed.activation.value}
     return {**record, "state": "completed", "injection": what, "activation": activation, **result}
 
 
@@ -120,15 +104,8 @@ def fault_of(record: Mapping[str, Any]) -> InstructionFault:
 
 
 def _corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
-    """The corruption part of a record, read back."""
-    return InstructionCorruption(
-        site=Site(data["site"]),
-        role=Role(data["role"]),
-        register=data["register"],
-        operand=data["operand"],
-        bits=tuple(data["bits"]),
-        memory_operand=data["memory_operand"],
-    )
+    converted = {"site": Site(data["site"]), "role": Role(data["role"]), "bits": (*data["bits"],)}
+    return InstructionCorruption(**{**data, **converted})
 
 
 def require_same_build(record: Mapping[str, Any], image: Image) -> None:

@@ -1,24 +1,230 @@
-"""Sampling rules: the population from which a fault is drawn. Every result names its rule."""
+"""The population from which a fault is drawn: sampling rules, and windows of executed instructions.
+
+Every result names its rule. A window of the golden run is single-stepped and the address of each
+instruction in scope is recorded, so that sampling can be uniform over them. Code out of scope runs
+natively. Meanwhile every byte of the code in scope is a breakpoint instruction, so that no way back
+in (return, callback, exception) is missed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import FaultError, UnknownName, named_member
-from mavfi_cli.fi.tracer.arch import Instruction, decode
+from mavfi_cli.core.errors import FaultError, TargetError, UnknownName, named_member
+from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, decode, record_steps, return_address
+from mavfi_cli.fi.tracer.arch.interface import StepEnd
 from mavfi_cli.fi.tracer.fault import (
+    CountedStop,
     FaultModel,
     InstructionCorruption,
     InstructionFault,
     Site,
     draw_corruption,
 )
-from mavfi_cli.fi.tracer.image import Location
-from mavfi_cli.fi.tracer.windows import Stratum, plan_trigger
+from mavfi_cli.fi.tracer.image import Location, Scope
+from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+
+_CHUNK = 16384
+_STAGE_COST = 12  # one more stop costs about as much as 12 counted hits
+_HORIZON = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Segment:
+    """One stepped window: its start, and the instructions that executed in it."""
+
+    start: tuple[CountedStop, ...]  # empty: the program's entry point
+    trace: NDArray[np.int64]  # (n,) addresses in order; a repeated string instruction is one entry
+
+    @functools.cached_property
+    def ranks(self) -> NDArray[np.int64]:
+        """(n,) number of the execution of its instruction at each position, from 1."""
+        order = np.argsort(self.trace, kind="stable")
+        ordered = self.trace[order]
+        fresh = np.r_[True, ordered[1:] != ordered[:-1]]
+        starts = np.maximum.accumulate(np.where(fresh, np.arange(len(order)), 0))
+        ranks = np.empty(len(order), np.int64)
+        ranks[order] = np.arange(len(order)) - starts + 1
+        return ranks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stratum:
+    """Windows that begin at the same instruction, with those that were stepped."""
+
+    segments: tuple[Segment, ...]
+    windows_in_run: int  # windows of the run; if more than were stepped, they are a sample
+    marker: Location | None = None  # None: the start of the run
+
+    @property
+    def instructions(self) -> float:
+        """Number of executed instructions of all windows, estimated from the stepped ones."""
+        return self.executed / len(self.segments) * self.windows_in_run
+
+    @property
+    def executed(self) -> int:
+        """Number of executed instructions in scope, over the stepped windows."""
+        return sum(len(segment.trace) for segment in self.segments)
+
+    @property
+    def complete(self) -> bool:
+        """True if every window of the run was stepped."""
+        return len(self.segments) == self.windows_in_run
+
+    def at(self, position: int) -> tuple[Segment, int]:
+        """The segment and index of one executed instruction, counted over all segments."""
+        for segment in self.segments:
+            if position < len(segment.trace):
+                return segment, position
+            position -= len(segment.trace)
+        raise IndexError(position)
+
+
+class WindowTooLong(TargetError):
+    """A window has more instructions than the user allows to step."""
+
+    def __init__(self, program: str, limit: int) -> None:
+        super().__init__(
+            program,
+            f"executes more than {limit} instructions in scope; name a function whose "
+            "invocations are sampled, or allow more steps",
+        )
+
+
+def record_window(
+    tracee: Tracee,
+    scope: Scope,
+    *,
+    limit: int,
+    program: str,
+    until_return: bool = False,
+    markers: Sequence[int] = (),
+    watch: Callable[[int], None] | None = None,
+) -> NDArray[np.int64]:
+    """Step from the present stop to the end of the program, of the function, or to a marker.
+
+    Args:
+        tracee: the process, stopped at the start of the window.
+        scope: the code whose instructions are recorded.
+        until_return: the target is at a function's entry; the window ends when it returns.
+        markers: addresses in scope; the window ends in front of the next execution of one. It
+            always contains the instruction that the target is stopped in front of.
+        watch: called regularly with the number of instructions recorded since the last call.
+
+    Raises:
+        WindowTooLong: more than `limit` instructions in scope.
+    """
+    stop = np.array([-1, 0, *markers], np.int64)
+    if until_return:
+        stop[:2] = return_address(tracee.registers, tracee.memory), tracee.registers.sp
+    parts: list[NDArray[np.int64]] = []
+    if tracee.registers.ip in markers:
+        parts.append(np.array([tracee.registers.ip], np.int64))
+        clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
+    total = len(parts)
+    for part in _parts(tracee, scope, stop):
+        parts.append(part)
+        total += len(part)
+        if watch is not None:
+            watch(len(part))
+        if total > limit:
+            raise WindowTooLong(program, limit)
+    return np.concatenate(parts) if parts else np.empty(0, np.int64)
+
+
+def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    spans = np.array([[span.start, span.stop] for span in scope.spans], np.int64)
+    blanket = _Blanket(tracee, scope)
+    while tracee.ended is None:
+        trace = np.empty(_CHUNK, np.int64)
+        tracee.registers.forget()
+        steps = record_steps(tracee.tid, spans, trace, stop)
+        yield trace[: steps.count]
+        if steps.why is StepEnd.WINDOW_END:
+            return
+        if steps.why is StepEnd.OTHER_STATUS:
+            tracee.handle(linux.Status(tracee.tid, steps.status), linux.SINGLESTEP)
+        elif steps.why is StepEnd.NEEDS_CARE:
+            yield np.array([tracee.registers.ip], np.int64)
+            clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
+        elif steps.why is StepEnd.OUT_OF_SCOPE and not blanket.run_native(stop):
+            return
+
+
+class _Blanket:
+    """Covers the code in scope with breakpoint instructions while foreign code runs."""
+
+    def __init__(self, tracee: Tracee, scope: Scope) -> None:
+        self._tracee = tracee
+        self._code = [
+            (span.start, tracee.memory.read(span.start, len(span))) for span in scope.spans
+        ]
+        self._scope = scope
+
+    def run_native(self, stop: NDArray[np.int64]) -> bool:
+        """Run foreign code; False if the program ended or the window's function returned."""
+        tracee = self._tracee
+        guard = tracee.breakpoint_at(int(stop[0])) if self._guarded(stop) else None
+        try:
+            self._write(covered=True)
+            while True:
+                if isinstance(tracee.resume(), Ended):
+                    return False
+                entered = tracee.registers.ip - TRAITS.breakpoint_advance
+                if entered in self._scope:
+                    tracee.registers.write(TRAITS.instruction_pointer, entered)
+                    return True
+                if tracee.registers.ip == stop[0] and tracee.registers.sp > stop[1]:
+                    return False
+        finally:
+            if guard is not None:
+                guard.close()
+            if tracee.ended is None:
+                self._write(covered=False)
+
+    def _guarded(self, stop: NDArray[np.int64]) -> bool:
+        return int(stop[0]) > 0 and int(stop[0]) not in self._scope
+
+    def _write(self, *, covered: bool) -> None:
+        for start, code in self._code:
+            data = TRAITS.breakpoint * len(code) if covered else code
+            self._tracee.memory.write(start, data)
+
+
+def plan_trigger(
+    segment: Segment, index: int, locate: Callable[[int], Location]
+) -> tuple[tuple[CountedStop, ...], int]:
+    """Plan the cheapest exact trigger of one executed instruction of a segment.
+
+    Each counted hit costs the same. So a rarely executed instruction shortly before the target is
+    reached first, and the target's executions are counted from there.
+
+    Returns:
+        The trigger, and k, the number of the execution of its instruction in the segment.
+    """
+    trace = segment.trace[: index + 1]
+    target = trace[index]
+    is_target = trace == target
+    k = int(np.count_nonzero(is_target))
+    if k <= _STAGE_COST:
+        return (*segment.start, CountedStop(locate(int(target)), k)), k
+    first = max(0, index - _HORIZON)
+    ranks = segment.ranks[first:index]
+    after = k - (np.cumsum(is_target)[first:index] - is_target[first:index])
+    cost = np.where(is_target[first:index], np.iinfo(np.int64).max, ranks + after)
+    best = int(np.argmin(cost)) if len(cost) else -1
+    if best < 0 or int(cost[best]) + _STAGE_COST >= k:
+        return (*segment.start, CountedStop(locate(int(target)), k)), k
+    anchor = CountedStop(locate(int(trace[first + best])), int(ranks[best]))
+    return (*segment.start, anchor, CountedStop(locate(int(target)), int(after[best]))), k
 
 
 class Rule(Enum):
@@ -108,11 +314,8 @@ def draw_fault(
     If an instruction has no such operand, another is drawn, so that the rest stay equally likely.
 
     Args:
-        stratum: windows of the golden run.
         plan: a strategy whose rule is instruction-uniform.
-        rng: the fault's own generator.
         code_at: 16 bytes of code at an address.
-        locate: the location of an address.
 
     Raises:
         FaultError: no executed instruction in scope has such an operand.

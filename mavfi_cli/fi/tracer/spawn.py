@@ -13,8 +13,7 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.breakpoints import Mechanism
-from mavfi_cli.fi.tracer.tracee import ENTRY_ADDRESS, Tracee, best_mechanism
+from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee, best_mechanism
 
 # The shell says that it runs (so that its own exec is over) and waits for one line (so that the
 # tracer is attached before the program starts).
@@ -92,7 +91,7 @@ def run_to_entry(tracee: Tracee) -> bool:
     Returns:
         False if the program ended first, for example because a library is missing.
     """
-    entry = linux.auxiliary(tracee.pid, ENTRY_ADDRESS)
+    entry = linux.entry_point(tracee.pid)
     return entry is not None and tracee.run_to(entry)
 
 

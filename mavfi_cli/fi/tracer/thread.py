@@ -12,8 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from mavfi_cli.fi.tracer.breakpoints import ExecutionCounter, Mechanism
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee, best_mechanism
+from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Tracee, best_mechanism
 
 T = TypeVar("T")
 
@@ -31,7 +30,6 @@ class TracerThread(Generic[T]):
         self._error: BaseException | None = None
 
         def run() -> None:
-            """Run the work, and keep its result or error."""
             try:
                 self._result.append(work(self._armed.set))
             except BaseException as error:  # the thread's boundary: `result` raises it again
@@ -64,7 +62,6 @@ class EntryCounter:
 
     Args:
         pid: the node; closing the counter may end it.
-        address: address of the instruction.
     """
 
     def __init__(self, pid: int, address: int) -> None:

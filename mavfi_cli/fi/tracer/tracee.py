@@ -3,30 +3,93 @@
 Every thread and child of the process is traced, so that none outlives the tracer. The *target*
 thread is stopped and corrupted; the others keep running. There is no sleep and no polling: each
 step waits for the kernel's report. Call all methods from the thread that attached.
+
+There are two mechanisms for stops exactly before the k-th execution of an instruction, the better
+first. `PERF`: the kernel counts the hits of a hardware breakpoint and raises SIGTRAP on the k-th
+(`perf_event_open` with `sigtrap`, Linux 5.13, perf_event_open(2)). It needs no performance counter,
+so it works in virtual machines. `DEBUG`: the tracer writes the debug register itself and counts,
+with one stop a hit.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
+import struct
 from dataclasses import dataclass, field
+from enum import Enum
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.alarm import ProcessTimer
-from mavfi_cli.fi.tracer.arch import DebugBreakpoint, Registers
-from mavfi_cli.fi.tracer.breakpoints import (
-    SI_KERNEL,
-    TRAP_BRKPT,
-    TRAP_HWBKPT,
-    TRAP_PERF,
-    TRAP_TRACE,
-    ExecutionCounter,
-    Mechanism,
-    PerfBreakpoint,
-    perf_allowed,
-)
+from mavfi_cli.fi.tracer.arch import TRAITS, DebugBreakpoint, Registers
+from mavfi_cli.fi.tracer.linux import ProcessTimer
+
+TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL = 1, 2, 4, 6, 0x80
+
+_TYPE_BREAKPOINT, _EXECUTE, _CLOSE_ON_EXEC = 5, 4, 8
+_DISABLED_AT_EXEC_END = 1 << 36 | 1 << 37  # remove_on_exec, sigtrap
+_USER_ONLY = 1 << 5 | 1 << 6  # exclude_kernel, exclude_hv
+_ATTRIBUTES = struct.Struct("<IIQQQQQIIQQ56x")  # perf_event_attr, version 7: 128 bytes
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class Mechanism(Enum):
+    """How executions are counted."""
+
+    PERF = "perf"
+    DEBUG = "debug-registers"
+
+
+def _open_event(tid: int, address: int, period: int, extra: int) -> int:
+    attributes = _ATTRIBUTES.pack(
+        _TYPE_BREAKPOINT, 128, 0, period, 0, 0, _USER_ONLY | extra, 0, _EXECUTE, address,
+        TRAITS.breakpoint_length,
+    )  # fmt: skip
+    flags = ctypes.c_ulong(_CLOSE_ON_EXEC)
+    fd = int(_libc.syscall(TRAITS.perf_event_open, attributes, tid, -1, -1, flags))
+    if fd < 0:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+    return fd
+
+
+class PerfBreakpoint:
+    """Traps the thread before execution number `count` of the instruction at `address`."""
+
+    def __init__(self, tid: int, address: int, count: int) -> None:
+        self._fd = _open_event(tid, address, count, _DISABLED_AT_EXEC_END)
+
+    def close(self) -> None:
+        """Remove the breakpoint."""
+        os.close(self._fd)
+
+
+class ExecutionCounter:
+    """Counts the executions of one instruction without stopping it, for checks."""
+
+    def __init__(self, tid: int, address: int) -> None:
+        self._fd = _open_event(tid, address, 0, 0)
+
+    def read(self) -> int:
+        """Executions since the counter was opened; valid after the thread's end too."""
+        return int.from_bytes(os.read(self._fd, 8), "little")
+
+    def close(self) -> None:
+        """Remove the counter."""
+        os.close(self._fd)
+
+
+def perf_allowed() -> str | None:
+    """None if counted breakpoints can be opened, else the reason why not."""
+    try:
+        os.close(_open_event(0, 0x1000, 1_000_000, _DISABLED_AT_EXEC_END))
+    except OSError as error:
+        return str(error)
+    return None
+
 
 _TRACER_TRAPS = frozenset((TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL))
 _NOT_FROM_OTHERS = 0x2000_0000  # __WNOTHREAD: only tracees and children of this thread
@@ -59,25 +122,21 @@ class Tracee:
     ended: Ended | None = None
     signals: list[int] = field(default_factory=list)  # delivered to the process, in order
     registers: Registers = field(init=False)
+    memory: linux.Memory = field(init=False)
     _pending_signal: int = 0
     _interrupting: bool = False
     _expecting_alarm: bool = False
-    _memory: int = -1  # file descriptor of the process's memory
 
     def __post_init__(self) -> None:
-        self.registers = Registers(self.tid)
+        self.registers, self.memory = Registers(self.tid), linux.Memory(self.pid)
 
     @classmethod
-    def attach(
-        cls, pid: int, *, tid: int | None = None, mechanism: Mechanism | None = None
-    ) -> Tracee:
-        """Attach to every thread of a running process and stop its target thread.
+    def attach(cls, pid: int, *, mechanism: Mechanism | None = None) -> Tracee:
+        """Attach to every thread of a running process and stop its main thread, the target.
 
         The attaching thread must have no other children that other code waits for.
 
         Args:
-            pid: the process.
-            tid: the target thread; by default the main thread.
             mechanism: how executions are counted; by default the best that is allowed.
 
         Raises:
@@ -93,7 +152,7 @@ class Tracee:
                 seized.add(thread)
         if not seized:
             raise TargetError(f"process {pid}", "does not exist")
-        tracee = cls(pid, tid or pid, _ANY_CHILD, mechanism or best_mechanism())
+        tracee = cls(pid, pid, _ANY_CHILD, mechanism or best_mechanism())
         tracee.interrupt()
         return tracee
 
@@ -120,11 +179,6 @@ class Tracee:
                 return self.resume()
         finally:
             self._expecting_alarm = False
-
-    def release(self) -> None:
-        """Let the stopped target thread run without waiting for it."""
-        self.registers.forget()
-        linux.request(linux.CONT, self.tid, 0, self._take_signal())
 
     def run_to(self, address: int, count: int = 1) -> bool:
         """Run until the target thread is about to execute `address` for the `count`-th time.
@@ -165,35 +219,9 @@ class Tracee:
             return PerfBreakpoint(self.tid, address, 1)
         return DebugBreakpoint(self.tid, address)
 
-    def read_memory(self, address: int, size: int) -> bytes:
-        """Bytes of the process's memory, whatever their protection.
-
-        Raises:
-            OSError: nothing is mapped there.
-        """
-        return os.pread(self._memory_file(), size, address)
-
-    def write_memory(self, address: int, data: bytes) -> None:
-        """Write the process's memory; the kernel makes a private copy of a file's page.
-
-        Raises:
-            OSError: nothing is mapped there.
-        """
-        os.pwrite(self._memory_file(), data, address)
-
-    def _memory_file(self) -> int:
-        if self._memory < 0:
-            self._memory = os.open(f"/proc/{self.pid}/mem", os.O_RDWR | os.O_CLOEXEC)
-        return self._memory
-
-    def _close_memory(self) -> None:
-        if self._memory >= 0:
-            os.close(self._memory)
-            self._memory = -1
-
     def detach(self) -> None:
         """Let the process go on without a tracer; the target thread must be stopped."""
-        self._close_memory()
+        self.memory.close()
         for thread in linux.threads_of(self.pid):
             if thread != self.tid:
                 self._detach_running(thread)
@@ -240,7 +268,6 @@ class Tracee:
         """Handle a report and all that follow, until the target stops for us or ends.
 
         Args:
-            status: the first report.
             how: the request that resumes the target after a passing stop.
         """
         while True:
@@ -264,7 +291,7 @@ class Tracee:
     def _note_end(self, status: linux.Status) -> bool:
         if status.tid != self.pid:
             return False
-        self._close_memory()
+        self.memory.close()
         if os.WIFSIGNALED(status.raw):
             self.ended = Ended(exit_code=None, signal=os.WTERMSIG(status.raw))
         else:
@@ -288,7 +315,7 @@ class Tracee:
         if status.event == linux.EVENT_STOP:
             return Trap(code=TRAP_BRKPT) if self._interrupting else None
         if status.trapped:
-            code = linux.signal_info(self.tid).code
+            code = linux.signal_code(self.tid)
             if self._expecting_alarm and code <= 0:  # sent by a process
                 return Trap(code=code)
             return Trap(code=code) if code in _TRACER_TRAPS else None
@@ -351,6 +378,3 @@ class Tracee:
 def best_mechanism() -> Mechanism:
     """The best counting mechanism that this machine allows."""
     return Mechanism.PERF if perf_allowed() is None else Mechanism.DEBUG
-
-
-ENTRY_ADDRESS = 9  # AT_ENTRY of the auxiliary vector

@@ -1,43 +1,226 @@
-"""Injects an instruction-level fault into a mission from a tracer thread beside the flight."""
+"""Plans one exact instruction-level fault of a mission, and injects it beside the flight.
+
+A tracer thread injects it. The orders that the golden run gave to each node, the number of entries
+of each kernel, and each profile are kept below the output folder, under a hash of everything that
+they depend on.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import pickle
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from mavfi_cli.attack.attacker import LiveAttack, attack_live
-from mavfi_cli.attack.kernels.scope import KernelScope
+from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
 from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
 from mavfi_cli.companion.node_process import NodeProcess
-from mavfi_cli.core.errors import FaultError
+from mavfi_cli.core.errors import FaultError, RecordError
+from mavfi_cli.core.files import own_digest, write_atomically
+from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.thread import TracerThread
-from mavfi_cli.mission.instruction.plan import PlannedFault, plan_fault, planned_of
+from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.recorder import Recorder
+from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
+
+T = TypeVar("T")
+CACHE = ".profiles"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PlannedFault:
+    """One exact instruction-level fault of a mission.
+
+    Attributes:
+        node: the attacked node.
+        order: number of the node's order in which the fault strikes, from 1.
+        context: further entries of the record: kernel, invocation, simulated time, sampling.
+        recorded: the repeated record; None for a drawn fault.
+    """
+
+    fault: InstructionFault
+    node: str
+    order: int
+    context: Mapping[str, Any]
+    recorded: Mapping[str, Any] | None = None
+
+
+def _plan_fault(
+    config: MissionConfig,
+    asked: InstructionConfig,
+    out: Path,
+    versions: Mapping[str, str],
+    fly_golden: Callable[[MissionConfig, Path, Recorder], object],
+) -> _PlannedFault:
+    """Draw the fault of a mission and a seed.
+
+    Args:
+        out: the folder below which golden runs and profiles are kept.
+        fly_golden: function that flies a mission into a folder and records it.
+    """
+    strategy, node = asked.strategy(), asked.node()
+    kernel = kernel_of_node(node, config.planner)
+    golden = replace(config, fault=None, instruction=None, detector=None, isolate=())
+    folder = out / CACHE / _key(golden, versions)
+
+    def fly() -> tuple[Briefing, dict[str, list[Order]]]:
+        """The briefing of the golden run, and the orders that it gave, by node."""
+        recorder = Recorder()
+        fly_golden(golden, folder, recorder)
+        assert recorder.briefing is not None
+        return recorder.briefing, recorder.orders
+
+    briefing, all_orders = _kept(folder / "orders.pickle", fly)
+    setup = Setup(config=golden, briefing=briefing, node=node)
+    orders = all_orders.get(node, [])
+    counts = _kept(folder / f"entries-{kernel}.pickle", lambda: count_entries(setup, orders))
+    if not counts or not counts[-1]:
+        raise FaultError(
+            f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
+            "world, seed or node"
+        )
+    rng = generator(asked.seed, Stream.FAULT, "instruction")
+    drawn = draw_invocation(node, counts, rng)
+    profiling = generator(config.seed, Stream.FAULT, "profile", kernel, drawn.number)
+    found: TargetProfile = _kept(
+        folder / f"profile-{kernel}-{drawn.number}.pickle",
+        lambda: profile_invocation(
+            setup, orders[: drawn.order], drawn.entry, drawn.earlier, profiling
+        ),
+    )
+    fault = found.draw(replace(strategy, whole_process=False), rng)
+    context = {
+        "node": node,
+        "kernel": kernel,
+        "invocation": drawn.number,
+        "invocations": drawn.of,
+        "node_invocation": drawn.order,
+        "stamp_s": round(orders[drawn.order - 1][1], 9),
+        "sampling": asked.sampling_name(),
+        "windows": found.windows,
+        "profiled_instructions": found.executed,
+        "seed": asked.seed,
+        "request": asked.to_dict(),
+    }
+    struck = replace(fault, corruption=None) if asked.null else fault
+    return _PlannedFault(fault=struck, node=node, order=drawn.order, context=context)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _KernelInvocation:
+    """One invocation of a kernel, and the entry with which it begins."""
+
+    number: int  # number of the kernel's invocation, from 1
+    of: int
+    order: int  # number of the node's order that contains it, from 1
+    entry: int  # number of the kernel's entry with which it begins, from 1
+    earlier: int  # entries in the earlier orders
+
+
+def draw_invocation(
+    node: str, counts: Sequence[int], rng: np.random.Generator
+) -> _KernelInvocation:
+    """Draw one invocation of a kernel uniformly from the entries up to each order.
+
+    Each entry is an invocation, except for a planner node. It is entered each time it builds an
+    obstacle grid, once or more in a request, and the request is the invocation.
+
+    Args:
+        counts: entries up to each order of the golden run, ascending; not empty.
+    """
+    before = np.array([0, *counts[:-1]])
+    if node != "planner":
+        number = entry = int(rng.integers(counts[-1])) + 1
+        order, of = int(np.searchsorted(counts, entry)), counts[-1]
+    else:
+        orders = np.flatnonzero(np.array(counts) > before)
+        which, of = int(rng.integers(len(orders))), len(orders)
+        order, number = int(orders[which]), which + 1
+        entry = int(before[order]) + 1
+    return _KernelInvocation(
+        number=number, of=of, order=order + 1, entry=entry, earlier=int(before[order])
+    )
+
+
+def _planned_of(recorded: Mapping[str, Any]) -> _PlannedFault:
+    """Read the fault of a record, to repeat it."""
+    fault = record.fault_of(recorded)
+    try:
+        context = {name: recorded[name] for name in _CONTEXT}
+    except KeyError as error:
+        raise RecordError(f"the fault record is damaged: it has no {error}") from None
+    return _PlannedFault(
+        fault=fault,
+        node=context["node"],
+        order=context["node_invocation"],
+        context=context,
+        recorded=recorded,
+    )
+
+
+_CONTEXT = (
+    "node", "kernel", "invocation", "invocations", "node_invocation", "stamp_s", "sampling",
+    "windows", "profiled_instructions", "seed", "request",
+)  # fmt: skip
+
+
+def _kept(path: Path, make: Callable[[], T]) -> T:
+    """Read a value from its file, or make it and keep it there."""
+    if path.is_file():
+        kept: T = pickle.loads(path.read_bytes())
+        return kept
+    value = make()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{path.parent}: {error.strerror or error}") from None
+    write_atomically(path, lambda file: pickle.dump(value, file))
+    return value
+
+
+def _key(golden: MissionConfig, versions: Mapping[str, str]) -> str:
+    """A hash of everything that the golden run depends on."""
+    values = golden.to_dict()
+    files = [Path(name) for name in golden.files]
+    parts = [
+        json.dumps(values, sort_keys=True),
+        json.dumps(dict(versions), sort_keys=True),
+        own_digest(),
+        *(hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()),
+    ]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
 
 _TIMING = ("stop_s",)
 
 
-class InstructionInjection(NoInjection):
+class _InstructionInjection(NoInjection):
     """One instruction-level fault in one mission; messages pass unchanged.
 
     Args:
-        planned: the planned fault.
         spawned: the process that will be the attacked node.
         for_debugger: called when the node waits for a debugger at the injected instruction.
     """
 
     def __init__(
         self,
-        planned: PlannedFault,
+        planned: _PlannedFault,
         spawned: ServedProcess,
         for_debugger: Callable[[int], None] | None = None,
     ) -> None:
@@ -52,11 +235,9 @@ class InstructionInjection(NoInjection):
 
     @property
     def node(self) -> str:
-        """The attacked node."""
         return self._planned.node
 
     def begin(self, path: Path) -> None:
-        """Set the path of the record."""
         self._path = path
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
@@ -120,14 +301,14 @@ class InstructionInjection(NoInjection):
         done = self._tracer.result()
         if self._planned.fault.corruption is None:
             return []
-        return [attack_text(done.record)]
+        return [_attack_text(done.record)]
 
     def finish(self) -> dict[str, Any] | None:
         """The record at the end of the mission, without measured times."""
         if self._tracer is None:
             self._spawned.kill()
             return None
-        return in_result(self._tracer.result().record)
+        return _in_result(self._tracer.result().record)
 
     def close(self) -> None:
         """End the node's process if no executor owns it."""
@@ -135,7 +316,7 @@ class InstructionInjection(NoInjection):
             self._spawned.kill()
 
 
-def in_result(written: Mapping[str, Any]) -> dict[str, Any]:
+def _in_result(written: Mapping[str, Any]) -> dict[str, Any]:
     """A fault record as result.json carries it: the same in every repetition."""
     injection = {k: v for k, v in written["injection"].items() if k not in _TIMING}
     state = "applied" if injection["applied"] else "not_injected"
@@ -145,8 +326,7 @@ def in_result(written: Mapping[str, Any]) -> dict[str, Any]:
     return {**written, "schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
 
 
-def attack_text(written: Mapping[str, Any]) -> str:
-    """One line that says what was hit."""
+def _attack_text(written: Mapping[str, Any]) -> str:
     place = written["symbol"] or f"{written['object']}+{written['offset']:#x}"
     where = f"{written['kernel']}, {written['instruction']} at {place}"
     if not written["injection"]["applied"]:
@@ -166,13 +346,11 @@ def injection_of(
     *,
     repeat: Mapping[str, Any] | None = None,
     for_debugger: Callable[[int], None] | None = None,
-) -> InstructionInjection:
+) -> _InstructionInjection:
     """Plan the instruction-level fault of a mission, and start its node's process.
 
     Args:
-        config: the mission.
         out: the folder below which golden runs and profiles are kept.
-        versions: versions of the libraries.
         fly_golden: function that flies a mission into a folder and records it.
         repeat: the record of a fault to repeat; None draws one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
@@ -187,7 +365,7 @@ def injection_of(
             "flies no two alike: leave out --link"
         )
     if repeat is not None:
-        planned = planned_of(repeat)
+        planned = _planned_of(repeat)
     else:
-        planned = plan_fault(config, config.instruction, out, versions, fly_golden)
-    return InstructionInjection(planned, ServedProcess(PROGRAM), for_debugger)
+        planned = _plan_fault(config, config.instruction, out, versions, fly_golden)
+    return _InstructionInjection(planned, ServedProcess(PROGRAM), for_debugger)

@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.kernels.scope import KernelScope
-from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
+from mavfi_cli.attack.profile import profile_call, profile_calls, profile_run
 from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.fault import CountedStop
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
 from mavfi_cli.fi.tracer.tracee import Tracee
-from mavfi_cli.fi.tracer.windows import WindowTooLong
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 
 Order = tuple[Any, float]  # input, start stamp
@@ -36,7 +37,6 @@ class Rehearsal:
     """The `AttackPlace` in which one invocation of a node's kernel runs.
 
     Args:
-        setup: setup of the node.
         orders: inputs and start stamps, up to the order with the invocation.
         entry: number of the kernel's entry in that order with which it begins, from 1.
     """
@@ -129,7 +129,6 @@ def profile_invocation(
     """Profile one invocation of a node's kernel in the last of the orders.
 
     Args:
-        setup: setup of the node.
         orders: the orders up to the one with the invocation.
         entry: number of the kernel's entries when it begins, itself included.
         earlier: number of them in the earlier orders.

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.attack.campaign import Record, TargetRuns
+from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.outcome import RunOutcome, counted, shares, shares_to_json, signal_name
-from mavfi_cli.attack.plan import Plan
 from mavfi_cli.report.tables.columns import blocks, csv_text
 
 SCHEMA = 1

@@ -10,7 +10,6 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.detector_pairs import CSV, NONE
 from mavfi_cli.analysis.detectors import ALL
-from mavfi_cli.analysis.flights import rows_of
 from mavfi_cli.report.tables.columns import (
     columns,
     csv_text,
@@ -182,4 +181,4 @@ def _share(share: Row) -> str:
 
 def detector_csv(*pairs: pa.Table) -> str:
     """One row per pair: first the pairs without faults, then those with one."""
-    return csv_text((row for table in pairs for row in rows_of(table, [*CSV])), [*CSV])
+    return csv_text((row for table in pairs for row in table.select([*CSV]).to_pylist()), [*CSV])

@@ -10,8 +10,15 @@ from mavfi_cli.core.errors import BitOutsideWidth, FaultSpecError, FieldUnavaila
 from mavfi_cli.core.states import BY_NAME, STATES, DType, Message, of_stage
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field, pattern_of
-from mavfi_cli.fi.source.draw import GROUPS, draw_fault
-from mavfi_cli.fi.source.fault import Corruption, Effect, Persistence, Trigger, When
+from mavfi_cli.fi.source.fault import (
+    GROUPS,
+    Corruption,
+    Effect,
+    Persistence,
+    Trigger,
+    When,
+    draw_fault,
+)
 from mavfi_cli.fi.source.injector import SourceInjector, Strike
 from mavfi_cli.fi.source.schedule import Moment
 

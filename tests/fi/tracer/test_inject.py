@@ -57,7 +57,7 @@ def test_the_return_address_that_a_call_wrote(start):
     )
     done = apply(tracee, instruction, corruption)
     assert (done.address, done.before) == (stack - 8, instruction.next_address)
-    assert tracee.read_memory(stack - 8, 8) == (instruction.next_address ^ 4).to_bytes(8, "little")
+    assert tracee.memory.read(stack - 8, 8) == (instruction.next_address ^ 4).to_bytes(8, "little")
 
 
 def test_a_repeated_string_instruction_completes_first(start, tmp_path):
@@ -108,7 +108,7 @@ def test_opcode_bytes_execute_once_and_are_whole_again(start, tmp_path):
     )
     assert apply(tracee, instruction, corruption).applied
     assert tracee.registers.read("rax") == 4
-    assert tracee.read_memory(instruction.address, len(instruction.raw)) == instruction.raw
+    assert tracee.memory.read(instruction.address, len(instruction.raw)) == instruction.raw
 
 
 def test_a_wild_instruction_pointer_crashes(start):

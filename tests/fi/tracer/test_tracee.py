@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.alarm import ProcessTimer
-from mavfi_cli.fi.tracer.breakpoints import ExecutionCounter, Mechanism
+from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
+from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.spawn import Program, spawn
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Tracee
 
 
 def entry(tracee, program, function):
@@ -83,7 +83,7 @@ def test_a_stop_inside_a_blocking_system_call_resumes_correctly(start, tmp_path)
 def test_an_interrupt_stops_and_resumes(start, tmp_path):
     tracee = start("sleeper")
     for _ in range(5):
-        tracee.release()
+        linux.request(linux.CONT, tracee.tid)
         tracee.interrupt()
     assert tracee.resume() == Ended(exit_code=0, signal=None)
     assert (tmp_path / "stdout").read_text() == "0\n"
@@ -97,7 +97,7 @@ def test_no_trap_flag_is_left_after_pushf_and_popf(start):
         pushf = instruction_at(tracee, pushf).next_address
     assert tracee.run_to(pushf)
     clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
-    saved = int.from_bytes(tracee.read_memory(tracee.registers.sp, 8), "little")
+    saved = int.from_bytes(tracee.memory.read(tracee.registers.sp, 8), "little")
     assert not saved & 0x100
     assert instruction_at(tracee, tracee.registers.ip).mnemonic == "popfq"
     clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
@@ -115,7 +115,7 @@ def test_pushf_under_a_bare_step_shows_why_the_care_is_needed(start):
         pushf = instruction_at(tracee, pushf).next_address
     assert tracee.run_to(pushf)
     tracee.step()
-    saved = int.from_bytes(tracee.read_memory(tracee.registers.sp, 8), "little")
+    saved = int.from_bytes(tracee.memory.read(tracee.registers.sp, 8), "little")
     assert saved & 0x100
 
 

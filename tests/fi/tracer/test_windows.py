@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import FaultError, UnknownName
-from mavfi_cli.fi.tracer.breakpoints import ExecutionCounter, Mechanism
 from mavfi_cli.fi.tracer.fault import FaultModel, Site
 from mavfi_cli.fi.tracer.image import Image, scope_of
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
-from mavfi_cli.fi.tracer.sampling import draw_fault, strategy
-from mavfi_cli.fi.tracer.tracee import Ended
-from mavfi_cli.fi.tracer.windows import Segment, WindowTooLong, plan_trigger, record_window
+from mavfi_cli.fi.tracer.sampling import (
+    Segment,
+    WindowTooLong,
+    draw_fault,
+    plan_trigger,
+    record_window,
+    strategy,
+)
+from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism
 
 
 def profile_of(start, name, *arguments, limit=100_000):
@@ -132,7 +137,7 @@ def test_faults_are_uniform_over_executed_instructions(start):
     """Chi-square of the drawn addresses against the profile's counts."""
     from scipy.stats import chisquare
 
-    from mavfi_cli.fi.tracer.windows import Stratum
+    from mavfi_cli.fi.tracer.sampling import Stratum
 
     trace, image, _ = profile_of(start, "counting", "40")
     tracee = start("counting", "40")
@@ -145,7 +150,7 @@ def test_faults_are_uniform_over_executed_instructions(start):
                 profile,
                 plan,
                 rng,
-                code_at=lambda address: tracee.read_memory(address, 16),
+                code_at=lambda address: tracee.memory.read(address, 16),
                 locate=image.locate,
             ).target
         )
@@ -174,7 +179,7 @@ def test_unknown_rules_objects_and_functions_name_the_nearest(start):
 
 
 def test_a_scope_without_a_matching_operand_is_an_error(start):
-    from mavfi_cli.fi.tracer.windows import Stratum
+    from mavfi_cli.fi.tracer.sampling import Stratum
 
     trace, image, _ = profile_of(start, "sorting")
     tracee = start("sorting")
@@ -185,6 +190,6 @@ def test_a_scope_without_a_matching_operand_is_an_error(start):
             profile,
             plan,
             np.random.default_rng(0),
-            code_at=lambda address: tracee.read_memory(address, 16),
+            code_at=lambda address: tracee.memory.read(address, 16),
             locate=image.locate,
         )

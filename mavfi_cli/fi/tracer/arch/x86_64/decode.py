@@ -15,9 +15,14 @@ from typing import Any
 import capstone
 from capstone import x86
 
-from mavfi_cli.fi.tracer.arch.instruction import Instruction, MemoryUse, RegisterUse
-from mavfi_cli.fi.tracer.arch.x86_64.cpuid import xsave_components
-from mavfi_cli.fi.tracer.arch.x86_64.registers import AVX, FLAG_BITS, GENERAL, ZMM_HIGH
+from mavfi_cli.fi.tracer.arch.interface import Instruction, MemoryUse, RegisterUse
+from mavfi_cli.fi.tracer.arch.x86_64.registers import (
+    AVX,
+    FLAG_BITS,
+    GENERAL,
+    ZMM_HIGH,
+    xsave_components,
+)
 
 _FULL = (1 << 64) - 1
 
@@ -196,7 +201,6 @@ def _memory(found: Any) -> list[MemoryUse]:
         return []
 
     def name(number: int) -> str | None:
-        """Name of a register by capstone's number; None for no register."""
         return str(found.reg_name(number)) if number else None
 
     return [
@@ -241,8 +245,6 @@ def address_of(use: MemoryUse, instruction: Instruction, read: Any) -> int:
     """Address of a memory operand before the instruction executes.
 
     Args:
-        use: the operand.
-        instruction: the instruction that the operand belongs to.
         read: function that returns the value of a full register.
     """
     total = use.displacement

@@ -1,18 +1,69 @@
 """Registers of a stopped x86-64 thread: general, flags, x87, MMX, XMM, YMM, ZMM, opmask.
 
 Layouts: `user_regs_struct` of `<sys/user.h>`; FXSAVE and XSAVE areas of Intel SDM volume 1,
-sections 10.5 and 13.4. The XSAVE offsets come from CPUID.
+sections 10.5 and 13.4. The XSAVE offsets differ between processors: leaf 0xD of CPUID gives them
+(section 13.5), through a few bytes of machine code in an executable page.
 """
 
 from __future__ import annotations
 
 import ctypes
+import functools
+import mmap
 import re
 from dataclasses import dataclass
 
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch.traits import Traits
-from mavfi_cli.fi.tracer.arch.x86_64.cpuid import xsave_components
+from mavfi_cli.fi.tracer.arch.interface import Traits
+
+# void f(uint32_t leaf /*edi*/, uint32_t subleaf /*esi*/, uint32_t *out /*rdx*/)
+_CODE = bytes.fromhex(
+    "53"  # push rbx
+    "4989d0"  # mov r8, rdx
+    "89f8"  # mov eax, edi
+    "89f1"  # mov ecx, esi
+    "0fa2"  # cpuid
+    "418900"  # mov [r8], eax
+    "41895804"  # mov [r8+4], ebx
+    "41894808"  # mov [r8+8], ecx
+    "4189500c"  # mov [r8+12], edx
+    "5b"  # pop rbx
+    "c3"  # ret
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Component:
+    """Offset and size of one XSAVE component in the standard (not compacted) format, bytes."""
+
+    offset: int
+    size: int
+
+
+def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
+    """EAX, EBX, ECX, EDX of one CPUID leaf."""
+    page = mmap.mmap(-1, 4096, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+    page.write(_CODE)
+    start = ctypes.addressof(ctypes.c_char.from_buffer(page))
+    out = (ctypes.c_uint32 * 4)()
+    ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_void_p)(start)(
+        leaf, subleaf, ctypes.addressof(out)
+    )
+    return out[0], out[1], out[2], out[3]
+
+
+@functools.lru_cache(maxsize=1)
+def xsave_components() -> dict[int, _Component]:
+    """The user components from 2 on (AVX 2, opmask 5, ZMM_Hi256 6, Hi16_ZMM 7, PKRU 9)."""
+    low, _, _, high = _cpuid(0xD, 0)
+    enabled = low | high << 32
+    found: dict[int, _Component] = {}
+    for number in range(2, 63):
+        if enabled >> number & 1:
+            size, offset, _, _ = _cpuid(0xD, number)
+            found[number] = _Component(offset, size)
+    return found
+
 
 NT_PRSTATUS, NT_X86_XSTATE = 1, 0x202
 XSTATE_BV = 512
@@ -35,7 +86,6 @@ _X87 = re.compile(r"(st|mm|k)(\d)$")
 
 TRAITS = Traits(
     instruction_pointer="rip",
-    stack_pointer="rsp",
     vector_bits=512,
     breakpoint=b"\xcc",
     breakpoint_advance=1,

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch.instruction import Instruction
-from mavfi_cli.fi.tracer.arch.traits import StepEnd, Steps
-from mavfi_cli.fi.tracer.arch.x86_64.registers import TRAP_FLAG
-
-if TYPE_CHECKING:
-    from mavfi_cli.fi.tracer.tracee import Tracee
+from mavfi_cli.fi.tracer.arch.interface import Instruction, StepEnd, Steps
+from mavfi_cli.fi.tracer.arch.x86_64.registers import TRAP_FLAG, Registers
 
 _USER_OFFSETS = (128, 152)  # of rip and rsp in `struct user`
 _DEBUG_REGISTERS = 848  # offset of debug register 0 in `struct user`
@@ -26,7 +21,6 @@ def record_steps(
     """Single-step a stopped thread and record the address of each instruction in scope.
 
     Args:
-        tid: the thread.
         spans: (n, 2) addresses in scope.
         trace: (m,) filled from the start; a repeated string instruction is one entry.
         stop: (2,) the window ends at this address once the stack pointer is above the second.
@@ -39,25 +33,25 @@ def record_steps(
     return Steps(count=int(count), why=StepEnd(int(why)), status=int(status[0]))
 
 
-def erase_trap(tracee: Tracee, instruction: Instruction) -> None:
+def erase_trap(registers: Registers, memory: linux.Memory, instruction: Instruction) -> None:
     """Remove the trap flag that a single step of `instruction` left in the target.
 
     `pushf` has pushed the trap flag, and a system call has saved it in r11.
     """
     if instruction.mnemonic in ("pushfq", "pushf"):
-        stack = tracee.registers.sp
+        stack = registers.sp
         size = 2 if instruction.mnemonic == "pushf" else 8
-        image = int.from_bytes(tracee.read_memory(stack, size), "little")
-        tracee.write_memory(stack, (image & ~TRAP_FLAG).to_bytes(size, "little"))
+        image = int.from_bytes(memory.read(stack, size), "little")
+        memory.write(stack, (image & ~TRAP_FLAG).to_bytes(size, "little"))
     elif instruction.mnemonic == "syscall":
-        saved = tracee.registers.read("r11")
+        saved = registers.read("r11")
         if saved & TRAP_FLAG:
-            tracee.registers.write("r11", saved & ~TRAP_FLAG)
+            registers.write("r11", saved & ~TRAP_FLAG)
 
 
-def return_address(tracee: Tracee) -> int:
+def return_address(registers: Registers, memory: linux.Memory) -> int:
     """Return address of the function; the target is stopped at its first instruction."""
-    return int.from_bytes(tracee.read_memory(tracee.registers.sp, 8), "little")
+    return int.from_bytes(memory.read(registers.sp, 8), "little")
 
 
 class DebugBreakpoint:
@@ -66,8 +60,6 @@ class DebugBreakpoint:
     Intel SDM volume 3, section 18.2. A thread has four.
 
     Args:
-        tid: the thread.
-        address: address of the instruction.
         slot: number of the register, 0 to 3.
     """
 
@@ -85,7 +77,7 @@ class DebugBreakpoint:
             self._enable(0)
 
     def _enable(self, bits: int) -> None:
-        others = linux.peek_user(self._tid, _DEBUG_REGISTERS + 8 * 7) & ~self._taken
+        others = linux.request(linux.PEEKUSER, self._tid, _DEBUG_REGISTERS + 8 * 7) & ~self._taken
         self._poke(7, others | bits)
 
     def _poke(self, register: int, value: int) -> None:
