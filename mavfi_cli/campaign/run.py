@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import shutil
@@ -37,6 +36,7 @@ from mavfi_cli.campaign.workers import (
     judge,
 )
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
+from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.versions import installed_versions, version_differences
 from mavfi_cli.mission.record.measures import record_of
@@ -376,7 +376,7 @@ def require_unchanged(ledger: Ledger) -> None:
     elif stored != canonical(versions):
         differing = version_differences(json.loads(stored), versions)
         raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
-    changed = [name for name, digest in _noted(ledger).items() if digest != _digest(name)]
+    changed = [name for name, digest in _noted(ledger).items() if digest != file_digest(name)]
     if changed:
         raise ConfigError(
             f"{', '.join(changed)}: not as it was when the campaign was begun; "
@@ -389,7 +389,7 @@ def _note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
     """Store hashes of the files that missions name, for `require_unchanged`."""
     noted = _noted(ledger)
     named = {name for mission in missions for name in mission.config.files}
-    new = {name: _digest(name) for name in sorted(named - noted.keys())}
+    new = {name: file_digest(name) for name in sorted(named - noted.keys())}
     if new:
         ledger.set_meta({_FILES: canonical({**noted, **new})})
 
@@ -397,11 +397,3 @@ def _note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
 def _noted(ledger: Ledger) -> dict[str, str]:
     found: dict[str, str] = json.loads(ledger.meta(_FILES) or "{}")
     return found
-
-
-def _digest(name: str) -> str:
-    """Hash of a file's bytes; empty if there is no file."""
-    try:
-        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
-    except OSError:
-        return ""

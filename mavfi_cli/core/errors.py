@@ -2,6 +2,7 @@
 
 MavfiError                      a known error; printed in one line, exit code 1
 ├── UnknownName                 a world, planner, vehicle ... that does not exist
+├── BrokenPlugIn                a planner or detector of another package that does not load
 ├── ConfigError                 a file or value that cannot be used
 │   └── UnknownKey              a TOML key that no setting has
 ├── WorldError                  start or goal blocked or outside, or invalid boxes
@@ -55,15 +56,23 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 def _suggestion(name: str, known: Iterable[str]) -> str:
     names = sorted(known)
     match = nearest(name, names)
-    hint = f"did you mean {match!r}? " if match else ""
-    return f"{hint}Known: {', '.join(names)}"
+    listed = ", ".join(names)
+    return f"did you mean {match!r}? Known: {listed}" if match else f"known: {listed}"
 
 
 class UnknownName(MavfiError):
     """A name that does not exist. Suggests the nearest known name."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        super().__init__(f"unknown {kind} {name!r}: {_suggestion(name, known)}")
+        super().__init__(f"unknown {kind} {name!r}; {_suggestion(name, known)}")
+
+
+class BrokenPlugIn(MavfiError):
+    """An installed plug-in that cannot be loaded."""
+
+    def __init__(self, name: str, value: str, error: Exception) -> None:
+        found = f"{type(error).__name__}: {error}"
+        super().__init__(f"the plug-in {name!r} ({value}) does not load: {found}")
 
 
 def named_member(kind: type[E], what: str, name: str | E) -> E:

@@ -19,6 +19,14 @@ from mavfi_cli.core.errors import RecordError
 PACKAGE = Path(__file__).parents[1]
 
 
+def file_digest(name: str) -> str:
+    """Return the SHA-256 of a file's bytes; empty if there is no such file."""
+    try:
+        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Write to a temporary file in the same folder, sync it to disk, then rename it to `path`.
 

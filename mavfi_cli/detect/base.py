@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
-from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.plug_ins import installed, load_plug_in
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect.preprocess import Codes
 
@@ -66,15 +64,9 @@ class Factory(Protocol):
 ENTRY_POINT_GROUP = "mavfi.detectors"
 
 
-@cache
-def _installed() -> EntryPoints:
-    """Return the entry points of detectors. To find them reads the metadata of all packages."""
-    return entry_points(group=ENTRY_POINT_GROUP)
-
-
 def detector_names() -> list[str]:
     """Return the names of all installed detectors, sorted."""
-    return sorted(_installed().names)
+    return sorted(installed(ENTRY_POINT_GROUP).names)
 
 
 def find_detector(
@@ -88,11 +80,9 @@ def find_detector(
 
     Raises:
         UnknownName: No detector has this name. Suggests the nearest.
+        BrokenPlugIn: Its package does not load.
         ModelError: The model file cannot be used.
         ConfigError: The threshold is out of range.
     """
-    for entry in _installed():
-        if entry.name == name:
-            factory: Factory = entry.load()
-            return factory(model=model, threshold=threshold)
-    raise UnknownName("detector", name, detector_names())
+    factory: Factory = load_plug_in(ENTRY_POINT_GROUP, "detector", name, detector_names())
+    return factory(model=model, threshold=threshold)

@@ -11,6 +11,7 @@ import numpy as np
 
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.spec.mission import MissionConfig
@@ -36,7 +37,7 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
 
     Raises:
         RecordError: The run is not repeatable, because it flew a foreign autopilot, used measured
-            times, or was interrupted by the user.
+            times, was interrupted by the user, or named a file that has changed since.
     """
     values = dict(run.record.config)
     if interrupted(run):
@@ -45,6 +46,10 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
         raise RecordError(f"{run.folder.path}: a flight of a foreign autopilot does not repeat")
     if measured_factor(values.get("platform", "")) is not None:
         raise RecordError(f"{run.folder.path}: a flight on measured kernel times does not repeat")
+    for name, digest in run.record.files.items():
+        if file_digest(name) != digest:
+            how = "has changed since this flight" if Path(name).exists() else "does not exist"
+            raise RecordError(f"{run.folder.path}: {name} {how}, so the flight does not repeat")
     if not with_fault:
         values["fault"] = values["instruction"] = values["detector"] = None
     return structure(values, MissionConfig, path=run.folder.result)

@@ -21,6 +21,7 @@ import numpy as np
 from mavfi_cli.autonomy import is_compiled, planners, warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
+from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.core.versions import installed_versions
@@ -268,6 +269,7 @@ def _write(
         "referee": None if referee is None else {k: v for k, v in referee.items() if k != "world"},
         "versions": installed_versions(),
         "host": host,
+        **({"files": {name: file_digest(name) for name in config.files}} if config.files else {}),
     }
     write_trace(folder.trace, flight.trace.table(truth))
     write_plans(folder.plans, companion.plans if companion else [])

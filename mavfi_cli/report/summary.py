@@ -43,13 +43,15 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
     """Return outcome, quality of flight, pipeline figures and cost on this machine."""
     flight = record_of(result)
     config = flight.config
+    with_what = f"planner {config['planner']}, platform {config['platform']}"
+    with_what += f", stack {config['stack']}"
     flown = f"{config['vehicle']} in {config['world']}, seed {config['seed']}"
     if config["link"] is not None:
         flown = f"foreign autopilot at {config['link']}, seed {config['seed']}"
     lines = [
         outcome_line(result),
         "",
-        f"Mission     {flown}; planner {config['planner']}, platform {config['platform']}",
+        f"Mission     {flown}; {with_what}",
         *_flight_lines(flight),
     ]
     lines += _fault_lines(flight.fault)
@@ -145,10 +147,10 @@ def _detection_lines(detection: Section, cost: DetectionCost | None) -> list[str
     """Return the detector's alarms, its recomputations, and the host time of its checks."""
     if not detection:
         return []
-    responses = detection["responses"]
+    responses, alarms = detection["responses"], detection["alarm_count"]
     lines = [
         f"Detector    {detection['detector']} on {', '.join(detection['protect'])}: "
-        f"{sum(detection['checks'].values())} checks, {detection['alarm_count']} alarms"
+        f"{sum(detection['checks'].values())} checks, {alarms} alarm{'' if alarms == 1 else 's'}"
     ]
     for alarm in detection["alarms"][:3]:
         where = ", ".join(alarm["states"][:2]) or "all states together"

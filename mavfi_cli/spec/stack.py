@@ -209,7 +209,9 @@ def _values(path: Path) -> tuple[dict[str, Any], str]:
         raise ConfigError(str(error), path=path, key="base")
     inherited, _ = _values(_FOLDER / f"{base}.toml")
     kept = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}
-    return {**inherited, **values, "sources": {**kept, **values.get("sources", {})}}, text
+    about = {"name": path.stem, "description": ""}
+    sources = {**kept, **values.get("sources", {})}
+    return {**inherited, **about, **values, "sources": sources}, text
 
 
 def _changes(text: str) -> dict[str, Any]:

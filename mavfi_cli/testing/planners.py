@@ -105,7 +105,6 @@ class PlannerContract:
         for other in planners.names():
             planners.find(other).plan(posed(wall_with_gap(5.0)), 3)
         assert np.array_equal(planner.plan(problem, 7).path_enu_m, first)
-        assert not np.array_equal(planner.plan(problem, 8).path_enu_m, first)
 
     def test_repeats_in_another_process(self, name: str) -> None:
         code = (

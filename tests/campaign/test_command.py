@@ -190,16 +190,16 @@ def refused(mavfi, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ('world = "farm"', 'world = "fram"', "unknown world 'fram': did you mean 'farm'?"),
+        ('world = "farm"', 'world = "fram"', "unknown world 'fram'; did you mean 'farm'?"),
         ('world = "farm"', 'wrold = "farm"', "factors.wrold: unknown key; did you mean 'world'?"),
         ('world = "farm"', "world = []", "factors.world: an empty list of values"),
         ("repetitions = 2", "repetitions = 0", "repetitions: must be at least 1, is 0"),
         ("waypoint_position", "waypoint_postion", "did you mean 'waypoint_position'?"),
         ('field = "mantissa"', 'field = "mantisa"', "did you mean 'mantissa'?"),
-        ('world = "farm"', 'planner = "rtt"', "unknown planner 'rtt': did you mean 'rrt'?"),
-        ('world = "farm"', 'vehicle = "sola"', "unknown vehicle 'sola': did you mean 'solo'?"),
-        ('world = "farm"', 'detector = "gda"', "unknown detector 'gda': did you mean 'gad'?"),
-        ('world = "farm"', 'platform = "x68"', "unknown platform 'x68': did you mean 'x86'?"),
+        ('world = "farm"', 'planner = "rtt"', "unknown planner 'rtt'; did you mean 'rrt'?"),
+        ('world = "farm"', 'vehicle = "sola"', "unknown vehicle 'sola'; did you mean 'solo'?"),
+        ('world = "farm"', 'detector = "gda"', "unknown detector 'gda'; did you mean 'gad'?"),
+        ('world = "farm"', 'platform = "x68"', "unknown platform 'x68'; did you mean 'x86'?"),
     ],
 )
 def test_a_bad_specification_gets_one_line_and_flies_nothing(refused, tmp_path, old, new, problem):
@@ -305,7 +305,7 @@ def test_the_name_of_a_campaign_that_was_begun_is_told_with_its_folder(monkeypat
     assert begun.exit_code == 0, begun.output
     for line in (["status", "short"], ["run", "short"], ["plan", "short"]):
         said = str(invoke(command.campaign, line).exception)
-        assert said.startswith("unknown campaign 'short': did you mean 'campaigns/short'?")
+        assert said.startswith("unknown campaign 'short'; did you mean 'campaigns/short'?")
     assert "did you mean 'fig8'?" in str(invoke(command.campaign, ["status", "fig88"]).exception)
 
 

@@ -43,11 +43,11 @@ def refused(command_line, tmp_path, monkeypatch):
 )
 def test_an_unknown_name_gets_the_nearest(refused, option, given, kind, nearest):
     line = refused(option, given, code=2)
-    assert line.startswith(f"unknown {kind} {given!r}: did you mean {nearest!r}? Known: ")
+    assert line.startswith(f"unknown {kind} {given!r}; did you mean {nearest!r}? Known: ")
 
 
 def test_a_name_like_no_other_gets_the_list(refused):
-    assert refused("--stack", "zzz", code=2).startswith("unknown stack 'zzz': Known: hardened, ")
+    assert refused("--stack", "zzz", code=2).startswith("unknown stack 'zzz'; known: hardened, ")
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_wrong_usage_is_one_line_and_exits_with_2(command_line, arguments, said)
 def test_an_unknown_command_gets_the_nearest(command_line):
     code, _, err = command_line("fyl")
     assert code == 2
-    assert "unknown command 'fyl': did you mean 'fly'?" in err
+    assert "unknown command 'fyl'; did you mean 'fly'?" in err
 
 
 # Files ---------------------------------------------------------------------------------------

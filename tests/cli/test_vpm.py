@@ -110,11 +110,11 @@ def test_files_and_pictures(command_line, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--vehicle", "sparck"), "unknown vehicle 'sparck': did you mean 'spark'?"),
+        (("--vehicle", "sparck"), "unknown vehicle 'sparck'; did you mean 'spark'?"),
         (("--vehicle", "spark", "--vehicle", "spark"), "vehicle: spark is named twice"),
-        (("--platform", "tx3"), "unknown platform 'tx3': did you mean 'tx2'?"),
-        (("--board", "xaviar"), "unknown board 'xaviar': did you mean 'xavier'?"),
-        (("--overhead", "aead=1"), "unknown detector 'aead': did you mean 'aad'?"),
+        (("--platform", "tx3"), "unknown platform 'tx3'; did you mean 'tx2'?"),
+        (("--board", "xaviar"), "unknown board 'xaviar'; did you mean 'xavier'?"),
+        (("--overhead", "aead=1"), "unknown detector 'aead'; did you mean 'aad'?"),
         (("--vehicle", "none.toml"), "none.toml: no such file"),
         (("--out", "file/below"), "file/below: Not a directory"),
     ],

@@ -122,10 +122,10 @@ def test_what_cannot_be_lifted_is_a_row(command_line, tmp_path, lawn):
     [
         (("--vehicle", "heavy.toml", "--board", "a57"), "vehicle 'heavy' cannot lift its compute"),
         (("--vehicle", "mine.toml"), "did you mean 'spark'"),
-        (("--world", "sprase"), "unknown world 'sprase': did you mean 'sparse'?"),
+        (("--world", "sprase"), "unknown world 'sprase'; did you mean 'sparse'?"),
         (("--world", "sparse", "--world", "sparse"), "world: sparse is named twice"),
         (("--vehicle", "spark", "--vehicle", "spark"), "vehicle: spark is named twice"),
-        (("--vehicle", "sparck"), "unknown vehicle 'sparck': did you mean 'spark'?"),
+        (("--vehicle", "sparck"), "unknown vehicle 'sparck'; did you mean 'spark'?"),
         (("--train", "1", "--first-seed", "10003"), "seeds 10000 to 10003 are for training"),
         (("--platform", "measured:2"), "platform: measured:2 has latencies only while it flies"),
     ],

@@ -1,11 +1,14 @@
 """Every registered planner passes the contract suite."""
 
+from importlib.metadata import EntryPoint, EntryPoints
+
 import numpy as np
 import pytest
 
 from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.occupancy import empty_snapshot
-from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core import plug_ins
+from mavfi_cli.core.errors import BrokenPlugIn, UnknownName
 from mavfi_cli.testing import PlannerContract
 from mavfi_cli.testing.planners import PARAMS, posed, wall_with_gap
 
@@ -42,22 +45,41 @@ def test_an_unknown_name_names_the_nearest():
         planners.find("rrtconect")
 
 
-def test_other_packages_plug_in_by_entry_point(monkeypatch):
-    class Straight:
-        name = "straight"
+@pytest.mark.parametrize("name", ["rrtstar", "rrt", "rrtconnect"])
+def test_another_seed_draws_another_path(name):
+    problem, planner = posed(wall_with_gap()), planners.find(name)
+    paths = [planner.plan(problem, seed).path_enu_m for seed in (7, 8)]
+    assert not np.array_equal(*paths)
 
-        def plan(self, problem, seed):
-            return None
 
-    class Entry:
-        name = "straight"
+class Straight:
+    name = "straight"
 
-        def load(self):
-            return Straight
+    def plan(self, problem, seed):
+        return None
 
-    monkeypatch.setattr(planners, "entry_points", lambda group: [Entry()])
-    assert "straight" in planners.names()
-    assert isinstance(planners.find("straight"), Straight)
+
+@pytest.fixture
+def plugged_in(monkeypatch):
+    """Two plug-ins: one that works, and one whose module does not exist."""
+    entries = EntryPoints(
+        EntryPoint(name, value, "mavfi.planners")
+        for name, value in (("straight", f"{__name__}:Straight"), ("gone", "nowhere_at_all:Gone"))
+    )
+    monkeypatch.setattr(plug_ins, "entry_points", lambda group: entries)
+    plug_ins.installed.cache_clear()
+    yield
+    plug_ins.installed.cache_clear()
+
+
+def test_other_packages_plug_in_by_entry_point(plugged_in):
+    assert planners.names()[3:] == ["gone", "straight"]
+    assert planners.find("straight").name == "straight"
+
+
+def test_a_plug_in_that_does_not_load_is_an_error_of_one_line(plugged_in):
+    with pytest.raises(BrokenPlugIn, match=r"'gone' \(nowhere_at_all:Gone\) does not load: Mod"):
+        planners.find("gone")
 
 
 @pytest.mark.parametrize("spelling", ["rrt-star", "RRT*", "rrt_star", "RRTstar", "rrtstar"])

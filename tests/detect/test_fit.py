@@ -70,7 +70,7 @@ def test_too_few_flights_are_refused(dataset):
 
 
 def test_bad_requests(dataset):
-    with pytest.raises(UnknownName, match="unknown detector 'x': Known: aad, gad, l2, range"):
+    with pytest.raises(UnknownName, match="unknown detector 'x'; known: aad, gad, l2, range"):
         fit.fit("x", dataset)
     with pytest.raises(ConfigError, match="n sigma"):
         fit.fit("gad", dataset, n_sigma=-1.0)

@@ -77,7 +77,7 @@ def test_a_vehicle_that_breaks_is_a_lost_link_with_its_reason(fly_short, fails_a
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
-        ({"world": "fram"}, UnknownName, "unknown world 'fram': did you mean 'farm'"),
+        ({"world": "fram"}, UnknownName, "unknown world 'fram'; did you mean 'farm'"),
         ({"vehicle": "sole"}, UnknownName, "unknown vehicle 'sole'"),
         ({"goal": (1e9, 0.0, 5.0)}, WorldError, "goal"),
     ],

@@ -37,7 +37,7 @@ def test_the_figures_are_those_of_the_record(result):
         f"{result['pilot']['plans_requested']} requested",
         f"{result['response_time_s']['median'] * 1e3:.0f} ms from depth frame",
         f"{result['simulated_s'] / result['host']['flight_wall_s']:.0f} times real time",
-        "solo in farm, seed 5; planner rrtstar, platform x86",
+        "solo in farm, seed 5; planner rrtstar, platform x86, stack hardened",
     ):
         assert figure in text
 

@@ -24,10 +24,10 @@ def test_the_release_differs_in_the_two_claims_only():
 
 def test_a_file_of_the_users_switches_one_key(tmp_path):
     file = tmp_path / "mine.toml"
-    file.write_text('name = "mine"\nbase = "mavbench"\nguards_tracking = true\n')
+    file.write_text('base = "mavbench"\nguards_tracking = true\n')
     mine, base = load_stack(str(file)), load_stack("mavbench")
     assert {key for key in KEYS if mine.settings[key] != base.settings[key]} == {"guards_tracking"}
-    assert mine.name == "mine"
+    assert (mine.name, mine.description) == ("mine", "")  # not those of its base
     assert "guards_tracking" not in mine.sources  # the base's source is not of this value
 
 

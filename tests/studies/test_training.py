@@ -76,7 +76,7 @@ def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
         (["--flights", "2"], "8 flights are too few to fit to: 10 at least"),
         (
             ["--kind", "gud"],
-            "unknown detector 'gud': did you mean 'gad'? Known: aad, gad, l2, range",
+            "unknown detector 'gud'; did you mean 'gad'? Known: aad, gad, l2, range",
         ),
         (["--n-sigma", "-1"], "n sigma: must be a finite number above 0, got -1.0"),
     ],

@@ -108,6 +108,20 @@ def library_scope(library: str, function: str) -> KernelScope:
     return KernelScope(kernel=function, entry=entry, objects=(library,), regions={})
 
 
+def compiled_scope(kernel: str, function: Any) -> KernelScope:
+    """Find entry and scope of a function that numba compiled and that has run in this process.
+
+    Args:
+        kernel: Name of the kernel.
+        function: Compiled with `core.compiled.compiled`.
+
+    Raises:
+        FaultError: The function has not run yet.
+    """
+    name, entry, region = compiled_region(function)
+    return KernelScope(kernel=kernel, entry=entry, objects=(name,), regions={name: region})
+
+
 def node_scope(node: str, planner: str) -> KernelScope:
     """Find entry and scope of the work of a mission's node, in this process.
 
@@ -154,8 +168,7 @@ def _compiled_kernel(kernel: str) -> KernelScope:
     from mavfi_cli.autonomy.point_cloud import back_project
     from mavfi_cli.autonomy.tracking import track
 
-    name, entry, region = compiled_region(track if kernel == "control" else back_project)
-    return KernelScope(kernel=kernel, entry=entry, objects=(name,), regions={name: region})
+    return compiled_scope(kernel, track if kernel == "control" else back_project)
 
 
 def _octomap() -> KernelScope:

@@ -1,7 +1,6 @@
 """Path planners by name: ours, and those that other packages register under `mavfi.planners`."""
 
 from collections.abc import Callable
-from importlib.metadata import entry_points
 
 from mavfi_cli.autonomy import OUR_PLANNERS, canonical_planner
 from mavfi_cli.autonomy.planners.base import (
@@ -12,7 +11,7 @@ from mavfi_cli.autonomy.planners.base import (
     pose_problem,
 )
 from mavfi_cli.autonomy.planners.ompl import RRT, RRTConnect, RRTStar
-from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.plug_ins import installed, load_plug_in
 
 __all__ = [
     "PlanResult",
@@ -33,7 +32,7 @@ _OURS: dict[str, Callable[[], Planner]] = dict(
 
 def names() -> list[str]:
     """Return the names of all installed planners, ours first."""
-    others = {entry.name for entry in entry_points(group=_ENTRY_POINT_GROUP)}
+    others = installed(_ENTRY_POINT_GROUP).names
     return [*_OURS, *sorted(others - set(_OURS))]
 
 
@@ -44,12 +43,10 @@ def find(name: str) -> Planner:
 
     Raises:
         UnknownName: No planner has this name. Suggests the nearest.
+        BrokenPlugIn: Its package does not load.
     """
     plain = canonical_planner(name)
     if plain in _OURS:
         return _OURS[plain]()
-    for entry in entry_points(group=_ENTRY_POINT_GROUP):
-        if entry.name == name:
-            planner: Planner = entry.load()()
-            return planner
-    raise UnknownName("planner", name, names())
+    planner: Planner = load_plug_in(_ENTRY_POINT_GROUP, "planner", name, names())()
+    return planner

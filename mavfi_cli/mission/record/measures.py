@@ -70,6 +70,7 @@ class FlightRecord:
     world: Record = field(default_factory=dict)
     referee: Record | None = field(default_factory=dict)  # None: the vehicle left no truth
     versions: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)  # SHA-256 of the user's files
     host: Record = field(default_factory=dict)
 
     @property

@@ -60,7 +60,7 @@ def test_box_holds_rotors_and_stands_clear_of_the_ground(name):
 
 
 def test_unknown_name_gives_the_nearest():
-    with pytest.raises(UnknownName, match=r"unknown vehicle 'sole': did you mean 'solo'"):
+    with pytest.raises(UnknownName, match=r"unknown vehicle 'sole'; did you mean 'solo'"):
         load_profile("sole")
 
 
