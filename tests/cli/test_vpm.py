@@ -203,4 +203,4 @@ def test_platforms(command_line, tmp_path):
     assert re.search(r"octomap +673\.37 ms", out)
     assert "measured:FACTOR" in command_line("platforms")[1]
     assert "2.5 times" in command_line("platforms", "measured:2.5")[1]
-    assert command_line("platforms", "tx1")[2].startswith("error: unknown platform 'tx1': did you")
+    assert command_line("platforms", "tx1")[2].startswith("error: unknown platform 'tx1'; did you")
