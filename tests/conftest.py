@@ -23,6 +23,7 @@ from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.vehicle import start_vehicle
 from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import load_platform
 
 for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
     sys.path.insert(0, str(Path(__file__).parent / _folder))
@@ -168,3 +169,15 @@ def autopilot_on_udp(free_port):
             return link, f"udpin:127.0.0.1:{free_port}"
 
         yield start
+
+
+@pytest.fixture
+def platform_of(tmp_path):
+    """Load a platform from the text of its file."""
+
+    def load(text):
+        path = tmp_path / "mine.toml"
+        path.write_text(text)
+        return load_platform(str(path))
+
+    return load

@@ -1,6 +1,7 @@
 """Missions and worlds that many tests fly, as Python, as a command line and as TOML."""
 
 from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import KERNELS
 
 # Some 20 simulated seconds, take-off included; less than a second of work.
 SHORT = MissionConfig(
@@ -15,4 +16,9 @@ POSTS = (
     'name = "posts"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
     "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
     "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
+)
+# A platform's file with every kernel.
+SOUND_PLATFORM = 'name = "mine"\ncores = 2\n' + "".join(
+    f"[kernels.{kernel}]\nlatency_s = {0.01 * (k + 1):.2f}\nspread = 0.5\n"
+    for k, kernel in enumerate(KERNELS)
 )

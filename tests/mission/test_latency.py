@@ -5,33 +5,19 @@ import math
 
 import numpy as np
 import pytest
+from missions import SOUND_PLATFORM
 
 from mavfi_cli.companion.latency import LatencyModel
 from mavfi_cli.mission.record.timetable import read_timetable
 from mavfi_cli.spec.platform import KERNELS, load_platform
-
-SOUND = 'name = "mine"\ncores = 2\n' + "".join(
-    f"[kernels.{kernel}]\nlatency_s = {0.01 * (k + 1):.2f}\nspread = 0.5\n"
-    for k, kernel in enumerate(KERNELS)
-)
-
-
-@pytest.fixture
-def load(tmp_path):
-    def of(text):
-        path = tmp_path / "mine.toml"
-        path.write_text(text)
-        return load_platform(str(path))
-
-    return of
 
 
 def draws(model, kernel, count=4000):
     return np.array([model.draw_s(kernel) for _ in range(count)])
 
 
-def test_latencies_are_log_normal_round_their_median(load):
-    logs = np.log(draws(LatencyModel(load(SOUND), 1), "octomap"))
+def test_latencies_are_log_normal_round_their_median(platform_of):
+    logs = np.log(draws(LatencyModel(platform_of(SOUND_PLATFORM), 1), "octomap"))
     error = 0.5 / math.sqrt(len(logs))
     assert logs.mean() == pytest.approx(math.log(0.02), abs=4 * error)
     assert logs.std() == pytest.approx(0.5, rel=0.06)
@@ -39,21 +25,21 @@ def test_latencies_are_log_normal_round_their_median(load):
     assert inside.mean() == pytest.approx(0.6827, abs=0.03)
 
 
-def test_without_spread_it_is_the_median_always(load):
-    model = LatencyModel(load(SOUND.replace("spread = 0.5", "spread = 0.0")), 1)
+def test_without_spread_it_is_the_median_always(platform_of):
+    model = LatencyModel(platform_of(SOUND_PLATFORM.replace("spread = 0.5", "spread = 0.0")), 1)
     assert set(draws(model, "planner", 50)) == {0.04}
 
 
-def test_a_seed_repeats_and_another_differs(load):
-    profile = load(SOUND)
+def test_a_seed_repeats_and_another_differs(platform_of):
+    profile = platform_of(SOUND_PLATFORM)
     once, twice = (draws(LatencyModel(profile, 5), "planner", 20) for _ in range(2))
     np.testing.assert_array_equal(once, twice)
     assert (draws(LatencyModel(profile, 6), "planner", 20) != once).all()
 
 
-def test_one_kernel_s_draws_do_not_shift_another_s(load):
+def test_one_kernel_s_draws_do_not_shift_another_s(platform_of):
     """So a faulty flight, whose kernels run at other times, stays paired with its golden one."""
-    profile = load(SOUND)
+    profile = platform_of(SOUND_PLATFORM)
     alone, mixed = LatencyModel(profile, 5), LatencyModel(profile, 5)
     expected = draws(alone, "planner", 50)
     found = []
@@ -63,8 +49,8 @@ def test_one_kernel_s_draws_do_not_shift_another_s(load):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_the_kernels_draws_are_independent(load):
-    model = LatencyModel(load(SOUND), 5)
+def test_the_kernels_draws_are_independent(platform_of):
+    model = LatencyModel(platform_of(SOUND_PLATFORM), 5)
     logs = np.log([draws(model, kernel, 2000) for kernel in KERNELS])
     correlation = np.corrcoef(logs) - np.eye(len(KERNELS))
     assert np.abs(correlation).max() < 0.1

@@ -1,24 +1,10 @@
 """Compute platforms: their files."""
 
 import pytest
+from missions import SOUND_PLATFORM
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
 from mavfi_cli.spec.platform import KERNELS, load_platform, platform_names
-
-SOUND = 'name = "mine"\ncores = 2\n' + "".join(
-    f"[kernels.{kernel}]\nlatency_s = {0.01 * (k + 1):.2f}\nspread = 0.5\n"
-    for k, kernel in enumerate(KERNELS)
-)
-
-
-@pytest.fixture
-def load(tmp_path):
-    def of(text):
-        path = tmp_path / "mine.toml"
-        path.write_text(text)
-        return load_platform(str(path))
-
-    return of
 
 
 @pytest.mark.parametrize("name", platform_names())
@@ -34,15 +20,15 @@ def test_shipped_platforms_have_every_kernel_with_its_source(name):
         assert {"mass_kg", "heatsink_kgpw"} <= set(platform.sources)
 
 
-def test_x86_is_the_paper_s(load):
+def test_x86_is_the_paper_s(platform_of):
     x86 = load_platform("x86").kernels
     assert x86["octomap"].latency_s == 0.289
     assert x86["planner"].latency_s == 0.083
     assert x86["control"].latency_s == 0.00046
 
 
-def test_a_file_of_one_s_own(load):
-    platform = load(SOUND)
+def test_a_file_of_one_s_own(platform_of):
+    platform = platform_of(SOUND_PLATFORM)
     assert (platform.name, platform.cores, platform.mass_kg) == ("mine", 2, 0.0)
     assert platform.kernels["octomap"].latency_s == 0.02
 
@@ -73,21 +59,21 @@ def test_a_file_of_one_s_own(load):
         ("cores = 2", 'cores = 2\nbase = "x68"', r"mine\.toml: base: .*did you mean 'x86'"),
     ],
 )
-def test_what_is_wrong_with_a_file(load, old, new, said):
+def test_what_is_wrong_with_a_file(platform_of, old, new, said):
     with pytest.raises(ConfigError, match=said) as error:
-        load(SOUND.replace(old, new, 1))
+        platform_of(SOUND_PLATFORM.replace(old, new, 1))
     assert "\n" not in str(error.value)
 
 
-def test_a_kernel_too_many(load):
+def test_a_kernel_too_many(platform_of):
     with pytest.raises(ConfigError, match=r"kernels\.dreams: no such kernel; Known: point_cloud"):
-        load(SOUND + "[kernels.dreams]\nlatency_s = 1.0\n")
+        platform_of(SOUND_PLATFORM + "[kernels.dreams]\nlatency_s = 1.0\n")
 
 
-def test_a_kernel_missing(load):
-    text = SOUND[: SOUND.index("[kernels.control]")]
+def test_a_kernel_missing(platform_of):
+    text = SOUND_PLATFORM[: SOUND_PLATFORM.index("[kernels.control]")]
     with pytest.raises(ConfigError, match=r"mine\.toml: kernels\.control: missing"):
-        load(text)
+        platform_of(text)
 
 
 SCALED = """name = "mine"
@@ -105,8 +91,8 @@ spread = 0.0
 """
 
 
-def test_a_platform_that_scales_another(load):
-    mine, x86 = load(SCALED).kernels, load_platform("x86").kernels
+def test_a_platform_that_scales_another(platform_of):
+    mine, x86 = platform_of(SCALED).kernels, load_platform("x86").kernels
     factors = {kernel: mine[kernel].latency_s / x86[kernel].latency_s for kernel in KERNELS}
     assert factors == pytest.approx(
         {"point_cloud": 3.0, "octomap": 2.0, "collision_check": 3.0,
@@ -116,19 +102,19 @@ def test_a_platform_that_scales_another(load):
     assert mine["control"].spread == 0.0
     assert mine["octomap"].source == "x86 x 2: a guess"
     assert mine["point_cloud"].source == "x86 x 3"
-    assert load_platform("x86").mass_kg == load(SCALED).mass_kg == 0.0
+    assert load_platform("x86").mass_kg == platform_of(SCALED).mass_kg == 0.0
 
 
-def test_a_scale_must_be_above_zero(load):
+def test_a_scale_must_be_above_zero(platform_of):
     with pytest.raises(
         ConfigError, match=r"mine\.toml.*kernels\.octomap: scale must be above zero"
     ):
-        load(SCALED.replace("scale = 2.0", "scale = -2.0"))
+        platform_of(SCALED.replace("scale = 2.0", "scale = -2.0"))
 
 
-def test_a_scale_that_goes_too_far(load):
+def test_a_scale_that_goes_too_far(platform_of):
     with pytest.raises(ConfigError, match=r"mine\.toml: latency_s must be at most 3600"):
-        load(SCALED.replace("scale = 3.0", "scale = 1e9"))
+        platform_of(SCALED.replace("scale = 3.0", "scale = 1e9"))
 
 
 def test_tx2_is_slower_in_every_kernel_and_with_every_cut():
