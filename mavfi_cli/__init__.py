@@ -7,12 +7,11 @@ the import itself and `mavfi --help` stay fast. docs/library.md shows how to use
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.core.versions import __version__
-
 if TYPE_CHECKING:
     from mavfi_cli.campaign.missions import PlannedMission
     from mavfi_cli.campaign.run import run_campaign
     from mavfi_cli.core.errors import MavfiError
+    from mavfi_cli.core.versions import __version__
     from mavfi_cli.fi.value import inject
     from mavfi_cli.library import campaign, fly
     from mavfi_cli.mission.golden import paired_golden
@@ -45,6 +44,7 @@ _MODULES = {  # name -> module that defines it; `campaign` is the package, which
     "MavfiError": "mavfi_cli.core.errors",
     "MissionConfig": "mavfi_cli.spec.mission",
     "PlannedMission": "mavfi_cli.campaign.missions",
+    "__version__": "mavfi_cli.core.versions",
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.value",
     "load_run": "mavfi_cli.mission.record.run_folder",

@@ -9,7 +9,6 @@ from typing import NoReturn
 
 import click
 
-from mavfi_cli import __version__
 from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
 
 # name -> (module, what it does); the help page must not import the modules
@@ -62,7 +61,7 @@ class _LazyGroup(click.Group):
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="mavfi")
+@click.version_option(package_name="mavfi", prog_name="mavfi")
 def cli() -> None:
     """Find out what a bit flip does to a flying robot, and what surviving it costs."""
 
