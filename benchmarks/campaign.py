@@ -15,10 +15,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.progress import Progress, Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig

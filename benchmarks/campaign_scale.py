@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.analysis.summary import summarise
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import Injected, PlannedMission, ResultState
-from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.run import Options, run_campaign, store_plan
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.progress import Progress, Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign, store_plan
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.spec.mission import MissionConfig
 
 CELLS = 40

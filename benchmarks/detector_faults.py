@@ -13,10 +13,10 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import DETECTOR, FaultConfig
 from mavfi_cli.spec.mission import MissionConfig

@@ -8,8 +8,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mavfi_cli.campaign.missions import PlannedMission
-    from mavfi_cli.campaign.run import run_campaign
+    from mavfi_cli.campaigns.missions import PlannedMission
+    from mavfi_cli.campaigns.run import run_campaign
     from mavfi_cli.core.errors import MavfiError
     from mavfi_cli.core.versions import __version__
     from mavfi_cli.fi.value import inject
@@ -37,26 +37,25 @@ __all__ = [
     "run_campaign",
 ]
 
-_MODULES = {  # name -> module that defines it; `campaign` is the package, which can be called
+_MODULES = {  # name -> module that defines it
     "DetectorConfig": "mavfi_cli.spec.detector",
     "FaultConfig": "mavfi_cli.spec.fault",
     "InstructionConfig": "mavfi_cli.spec.instruction",
     "MavfiError": "mavfi_cli.core.errors",
     "MissionConfig": "mavfi_cli.spec.mission",
-    "PlannedMission": "mavfi_cli.campaign.missions",
+    "PlannedMission": "mavfi_cli.campaigns.missions",
     "__version__": "mavfi_cli.core.versions",
+    "campaign": "mavfi_cli.library",
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.value",
     "load_run": "mavfi_cli.mission.record.run_folder",
     "paired_golden": "mavfi_cli.mission.golden",
-    "run_campaign": "mavfi_cli.campaign.run",
+    "run_campaign": "mavfi_cli.campaigns.run",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import a name of the library when it is first used."""
-    if name == "campaign":
-        return importlib.import_module("mavfi_cli.campaign")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(_MODULES[name]), name)

@@ -99,8 +99,8 @@ def campaign(what: str | Path) -> Campaign:
         MavfiError: The folder holds no campaign, or its records cannot be read.
     """
     from mavfi_cli.analysis.flights import exported
-    from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.ledger import Ledger
+    from mavfi_cli.campaigns.begin import folder_of
+    from mavfi_cli.campaigns.ledger import Ledger
 
     folder = folder_of(str(what))
     with Ledger(folder) as ledger:

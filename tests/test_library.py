@@ -43,18 +43,6 @@ def test_every_name_is_there_and_others_are_not():
         mavfi.flyy  # noqa: B018
 
 
-@pytest.mark.parametrize("first", ["pass", "import mavfi_cli.campaign.ledger", "mavfi.fly"])
-def test_campaign_can_be_called_whatever_was_imported_before(first, tmp_path):
-    program = (
-        f"import mavfi_cli as mavfi\n{first}\n"
-        "try: mavfi.campaign('nothing/here')\nexcept mavfi.MavfiError as error: print(error)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
-    )
-    assert "nothing/here" in done.stdout
-
-
 def test_settings_fly_what_the_configuration_flies(short_config, short_flight, tmp_path):
     flown = mavfi.fly(
         world="farm", seed=5, stack="hardened", start=(2, 2, 0), goal=(10, 6, 5), out=tmp_path

@@ -8,7 +8,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaigns.missions import Injected
 
 LONGER = 0.05  # fraction of the golden flight time beyond which a fault is harmful
 NONE = "none"  # no detector: the reference of all others

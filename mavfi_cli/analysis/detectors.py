@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.detector_pairs import KEY, LONGER, NONE, Harm
 from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers, paired
-from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.stats.bootstrap import Interval, interval, interval_of_rows, median

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.analysis.groups import Group
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import COUNTED, Injected, canonical
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import cross_layer, failures_per_hour, rate

@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import (
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
     PlannedMission,

@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers, paired
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import COUNTED, Injected, canonical, label_text
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 

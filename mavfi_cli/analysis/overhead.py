@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.groups import RESAMPLES, Group
-from mavfi_cli.campaign.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, detection_cost

@@ -18,8 +18,8 @@ from mavfi_cli.analysis.groups import (
     matched,
     untreated,
 )
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import COUNTED
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import COUNTED
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import WorstCase, holm, mcnemar, worst_case, worst_over_own

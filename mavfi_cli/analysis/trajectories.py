@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.analysis.groups import TREATMENT, untreated
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import COUNTED, Injected, MissionResult, ResultState, label_text
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import COUNTED, Injected, MissionResult, ResultState, label_text
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.record.measures import fields_of
 from mavfi_cli.mission.record.run_folder import RESULT

@@ -13,8 +13,8 @@ import click
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
 
 if TYPE_CHECKING:
-    from mavfi_cli.campaign.ledger import Ledger
-    from mavfi_cli.campaign.specification import Spec
+    from mavfi_cli.campaigns.ledger import Ledger
+    from mavfi_cli.campaigns.specification import Spec
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _what = partial(click.option, cls=GroupedOption, group="Missions")
@@ -65,9 +65,9 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     Ctrl-C waits for the missions in flight; a second one kills them. The next run resumes the
     campaign in either case.
     """
-    from mavfi_cli.campaign.begin import begin, chosen
-    from mavfi_cli.campaign.run import Options, fly_missing
-    from mavfi_cli.campaign.specification import Keep
+    from mavfi_cli.campaigns.begin import begin, chosen
+    from mavfi_cli.campaigns.run import Options, fly_missing
+    from mavfi_cli.campaigns.specification import Keep
     from mavfi_cli.cli.missions_view import missions_view
 
     spec, folder = chosen(what, options["out"], options["scale"], options["changes"])
@@ -112,8 +112,8 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def status(what: str, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
     """Summarise the results of a campaign, also while it runs."""
-    from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.ledger import Ledger
+    from mavfi_cli.campaigns.begin import folder_of
+    from mavfi_cli.campaigns.ledger import Ledger
 
     if not options["failures"] and (options["kernels"] or options["upsets"] is not None):
         raise click.UsageError("--kernels and --upsets go with --failures")
@@ -152,8 +152,8 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     Reads the kept run folders of all settings of the pair. Each fault has a panel.
     """
     from mavfi_cli.analysis.trajectories import pair
-    from mavfi_cli.campaign.begin import folder_of
-    from mavfi_cli.campaign.ledger import Ledger
+    from mavfi_cli.campaigns.begin import folder_of
+    from mavfi_cli.campaigns.ledger import Ledger
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.trajectories import Panel, lines, write_trajectories
@@ -225,8 +225,8 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
 def _planned(what: str, scale: float | None, changes: Sequence[str]) -> dict[str, Any]:
     from collections import Counter
 
-    from mavfi_cli.campaign.begin import chosen_spec, flyable
-    from mavfi_cli.campaign.missions import label_text
+    from mavfi_cli.campaigns.begin import chosen_spec, flyable
+    from mavfi_cli.campaigns.missions import label_text
 
     spec: Spec
     spec = chosen_spec(what, scale, changes)
@@ -278,7 +278,7 @@ def _show(
     from dataclasses import asdict
 
     from mavfi_cli.analysis.summary import summarise
-    from mavfi_cli.campaign.begin import fixed_world, stopped
+    from mavfi_cli.campaigns.begin import fixed_world, stopped
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.tables.campaign import summary_lines
 

@@ -51,7 +51,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     World, start, noise and faults are the same on all platforms. The same command resumes an
     interrupted comparison. Writes compare.json, compare.csv, compare.svg and timeline.svg.
     """
-    from mavfi_cli.campaign.run import Options
+    from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
     from mavfi_cli.report.compare_plot import write_compare_plot

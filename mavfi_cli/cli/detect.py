@@ -86,7 +86,7 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     The same command resumes an interrupted evaluation. More flights, worlds or detectors are added
     to those in the folder. Writes evaluation.json, evaluation.csv, roc.svg and recovery.svg.
     """
-    from mavfi_cli.campaign.run import Options
+    from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
     from mavfi_cli.report.detection_plot import write_recovery_plot, write_roc_plot

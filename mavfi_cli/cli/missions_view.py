@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mavfi_cli.campaign.progress import Progress, Spectator
+from mavfi_cli.campaigns.progress import Progress, Spectator
 
 if TYPE_CHECKING:
     from rich.live import Live

@@ -51,7 +51,7 @@ def train(
     The same command resumes an interrupted training. Fitting the autoencoder needs torch:
     pip install 'mavfi[train]'.
     """
-    from mavfi_cli.campaign.run import Options
+    from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.detect.fit import KINDS
     from mavfi_cli.report.training_plot import write_loss_curve

@@ -186,7 +186,7 @@ def _flown(
     out: Path,
     options: dict[str, Any],
 ) -> dict[str, Any]:
-    from mavfi_cli.campaign.run import Options
+    from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.missions_view import missions_view
     from mavfi_cli.studies.redundancy import WORLDS, RedundancyPlan, fly_and_report
 

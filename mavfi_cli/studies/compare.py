@@ -14,11 +14,11 @@ from typing import Any
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, compared, figures, platforms_told
 from mavfi_cli.analysis.timeline import timeline_seed, timelines
-from mavfi_cli.campaign.begin import begin, resumed
-from mavfi_cli.campaign.missions import PlannedMission, ResultState
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, fly_missing, run_campaign
-from mavfi_cli.campaign.specification import Keep, Setting, Spec
+from mavfi_cli.campaigns.begin import begin, resumed
+from mavfi_cli.campaigns.missions import PlannedMission, ResultState
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, fly_missing, run_campaign
+from mavfi_cli.campaigns.specification import Keep, Setting, Spec
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage

@@ -20,13 +20,13 @@ from mavfi_cli.analysis.detector_pairs import ERROR_FREE, FAULT, NONE, Harm, pai
 from mavfi_cli.analysis.detectors import Scored, found
 from mavfi_cli.analysis.flights import chosen, flights, flown
 from mavfi_cli.analysis.scores import Scores, model_digest
-from mavfi_cli.campaign.begin import ask_vehicle
-from mavfi_cli.campaign.factors import check_names
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import Label, PlannedMission, ResultState, changes_of
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import PROFILES, Options, fly_missing, store_plan
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.begin import ask_vehicle
+from mavfi_cli.campaigns.factors import check_names
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import Label, PlannedMission, ResultState, changes_of
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import PROFILES, Options, fly_missing, store_plan
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError, ModelError, RecordError, UnknownName
 from mavfi_cli.core.seeds import Stream, derive

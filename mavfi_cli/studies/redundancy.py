@@ -10,12 +10,12 @@ from typing import Any
 
 from mavfi_cli.analysis.flights import chosen, flights
 from mavfi_cli.analysis.overhead import compute_overheads
-from mavfi_cli.campaign.begin import ask_vehicle
-from mavfi_cli.campaign.factors import check_names
-from mavfi_cli.campaign.missions import PlannedMission, ResultState, canonical, changes_of
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.begin import ask_vehicle
+from mavfi_cli.campaigns.factors import check_names
+from mavfi_cli.campaigns.missions import PlannedMission, ResultState, canonical, changes_of
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.detect import model as model_file

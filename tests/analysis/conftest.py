@@ -3,8 +3,8 @@
 import pytest
 from flown_twice import whole  # noqa: F401
 
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 

@@ -3,7 +3,7 @@
 import pyarrow as pa
 
 from mavfi_cli.analysis.detector_pairs import SCHEMA, error_free_pair, fault_pair
-from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaigns.missions import Injected
 
 
 def flown(outcome="success", time_s=100.0, *, alarms_s=(), struck_s=None, **more):

@@ -10,7 +10,7 @@ from plain_values import named
 
 from mavfi_cli.analysis.groups import groups
 from mavfi_cli.analysis.overhead import flight_overheads
-from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.cli.campaign import campaign as command
 from mavfi_cli.report.tables.campaign import overhead_lines
 
@@ -150,7 +150,7 @@ def test_the_command_shows_it_where_it_is_asked_for(filled):
 
 def test_table_v_has_the_flights_that_it_needs():
     """Both detectors, every stage, each world; and faults whose recovery has to be paid."""
-    from mavfi_cli.campaign.begin import chosen
+    from mavfi_cli.campaigns.begin import chosen
 
     spec, _ = chosen("table4", None, 0.01)
     flown = {

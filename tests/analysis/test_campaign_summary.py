@@ -10,8 +10,8 @@ from plain_values import named
 from mavfi_cli.analysis.failures import failures
 from mavfi_cli.analysis.groups import METRICS, groups
 from mavfi_cli.analysis.summary import against_golden, protection, qualities, summarise
-from mavfi_cli.campaign.begin import stopped
-from mavfi_cli.campaign.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.begin import stopped
+from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel

@@ -7,7 +7,7 @@ from evaluation_flights import error_free, flown, pair, struck, table
 from plain_values import named
 
 from mavfi_cli.analysis import detectors as question
-from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaigns.missions import Injected
 
 
 def error_free_metrics(pairs):

@@ -5,7 +5,7 @@ import pytest
 from evaluation_flights import flown, pair, struck
 
 from mavfi_cli.analysis.detector_pairs import WANTED, Harm, harm_of, pairs_of
-from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.mission.record.measures import measures_of
 
 GOLDEN = {"kind": "error-free", "world": "farm", "seed": 7}

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.analysis.groups import METRICS, Group, matched
-from mavfi_cli.campaign.missions import Injected
+from mavfi_cli.campaigns.missions import Injected
 
 FATES = (Injected.ACTIVE.value, Injected.NOT_INJECTED.value)
 PAIRS = "abcd"

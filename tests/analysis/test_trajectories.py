@@ -4,9 +4,9 @@ import pytest
 from plain_values import named
 
 from mavfi_cli.analysis import trajectories
-from mavfi_cli.campaign.begin import chosen
-from mavfi_cli.campaign.missions import Injected, PlannedMission, ResultState
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.begin import chosen
+from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig

@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from mavfi_cli.campaign.progress import Progress
+from mavfi_cli.campaigns.progress import Progress
 from mavfi_cli.cli.missions_view import missions_view, progress_line
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from record_digest import record_digest
 
-from mavfi_cli.campaign.begin import ask_vehicle
+from mavfi_cli.campaigns.begin import ask_vehicle
 from mavfi_cli.core.errors import UnknownName, VehicleProcessError, WorldError
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.vehicle import VehicleProcess, start_vehicle

@@ -16,7 +16,7 @@ config = MissionConfig(
     fault=FaultConfig(target="planning", seed=2),
 )
 fly_mission(config, Path(sys.argv[1]), Watcher())
-import mavfi_cli.campaign.run
+import mavfi_cli.campaigns.run
 print([name for name in sys.modules if name.startswith(("capstone", "mavfi_cli.fi.tracer.arch"))])
 """
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavfi_cli.campaign.specification_file import load_spec
+from mavfi_cli.campaigns.specification_file import load_spec
 from mavfi_cli.companion import protection as protection_module
 from mavfi_cli.companion.protection import PASSED, Protection, Response
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, OtherStack, UnknownName

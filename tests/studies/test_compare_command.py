@@ -9,9 +9,9 @@ import xml.etree.ElementTree as ET
 import pytest
 from missions import POSTS
 
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import plain
 from mavfi_cli.studies.compare import ComparePlan, compare

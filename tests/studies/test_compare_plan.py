@@ -8,7 +8,7 @@ from flown_twice import flight
 
 from mavfi_cli.analysis.platforms import titles
 from mavfi_cli.analysis.timeline import timeline_seed
-from mavfi_cli.campaign.specification_file import load_spec, replaced
+from mavfi_cli.campaigns.specification_file import load_spec, replaced
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.studies.compare import ComparePlan
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from evaluation_flights import error_free, flown, pair, struck, table
 
-from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.detection_plot import (
     draw_recovery_plot,

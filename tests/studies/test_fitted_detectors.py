@@ -2,8 +2,8 @@
 
 import pytest
 
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies import redundancy
 from mavfi_cli.studies.flight_plan import flight_plan

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.analysis.groups import INACTIVE, METRICS
-from mavfi_cli.campaign.missions import label_text
+from mavfi_cli.campaigns.missions import label_text
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
 from mavfi_cli.report.tables.columns import number, percent, spread

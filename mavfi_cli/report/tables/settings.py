@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mavfi_cli.campaign.missions import label_text, label_value, ordered
+from mavfi_cli.campaigns.missions import label_text, label_value, ordered
 from mavfi_cli.report.tables.columns import blocks
 
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.factors import check_names
-from mavfi_cli.campaign.ledger import LEDGER, Ledger
-from mavfi_cli.campaign.missions import (
+from mavfi_cli.campaigns.factors import check_names
+from mavfi_cli.campaigns.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.missions import (
     PlannedMission,
     canonical,
     changes_of,
@@ -20,12 +20,12 @@ from mavfi_cli.campaign.missions import (
     label_text,
     naming,
 )
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, require_unchanged, store_plan
-from mavfi_cli.campaign.specification import FixedWorld, Spec, differences
-from mavfi_cli.campaign.specification_file import load_spec, parse_spec, presets, replaced, to_toml
-from mavfi_cli.campaign.stopping import BatchLimiter
-from mavfi_cli.campaign.world_search import with_worlds
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, require_unchanged, store_plan
+from mavfi_cli.campaigns.specification import FixedWorld, Spec, differences
+from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, replaced, to_toml
+from mavfi_cli.campaigns.stopping import BatchLimiter
+from mavfi_cli.campaigns.world_search import with_worlds
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName, VehicleProcessError
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.vehicle import VehicleInProcess

@@ -1,6 +1,6 @@
 """Lists of missions, for tests and for the programs that they start."""
 
-from mavfi_cli.campaign.missions import PlannedMission
+from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.spec.mission import MissionConfig
 
 

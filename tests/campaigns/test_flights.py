@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from mavfi_cli.campaign.missions import Injected, PlannedMission
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.missions import Injected, PlannedMission
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.mission.record.run_folder import RunFolder
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig

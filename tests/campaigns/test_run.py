@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from plans import planned
 
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.missions import Injected, ResultState
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import ATTEMPTS
-from mavfi_cli.campaign.specification import Keep
-from mavfi_cli.campaign.workers import CampaignStopped
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import Injected, ResultState
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import ATTEMPTS
+from mavfi_cli.campaigns.specification import Keep
+from mavfi_cli.campaigns.workers import CampaignStopped
 from mavfi_cli.core.errors import ConfigError, Interrupted
 
 

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from missions import SHORT_WAY
 
-from mavfi_cli.campaign.ledger import LEDGER
+from mavfi_cli.campaigns.ledger import LEDGER
 from mavfi_cli.cli import campaign as command
 
 SPEC = f"""
@@ -257,7 +257,7 @@ def test_plan_says_what_would_be_flown(mavfi, tmp_path):
 
 def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mavfi_cli.campaign.run.fly_missing", lambda *_: None)
+    monkeypatch.setattr("mavfi_cli.campaigns.run.fly_missing", lambda *_: None)
     line = ["run", str(written(tmp_path)), "--quiet"]
     invoke = CliRunner().invoke
     assert invoke(command.campaign, line).exit_code == 0
@@ -274,7 +274,7 @@ def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
 
 def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mavfi_cli.campaign.run.fly_missing", lambda *_: None)
+    monkeypatch.setattr("mavfi_cli.campaigns.run.fly_missing", lambda *_: None)
 
     def called(*arguments):
         return CliRunner().invoke(command.campaign, arguments)
@@ -299,7 +299,7 @@ def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch
 
 def test_the_name_of_a_campaign_that_was_begun_is_told_with_its_folder(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mavfi_cli.campaign.run.fly_missing", lambda *_: None)
+    monkeypatch.setattr("mavfi_cli.campaigns.run.fly_missing", lambda *_: None)
     invoke = CliRunner().invoke
     begun = invoke(command.campaign, ["run", str(written(tmp_path)), "--quiet"])
     assert begun.exit_code == 0, begun.output
@@ -340,7 +340,7 @@ def test_wrong_usage_is_exit_code_2(mavfi, arguments):
 
 
 def test_every_preset_is_named_in_the_help():
-    from mavfi_cli.campaign.specification_file import presets
+    from mavfi_cli.campaigns.specification_file import presets
 
     for name in presets():
         assert name in command.campaign.help

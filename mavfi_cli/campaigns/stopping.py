@@ -11,8 +11,8 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from mavfi_cli.campaign.missions import COUNTED
-from mavfi_cli.campaign.specification import Stop
+from mavfi_cli.campaigns.missions import COUNTED
+from mavfi_cli.campaigns.specification import Stop
 from mavfi_cli.stats.shares import half_width, rate
 
 Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from mavfi_cli.campaign.factors import Point
-from mavfi_cli.campaign.missions import Label, PlannedMission, naming
+from mavfi_cli.campaigns.factors import Point
+from mavfi_cli.campaigns.missions import Label, PlannedMission, naming
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.seeds import Stream, derive
 

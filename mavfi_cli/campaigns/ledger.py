@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.missions import (
+from mavfi_cli.campaigns.missions import (
     Injected,
     MissionResult,
     PlannedMission,

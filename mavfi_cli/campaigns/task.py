@@ -30,7 +30,7 @@ def perform(changes: Mapping[str, Any], out: Path) -> Path:
     Raises:
         MavfiError: the mission could not begin, or its record could not be written.
     """
-    from mavfi_cli.campaign.missions import config_from
+    from mavfi_cli.campaigns.missions import config_from
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
 

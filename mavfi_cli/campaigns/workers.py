@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from mavfi_cli.campaign.missions import ResultState
+from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.types import Outcome
@@ -87,7 +87,7 @@ class Workers(ABC):
         """End all missions that still run."""
 
 
-TASK = "mavfi_cli.campaign.task"
+TASK = "mavfi_cli.campaigns.task"
 _STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
 
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign import begin as beginning
-from mavfi_cli.campaign.begin import begin, fixed_world
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.specification import FixedWorld
-from mavfi_cli.campaign.specification_file import parse_spec, replaced, to_toml
-from mavfi_cli.campaign.world_search import SEARCH
+from mavfi_cli.campaigns import begin as beginning
+from mavfi_cli.campaigns.begin import begin, fixed_world
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.specification import FixedWorld
+from mavfi_cli.campaigns.specification_file import parse_spec, replaced, to_toml
+from mavfi_cli.campaigns.world_search import SEARCH
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 
 SPEC = """

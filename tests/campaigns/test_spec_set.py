@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.specification_file import load_spec, parse_spec, replaced
+from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, replaced
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey
 
 SPEC = """

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 
 
 @pytest.fixture(autouse=True)

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from mavfi_cli.campaign.specification import Keep
-from mavfi_cli.campaign.workers import TASK, Assignment, AttemptEnd, LocalWorkers, Workers
+from mavfi_cli.campaigns.specification import Keep
+from mavfi_cli.campaigns.workers import TASK, Assignment, AttemptEnd, LocalWorkers, Workers
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.fork_server import SCRATCH
 from mavfi_cli.core.versions import installed_versions, version_differences

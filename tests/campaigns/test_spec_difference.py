@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.specification import differences
-from mavfi_cli.campaign.specification_file import parse_spec
+from mavfi_cli.campaigns.specification import differences
+from mavfi_cli.campaigns.specification_file import parse_spec
 from mavfi_cli.studies.compare import ComparePlan
 
 STORED = """

@@ -6,8 +6,8 @@ import sqlite3
 import pytest
 from plans import planned
 
-from mavfi_cli.campaign.ledger import LEDGER, Ledger
-from mavfi_cli.campaign.missions import (
+from mavfi_cli.campaigns.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.missions import (
     Injected,
     PlannedMission,
     ResultState,

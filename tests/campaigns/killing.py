@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from mavfi_cli.campaign.ledger import Ledger
+from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.processes import GUARD, SERVER, WORKER
 
 RUNNER, VEHICLE = "runner", "vehicle"
@@ -101,9 +101,9 @@ def start_fake(folder, count):
 
 
 if __name__ == "__main__":  # the runner of the tests: a list of missions without flights
-    from mavfi_cli.campaign.missions import PlannedMission
-    from mavfi_cli.campaign.run import Options, run_campaign
-    from mavfi_cli.campaign.workers import CampaignStopped
+    from mavfi_cli.campaigns.missions import PlannedMission
+    from mavfi_cli.campaigns.run import Options, run_campaign
+    from mavfi_cli.campaigns.workers import CampaignStopped
     from mavfi_cli.spec.mission import MissionConfig
 
     folder, count, task = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]

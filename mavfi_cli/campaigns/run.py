@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaign.ledger import RUNS, Ledger
-from mavfi_cli.campaign.missions import (
+from mavfi_cli.campaigns.ledger import RUNS, Ledger
+from mavfi_cli.campaigns.missions import (
     PlannedMission,
     ResultState,
     canonical,
@@ -22,10 +22,10 @@ from mavfi_cli.campaign.missions import (
     config_from,
     injected_of,
 )
-from mavfi_cli.campaign.progress import Progress, Spectator
-from mavfi_cli.campaign.specification import Keep, Stop
-from mavfi_cli.campaign.stopping import BatchLimiter, Entry, Queue
-from mavfi_cli.campaign.workers import (
+from mavfi_cli.campaigns.progress import Progress, Spectator
+from mavfi_cli.campaigns.specification import Keep, Stop
+from mavfi_cli.campaigns.stopping import BatchLimiter, Entry, Queue
+from mavfi_cli.campaigns.workers import (
     TASK,
     Assignment,
     AttemptEnd,
@@ -242,7 +242,7 @@ class _Run:
         options = self._options
         if options.cluster is None:
             return LocalWorkers(self._jobs, options.task)
-        from mavfi_cli.campaign.cluster import Cluster
+        from mavfi_cli.campaigns.cluster import Cluster
 
         return Cluster(options.cluster, options.keep, options.task)
 

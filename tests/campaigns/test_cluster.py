@@ -13,9 +13,9 @@ from killing import results_of
 from missions import SHORT_WAY
 from plans import planned
 
-from mavfi_cli.campaign.cluster import Cluster, ClusterError
-from mavfi_cli.campaign.ledger import Ledger
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.cluster import Cluster, ClusterError
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.specification import Keep
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
 START_S = 90.0
@@ -23,9 +23,9 @@ RUNNER = """
 import sys
 from pathlib import Path
 from plans import planned
-from mavfi_cli.campaign.specification import Keep
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
 
 class Telling(Spectator):
     def on_progress(self, progress):

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mavfi_cli.campaign.workers import AttemptEnd, judge
+from mavfi_cli.campaigns.workers import AttemptEnd, judge
 from mavfi_cli.core.errors import Interrupted
 
 

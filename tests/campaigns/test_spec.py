@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.campaign.begin import flyable
-from mavfi_cli.campaign.specification import Keep, Stop
-from mavfi_cli.campaign.specification_file import load_spec, parse_spec, presets, to_toml
+from mavfi_cli.campaigns.begin import flyable
+from mavfi_cli.campaigns.specification import Keep, Stop
+from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, to_toml
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey, UnknownName
 from mavfi_cli.spec.stack import load_stack
 

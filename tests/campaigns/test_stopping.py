@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plans import planned
 
-from mavfi_cli.campaign.missions import Injected
-from mavfi_cli.campaign.specification import Stop
-from mavfi_cli.campaign.stopping import BatchLimiter, Queue
+from mavfi_cli.campaigns.missions import Injected
+from mavfi_cli.campaigns.specification import Stop
+from mavfi_cli.campaigns.stopping import BatchLimiter, Queue
 from mavfi_cli.stats.shares import half_width, rate
 
 STOP = Stop(margin=0.12, batch=10)

@@ -9,10 +9,10 @@ import pytest
 from killing import VEHICLE, processes, results_of
 from live_processes import none_left
 
-from mavfi_cli.campaign.missions import PlannedMission
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import Keep
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.processes import GUARD, WORKER
 
 pytestmark = pytest.mark.slow
@@ -54,7 +54,7 @@ def test_a_kill_costs_an_attempt_and_no_mission(
 ):
     mark = str(tmp_path)
     monkeypatch.setenv("MAVFI_TEST_CAMPAIGN", mark)
-    monkeypatch.setattr("mavfi_cli.campaign.run._LOOK_S", 0.02)
+    monkeypatch.setattr("mavfi_cli.campaigns.run._LOOK_S", 0.02)
     killer = _Killer(mark, victim)
     with run_campaign(missions, tmp_path / "campaign", Options(jobs=1), killer) as ledger:
         attempts = sorted(result.attempts for result in ledger.results())

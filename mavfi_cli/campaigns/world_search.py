@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.campaign.missions import PlannedMission, golden_of
-from mavfi_cli.campaign.progress import Spectator
-from mavfi_cli.campaign.run import Options, run_campaign
-from mavfi_cli.campaign.specification import FixedWorld, Flown, Keep, Spec
+from mavfi_cli.campaigns.missions import PlannedMission, golden_of
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.mission.record.measures import fields_of
 from mavfi_cli.spec.mission import MissionConfig

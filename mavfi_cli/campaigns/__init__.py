@@ -1,0 +1,1 @@
+"""Campaigns: planned lists of missions with a ledger of their results."""
