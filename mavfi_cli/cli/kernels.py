@@ -61,7 +61,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
         help="Number of bits that are flipped.")  # fmt: skip
 @_fault("--seed", default=1, show_default=True, type=click.IntRange(min=0),
         help="Seed of the faults.")  # fmt: skip
-@_fault("--compat", help="Follow the rules of another injector: rosfi-2021.")
+@_fault("--compat", metavar="INJECTOR",
+        help="Follow the rules of another injector: pinfi, pinfi-bugs, rosfi-2021.")  # fmt: skip
 @_fault("--null", is_flag=True, help="Do everything except the flip.")
 @_runs("--runs", default=1000, show_default=True, type=click.IntRange(min=1),
        help="Runs per kernel, or of the program. Each run has one fault.")  # fmt: skip

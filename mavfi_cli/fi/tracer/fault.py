@@ -57,6 +57,9 @@ class InstructionCorruption:
     operand: str  # as the assembler names it
     bits: tuple[int, ...]  # of the full register, of the opcode bytes, or of the memory operand
     memory_operand: int = 0  # index among the instruction's memory operands
+    inverts: str = (
+        ""  # a conditional jump: those of `bits` are struck that make it go the other way
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +139,8 @@ def draw_corruption(
     return replace(operand, bits=tuple(sorted(available[int(index)] for index in picked)))
 
 
-def _site_of(register: str) -> Site:
+def site_of(register: str) -> Site:
+    """The site that a full register is."""
     return Site(register_kind(register))
 
 
@@ -154,7 +158,7 @@ def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> In
     if not 0 <= bit < width:
         raise BitOutsideWidth(bit, register, width)
     return InstructionCorruption(
-        site=_site_of(register), role=role, register=register, operand=register, bits=(bit,)
+        site=site_of(register), role=role, register=register, operand=register, bits=(bit,)
     )
 
 
@@ -184,7 +188,7 @@ def _registers(
 ) -> list[_Operand]:
     merged: dict[str, _Operand] = {}
     for use in uses:
-        site = _site_of(use.register)
+        site = site_of(use.register)
         if site not in model.sites or not (use.explicit or model.implicit):
             continue
         mask, name = use.mask & _field_mask(instruction, model, site), use.operand

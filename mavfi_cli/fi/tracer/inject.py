@@ -8,7 +8,15 @@ from enum import Enum
 
 from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi import bits
-from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, address_of, decode, erase_trap, width_of
+from mavfi_cli.fi.tracer.arch import (
+    TRAITS,
+    Instruction,
+    address_of,
+    decode,
+    erase_trap,
+    inverting_bits,
+    width_of,
+)
 from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee, Trap
@@ -99,7 +107,7 @@ def apply(tracee: Tracee, instruction: Instruction, corruption: InstructionCorru
         before, after = _invert(tracee, instruction, corruption, place)
     except OSError as error:
         return _not_applied(f"refused by the operating system: {error.strerror}", place, 0, start)
-    lost = [bit for bit in corruption.bits if not (before ^ after) >> bit & 1]
+    lost = [bit for bit in _struck(corruption, before) if not (before ^ after) >> bit & 1]
     reason = f"discarded by the operating system: bits {lost}" if lost else ""
     stop_s = (time.perf_counter_ns() - start) * 1e-9
     return Injection(
@@ -131,8 +139,13 @@ def _invert(
     registers = tracee.registers
     before = registers.read(corruption.register)
     kind = bits.raw(width_of(corruption.register) // 8)
-    registers.write(corruption.register, bits.flip_pattern(before, corruption.bits, kind))
+    struck = _struck(corruption, before)
+    registers.write(corruption.register, bits.flip_pattern(before, struck, kind))
     return before, registers.read(corruption.register)
+
+
+def _struck(corruption: InstructionCorruption, before: int) -> tuple[int, ...]:
+    return inverting_bits(corruption.inverts, before) if corruption.inverts else corruption.bits
 
 
 def _execute_corrupted(
@@ -173,7 +186,7 @@ def follow(
         if current is None:
             break
         read, remaining = _touch(tracee, current, corruption, injection.address, remaining)
-        if read or not remaining:
+        if read or (corruption.bits and not remaining):
             what = BitActivation.READ if read else BitActivation.OVERWRITTEN
             return Followed(activation=what, after_instructions=distance, instruction=current.text)
         if isinstance(clean_step(tracee, current), Ended):

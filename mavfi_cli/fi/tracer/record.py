@@ -64,7 +64,8 @@ def corruption_to_json(corruption: InstructionCorruption | None) -> dict[str, An
     if corruption is None:
         return None
     names = {"site": corruption.site.value, "role": corruption.role.value}
-    return asdict(corruption) | names | {"bits": list(corruption.bits)}
+    told = asdict(corruption) | names | {"bits": list(corruption.bits)}
+    return told if corruption.inverts else {k: v for k, v in told.items() if k != "inverts"}
 
 
 def completed(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -20,12 +20,18 @@ from mavfi_cli.core.errors import FaultError, TargetError, UnknownName, named_me
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, decode, record_steps, return_address
 from mavfi_cli.fi.tracer.arch.interface import StepEnd
+from mavfi_cli.fi.tracer.compat import (
+    PINFI_MODEL,
+    ROSFI_MODEL,
+    draw_pinfi,
+    draw_pinfi_with_bugs,
+    draw_rosfi,
+)
 from mavfi_cli.fi.tracer.fault import (
     CountedStop,
     FaultModel,
     InstructionCorruption,
     InstructionFault,
-    Site,
     draw_corruption,
 )
 from mavfi_cli.fi.tracer.image import Location, Scope
@@ -227,6 +233,11 @@ def plan_trigger(
     return (*segment.start, anchor, CountedStop(locate(int(target)), int(after[best]))), k
 
 
+Draw = Callable[
+    [Instruction, Instruction | None, np.random.Generator], InstructionCorruption | None
+]
+
+
 class Rule(Enum):
     """How the moment of a fault is drawn."""
 
@@ -242,39 +253,48 @@ class Strategy:
     name: str
     rule: Rule
     model: FaultModel
-    refused: frozenset[str] = frozenset()  # operands whose draw is discarded
+    imitates: Draw | None = None  # another injector, instead of the model
     attempts: int = 1  # time rules: how many moments are tried
     retry_s: float = 0.0  # time rules: how much later
     whole_process: bool = False  # hits code out of scope as well
     in_system_calls: bool = False  # hits a thread that waits in the operating system as well
-    bit_of: Callable[[InstructionCorruption, np.random.Generator], InstructionCorruption] = field(
-        default=lambda corruption, _rng: corruption
-    )
 
     def draw_at(
-        self, instruction: Instruction, rng: np.random.Generator
+        self,
+        instruction: Instruction,
+        rng: np.random.Generator,
+        following: Instruction | None = None,
     ) -> InstructionCorruption | None:
-        """Draw a corruption at a stop; None gives up this moment."""
-        drawn = draw_corruption(instruction, self.model, rng)
-        if drawn is None or drawn.operand in self.refused:
-            return None
-        return self.bit_of(drawn, rng)
+        """Draw a corruption of an instruction, given the next one; None gives it up."""
+        if self.imitates is not None:
+            return self.imitates(instruction, following, rng)
+        return draw_corruption(instruction, self.model, rng)
 
 
-# The released ROSFI injector refuses these registers, so that r8 to r13 and XMM get nearly all
-# faults (MAVBench/MAV_apps, branch mavfi, regManip.cpp and rosfi.cpp).
-_ROSFI_REFUSED = frozenset(
-    "rip rax rbx rcx rdx rsi rdi rbp rsp r14 r15 esi edi eax ecx edx bl cl dl".split()  # noqa: SIM905
-)
-
-
-def _rosfi_bit(
-    corruption: InstructionCorruption, rng: np.random.Generator
-) -> InstructionCorruption:
-    """Move bits 52 to 62 (110 to 126 of XMM) to byte 0, where ROSFI writes them."""
-    wide = corruption.site is Site.VECTOR
-    bit = int(rng.integers(110, 127) if wide else rng.integers(52, 63))
-    return replace(corruption, bits=(bit % 8,))
+_COMPAT = {
+    "rosfi-2021": Strategy(
+        name="rosfi-2021 (wall-clock, low byte only, most registers refused)",
+        rule=Rule.WALL_CLOCK,
+        model=ROSFI_MODEL,
+        imitates=draw_rosfi,
+        attempts=100,
+        retry_s=500e-6,
+        whole_process=True,
+        in_system_calls=True,
+    ),
+    "pinfi": Strategy(
+        name="pinfi (instruction-uniform, one register that is written)",
+        rule=Rule.INSTRUCTION,
+        model=PINFI_MODEL,
+        imitates=draw_pinfi,
+    ),
+    "pinfi-bugs": Strategy(
+        name="pinfi-bugs (as pinfi, xmm10 to xmm15 taken for xmm0 to xmm5)",
+        rule=Rule.INSTRUCTION,
+        model=PINFI_MODEL,
+        imitates=draw_pinfi_with_bugs,
+    ),
+}
 
 
 def strategy(name: str, model: FaultModel | None = None, *, compat: str | None = None) -> Strategy:
@@ -284,19 +304,9 @@ def strategy(name: str, model: FaultModel | None = None, *, compat: str | None =
         UnknownName: no such rule or compatibility mode; names the nearest.
     """
     if compat is not None:
-        if compat != "rosfi-2021":
-            raise UnknownName("compatibility mode", compat, ["rosfi-2021"])
-        return Strategy(
-            name="rosfi-2021 (wall-clock, low byte only, most registers refused)",
-            rule=Rule.WALL_CLOCK,
-            model=FaultModel(sites=frozenset((Site.GENERAL, Site.VECTOR))),
-            refused=_ROSFI_REFUSED,
-            attempts=100,
-            retry_s=500e-6,
-            whole_process=True,
-            in_system_calls=True,
-            bit_of=_rosfi_bit,
-        )
+        if compat not in _COMPAT:
+            raise UnknownName("compatibility mode", compat, _COMPAT)
+        return _COMPAT[compat]
     rule = named_member(Rule, "sampling rule", name)
     return Strategy(name=rule.value, rule=rule, model=model or FaultModel())
 
@@ -328,7 +338,8 @@ def draw_fault(
         instruction = decode(code_at(address), address)
         if instruction is None:
             continue
-        corruption = plan.draw_at(instruction, rng)
+        following = decode(code_at(instruction.next_address), instruction.next_address)
+        corruption = plan.draw_at(instruction, rng, following)
         if corruption is None:
             continue
         trigger, k = plan_trigger(segment, index, locate)

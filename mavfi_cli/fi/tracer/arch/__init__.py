@@ -19,6 +19,7 @@ SUPPORTED = platform.system() == "Linux" and platform.machine() == "x86_64"
 
 if SUPPORTED or TYPE_CHECKING:
     from mavfi_cli.fi.tracer.arch.x86_64.decode import address_of, decode, widest_vector
+    from mavfi_cli.fi.tracer.arch.x86_64.jumps import JUMP_FLAGS, inverting_bits
     from mavfi_cli.fi.tracer.arch.x86_64.registers import (
         TRAITS,
         Registers,
@@ -50,9 +51,11 @@ else:
     TRAITS = Registers = DebugBreakpoint = _Refusing()
     decode = address_of = erase_trap = record_steps = return_address = TRAITS
     all_registers = register_kind = widest_vector = width_of = TRAITS
+    JUMP_FLAGS = inverting_bits = TRAITS
 
 __all__ = [
-    "SUPPORTED", "TRAITS", "DebugBreakpoint", "Instruction", "MemoryUse", "RegisterUse",
-    "Registers", "Traits", "address_of", "all_registers", "decode", "erase_trap", "record_steps",
-    "register_kind", "return_address", "widest_vector", "width_of",
+    "JUMP_FLAGS", "SUPPORTED", "TRAITS", "DebugBreakpoint", "Instruction", "MemoryUse",
+    "RegisterUse", "Registers", "Traits", "address_of", "all_registers", "decode", "erase_trap",
+    "inverting_bits", "record_steps", "register_kind", "return_address", "widest_vector",
+    "width_of",
 ]  # fmt: skip

@@ -50,6 +50,7 @@ class Instruction:
     memory: tuple[MemoryUse, ...]
     element: str | None  # float64 or float32 where the instruction computes with them
     scalar: bool  # it computes with the lowest element of its registers only
+    branches: bool  # it is a jump, a call or a return
     run_over: bool  # one single step is not enough or leaves a trace: run past it
 
     @property
@@ -63,6 +64,8 @@ class Traits:
     """One processor architecture under Linux."""
 
     instruction_pointer: str
+    flags_register: str
+    flags: int  # bits of that register which instructions read and write
     vector_bits: int  # no vector register is wider
     breakpoint: bytes  # software breakpoint instruction
     breakpoint_advance: int  # bytes by which the instruction pointer is past it at the trap

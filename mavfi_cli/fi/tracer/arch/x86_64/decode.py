@@ -65,6 +65,7 @@ _FLAG_WRITES = {
 }
 _ZEROING = re.compile(r"v?p?(xor|sub)([bwdq]|p[sd])?$|v?xorp[sd]$|vpxor[dq]$")
 _NO_ACCESS = ("lea", "nop", "prefetch")
+_BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
 _CALL_READS = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9")
 
 _engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
@@ -102,6 +103,7 @@ def _decode(code: bytes, address: int) -> Instruction | None:
         memory=(*_memory(found), *_stack(found)),
         element=_element(found.mnemonic),
         scalar=found.mnemonic.endswith(("sd", "ss")),
+        branches=bool(_BRANCHES.intersection(found.groups)),
         run_over=_run_over(found.mnemonic),
     )
 

@@ -86,6 +86,8 @@ _X87 = re.compile(r"(st|mm|k)(\d)$")
 
 TRAITS = Traits(
     instruction_pointer="rip",
+    flags_register="rflags",
+    flags=sum(1 << bit for bit in FLAG_BITS.values()),
     vector_bits=512,
     breakpoint=b"\xcc",
     breakpoint_advance=1,
