@@ -307,4 +307,4 @@ def ask_vehicle(config: MissionConfig) -> None:
         try:
             VehicleInProcess(config, Path(folder)).end()
         except MavfiError as error:
-            raise VehicleProcessError(str(error)) from None
+            raise VehicleProcessError(str(error), error.exit_code) from None

@@ -107,13 +107,15 @@ def naming(labels: Mapping[str, Label]) -> Iterator[None]:
     """Make a known error inside name the setting that it concerns.
 
     Raises:
-        ConfigError: instead of any MavfiError.
+        ConfigError: instead of any MavfiError, with its exit code.
     """
     try:
         yield
     except MavfiError as error:
         place = f" (in {label_text(labels)})" if labels else ""
-        raise ConfigError(f"{error}{place}") from None
+        named = ConfigError(f"{error}{place}")
+        named.exit_code = error.exit_code
+        raise named from None
 
 
 class ResultState(Enum):

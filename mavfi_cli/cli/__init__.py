@@ -84,9 +84,6 @@ def main() -> NoReturn:
     except click.ClickException as error:
         click.echo(f"error: {error.format_message()}", err=True)
         sys.exit(error.exit_code)
-    except UnknownName as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(2)
     except (Interrupted, KeyboardInterrupt, click.Abort) as error:
         click.echo(str(error) or "interrupted", err=True)
         sys.exit(130)
@@ -95,7 +92,7 @@ def main() -> NoReturn:
         sys.exit(1)
     except MavfiError as error:
         click.echo(f"error: {error}", err=True)
-        sys.exit(1)
+        sys.exit(error.exit_code)
     sys.exit(code if isinstance(code, int) else 0)
 
 

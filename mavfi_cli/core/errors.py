@@ -1,7 +1,7 @@
 """The error tree. Each error takes the objects it is about and composes its own message.
 
 MavfiError                      a known error; printed in one line, exit code 1
-├── UnknownName                 a world, planner, vehicle ... that does not exist
+├── UnknownName                 a world, planner, vehicle ... that does not exist; exit code 2
 ├── BrokenPlugIn                a planner or detector of another package that does not load
 ├── ConfigError                 a file or value that cannot be used
 │   └── UnknownKey              a TOML key that no setting has
@@ -40,7 +40,9 @@ E = TypeVar("E", bound=Enum)
 
 
 class MavfiError(Exception):
-    """A known error. The command line prints it in one line and exits with code 1."""
+    """A known error. The command line prints it in one line and exits with `exit_code`."""
+
+    exit_code = 1
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
@@ -49,8 +51,11 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
         if each.endswith(f"/{name}"):
             return each
     spelled = {each.lower(): each for each in known}
-    matches = difflib.get_close_matches(name.lower(), list(spelled), n=1, cutoff=0.5)
-    return spelled[matches[0]] if matches else None
+    alike = [each for each in spelled if each[:1] == name[:1].lower()]
+    for names, cutoff in ((spelled, 0.6), (alike, 0.5)):
+        if matches := difflib.get_close_matches(name.lower(), names, n=1, cutoff=cutoff):
+            return spelled[matches[0]]
+    return None
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:
@@ -61,7 +66,9 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
 
 
 class UnknownName(MavfiError):
-    """A name that does not exist. Suggests the nearest known name."""
+    """A name that does not exist: wrong usage. Suggests the nearest known name."""
+
+    exit_code = 2
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         super().__init__(f"unknown {kind} {name!r}; {_suggestion(name, known)}")
@@ -176,7 +183,11 @@ class CannotLift(MavfiError):
 
 
 class VehicleProcessError(MavfiError):
-    """The simulated vehicle could not start, or ended early."""
+    """The simulated vehicle could not start, or ended early; its exit code is passed on."""
+
+    def __init__(self, problem: str, exit_code: int = 1) -> None:
+        super().__init__(problem)
+        self.exit_code = exit_code
 
 
 class ModelError(MavfiError):

@@ -63,7 +63,7 @@ sys.exit(0 if height_m > 1.0 else 1)
 _ALLOW_PTRACE = (
     "allow ptrace: sysctl kernel.yama.ptrace_scope=1; in a container --cap-add SYS_PTRACE"
 )
-_EXTRAS = {"train": "torch", "cluster": "distributed", "view": "rerun"}
+_EXTRAS = {"train": "torch", "cluster": "distributed"}
 
 
 def check_machine() -> Iterator[Check]:

@@ -129,7 +129,7 @@ class VehicleProcess:
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         told = [line for line in lines if line.startswith("error: ")]
         if told:
-            return VehicleProcessError(told[-1].removeprefix("error: "))
+            return VehicleProcessError(told[-1].removeprefix("error: "), code)
         killed = code < 0
         how = f"was killed by {signal.Signals(-code).name}" if killed else f"ended with code {code}"
         last = f": {lines[-1]}" if lines else ""

@@ -154,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     except MavfiError as error:
         click.echo(f"error: {error}", err=True)
-        return 1
+        return error.exit_code
     return 0
 
 

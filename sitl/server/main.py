@@ -42,13 +42,13 @@ def _write_briefing(simulation: Simulation, folder: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m sitl`; return the exit code. A known error is one line on stderr and 1."""
+    """Run `python -m sitl`; return the exit code. A known error is one line on stderr."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
     try:
         _serve(options)
     except MavfiError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the one boundary
-        return 1
+        return error.exit_code
     return 0
 
 

@@ -235,7 +235,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except MavfiError as error:
         click.echo(f"error: {error}", err=True)
-        return 1
+        return error.exit_code
     return 0
 
 

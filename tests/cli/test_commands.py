@@ -151,13 +151,13 @@ def test_world_make_check_draw_a_file_of_ones_own(command_line, tmp_path):
 
 def test_world_errors_pass_through(command_line):
     code, out, err = command_line("world", "check", "denze")
-    assert (code, out) == (1, "")
+    assert (code, out) == (2, "")
     assert err.startswith("error: unknown world 'denze'; did you mean 'dense'?")
 
 
 def test_sitl_errors_pass_through(command_line):
     code, out, err = command_line("sitl", "--vehicle", "sollo")
-    assert (code, out) == (1, "")
+    assert (code, out) == (2, "")
     assert err.startswith("error: unknown vehicle 'sollo'; did you mean 'solo'?")
     assert command_line("sitl", "--speed", "-1")[0] == 2
 

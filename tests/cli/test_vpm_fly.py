@@ -142,7 +142,7 @@ def test_bad_input_of_flights_is_one_line(command_line, tmp_path, lawn, argument
     worlds = () if "--world" in arguments else ("--world", "lawn.toml")
     vehicles = () if "--vehicle" in arguments else ("--vehicle", "spark")
     code, out, err = command_line("vpm", "--fly", *arguments, *worlds, *vehicles, "--out", "out")
-    assert (code, out) == (2 if said.startswith("unknown vehicle") else 1, "")
+    assert (code, out) == (2 if said.startswith("unknown ") else 1, "")
     (line,) = err.splitlines()
     assert line.startswith("error: ")
     assert said in line
