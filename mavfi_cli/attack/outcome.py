@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import signal
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from mavfi_cli.stats.shares import Share, design_effect, wilson
+from mavfi_cli.stats.clusters import Sampled, clustered_share
+from mavfi_cli.stats.shares import Share
 
 
 class RunOutcome(Enum):
@@ -30,26 +32,37 @@ class RunOutcome(Enum):
 Window = tuple[Hashable, int]  # stratum and number of the sampled window that a run hit
 
 
-def shares(
-    outcomes: Iterable[RunOutcome], windows: Iterable[Window | None] = ()
-) -> dict[RunOutcome, Share]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Struck:
+    """The sampled windows that runs hit, and how many windows of each stratum were sampled."""
+
+    windows: Sequence[Window | None]  # None: the run's instruction is not from a sample
+    sampled: Sampled
+
+
+def shares(outcomes: Iterable[RunOutcome], struck: Struck | None = None) -> dict[RunOutcome, Share]:
     """Share of each outcome in the *injected* runs; not injected ones are a share of all runs.
 
     Args:
         outcomes: the outcome of each run.
-        windows: the window of each run if its instruction is from a sample of windows, else None.
-            The similarity of runs in a window widens the intervals.
+        struck: if windows are a sample: the spread between them widens the intervals.
     """
     ended = list(outcomes)
-    hit = list(windows) or [None] * len(ended)
-    injected = [(o, w) for o, w in zip(ended, hit, strict=True) if o is not RunOutcome.NOT_INJECTED]
+    injected = [outcome is not RunOutcome.NOT_INJECTED for outcome in ended]
+    everything = [True] * len(ended)
     found = {}
     for outcome in RunOutcome:
-        of = list(zip(ended, hit, strict=True)) if outcome is RunOutcome.NOT_INJECTED else injected
-        is_it = [each is outcome for each, _ in of]
-        effect = design_effect(is_it, [window for _, window in of])
-        found[outcome] = wilson(sum(is_it), len(of), design_effect=effect)
+        of = everything if outcome is RunOutcome.NOT_INJECTED else injected
+        found[outcome] = share_of([each is outcome for each in ended], of, struck)
     return found
+
+
+def share_of(hits: Sequence[bool], of: Sequence[bool], struck: Struck | None = None) -> Share:
+    """The share of hits in the runs `of` which it is, with its 95 % interval."""
+    windows = [None] * len(hits) if struck is None else struck.windows
+    runs = [(hit, window) for hit, counts, window in zip(hits, of, windows, strict=True) if counts]
+    sampled = {} if struck is None else struck.sampled
+    return clustered_share([hit for hit, _ in runs], [window for _, window in runs], sampled)
 
 
 def shares_to_json(found: Mapping[RunOutcome, Share]) -> dict[str, dict[str, Any]]:

@@ -5,9 +5,13 @@ the whole run. Each execution of a *marker*, such as a function's entry, begins 
 It ends in front of the next execution of any marker, or with the run. The code before the first
 marker is a window too. The windows of one marker are a stratum. Some windows of each stratum are
 drawn uniformly and stepped, so every executed instruction in scope is as likely to be in the sample
-as all others of its stratum. If windows are short, more are drawn: as many as fit into `ENOUGH`
-instructions by the length of the first ones. A stratum is then drawn in proportion to its windows
-times their mean length, and an instruction uniformly from its stepped windows.
+as all others of its stratum.
+
+A few windows are stepped first: the *pilot*. Its lengths decide how many of the other windows are
+stepped, as many as fit into `ENOUGH` instructions. A sample whose size depends on its own lengths
+would be biased, so the pilot is a stratum of its own, which is complete, and only the other windows
+estimate the rest. A stratum is drawn in proportion to its windows times their mean length, and an
+instruction uniformly from its stepped windows.
 """
 
 from __future__ import annotations
@@ -49,6 +53,7 @@ def profile_run(
     rng: np.random.Generator,
     *,
     markers: Sequence[Location] = (),
+    end: Location | None = None,
     windows: int = 1,
     enough: int = ENOUGH,
     limit: int = STEPS,
@@ -58,25 +63,29 @@ def profile_run(
 
     Args:
         markers: instructions in scope; none for the whole run.
-        windows: the least number of windows of each marker to step.
-        enough: more windows are stepped while they have at most this many instructions together.
+        end: nothing is profiled from the first execution of this instruction in scope on.
+        windows: the least number of windows of each marker to step, after half as many as a pilot.
+        enough: more windows are stepped while they have at most this many instructions together,
+            by the length of the pilot's.
 
     Raises:
         TargetError: no instruction in scope executes, or the run does not repeat itself.
         WindowTooLong: too many instructions.
     """
     begun = time.perf_counter()
-    first = _Stepper(place, None, tuple(markers), limit, watch)
-    strata = [first.step(_FIRST, 1)]
+    ends = (*markers, *([end] if end else []))
+    strata = [_Stepper(place, None, ends, limit, watch).step(_FIRST, 1)]
     for marker in markers:
-        stepper = _Stepper(place, marker, tuple(markers), limit, watch)
-        if count := stepper.count():
-            order = rng.permutation(count) + 1
-            stratum = stepper.step(order[:windows], count)
-            fit = enough * windows // max(1, stratum.executed)
-            if windows < min(fit, count):
-                stratum = stepper.step(order[:fit], count)
-            strata.append(stratum)
+        stepper = _Stepper(place, marker, ends, limit, watch)
+        order = rng.permutation(stepper.count()) + 1
+        pilot, others = np.split(order, [max(1, windows // 2)])
+        if not len(order):
+            continue
+        known = stepper.step(pilot, len(pilot))
+        fit = enough * len(pilot) // max(1, known.executed) - len(pilot)
+        strata.append(known)
+        if len(others):
+            strata.append(stepper.step(others[: max(windows, fit)], len(others)))
     strata = [stratum for stratum in strata if stratum.executed]
     if not strata:
         raise TargetError(place.name, "executes nothing that may be hit")

@@ -6,6 +6,7 @@ where it runs repeatedly from the same memory. Any class with these methods can 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Strategy, Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+from mavfi_cli.stats.clusters import Total, estimated_total
 
 Watch = Callable[[int], None]  # called with the instructions stepped since the last call
 
@@ -64,7 +66,7 @@ class RunVerdict:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class TargetProfile:
     """The instructions that can be hit in one run, with what is needed to draw from them."""
 
@@ -90,9 +92,14 @@ class TargetProfile:
         return sum(stratum.executed for stratum in self.strata)
 
     @property
-    def instructions(self) -> float:
+    def instructions(self) -> Total:
         """Number of executed instructions in scope; estimated if the profile is not complete."""
-        return sum(stratum.instructions for stratum in self.strata)
+        return estimated_total(
+            [
+                ([len(segment.trace) for segment in stratum.segments], stratum.windows_in_run)
+                for stratum in self.strata
+            ]
+        )
 
     def code_at(self, address: int) -> bytes:
         """16 bytes of code."""
@@ -104,11 +111,25 @@ class TargetProfile:
     def window_of(self, record: Mapping[str, Any]) -> Window | None:
         """The sampled window of a fault; None if no sample of windows was taken."""
         first = record["trigger"][0]
-        for number, stratum in enumerate(self.strata):
-            at = stratum.marker
-            if at is not None and (at.object, at.offset) == (first["object"], first["offset"]):
-                return None if stratum.complete else (number, int(first["count"]))
-        return None
+        return self._sampled_windows.get((first["object"], first["offset"], first["count"]))
+
+    @functools.cached_property
+    def _sampled_windows(self) -> dict[tuple[str, int, int], Window]:
+        return {
+            (start.location.object, start.location.offset, start.count): (number, start.count)
+            for number in self.sampled
+            for segment in self.strata[number].segments
+            for start in segment.start[:1]
+        }
+
+    @property
+    def sampled(self) -> dict[int, int]:
+        """Stepped windows of each stratum of which not all were stepped, by its number."""
+        return {
+            number: len(stratum.segments)
+            for number, stratum in enumerate(self.strata)
+            if not stratum.complete
+        }
 
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
         """Draw one fault, uniformly over the executed instructions."""
@@ -129,18 +150,22 @@ class TargetProfile:
     def in_words(self) -> str:
         """How the population of faults was found, in words."""
         if self.complete:
-            return f"all {self.instructions:.0f} executed instructions in scope"
-        parts = []
+            return f"all {self.executed} executed instructions in scope"
+        windows: dict[str, list[int]] = {}
         for stratum in self.strata:
-            if stratum.marker is None:
-                parts.append("the beginning")
-                continue
-            name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
-            stepped = f"{len(stratum.segments)} of {stratum.windows_in_run}"
-            parts.append(f"{stepped} windows from {name}")
+            if stratum.marker is not None:
+                name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
+                counts = windows.setdefault(name, [0, 0])
+                counts[0] += len(stratum.segments)
+                counts[1] += stratum.windows_in_run
+        parts = [f"{some} of {all_} windows from {name}" for name, (some, all_) in windows.items()]
+        if len(windows) < len({stratum.marker for stratum in self.strata}):
+            parts.insert(0, "the beginning")
+        found = self.instructions
         return (
-            f"about {self.instructions:.3g} executed instructions in scope, by sample: "
-            f"{', '.join(parts)}; {self.executed} stepped"
+            f"about {found.total:.3g} executed instructions in scope (95 % interval "
+            f"{found.low:.3g} to {found.high:.3g}), by sample: {', '.join(parts)}; "
+            f"{self.executed} stepped"
         )
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
 from mavfi_cli.core.errors import ConfigError
-
-Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of similar runs within it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,34 +63,6 @@ def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
 def half_width(share: Share) -> float:
     """Half of the width of the interval."""
     return (share.high - share.low) / 2.0
-
-
-def design_effect(hits: Sequence[bool], clusters: Sequence[Cluster | None]) -> float:
-    """Variance of a share over that of as many independent runs; at least 1.
-
-    W. G. Cochran, Sampling Techniques, 3rd edition, 1977, sections 9A and 11: squared sums of
-    residuals of the clusters against their stratum's share, and the variance of how many runs fall
-    into each stratum.
-
-    Args:
-        clusters: stratum and cluster of each run; None for a run that stands for itself.
-    """
-    total = len(hits)
-    share = sum(hits) / total if total else 0.0
-    if not 0.0 < share < 1.0:
-        return 1.0
-    strata: dict[Hashable, dict[Hashable, list[bool]]] = {}
-    for number, (hit, place) in enumerate(zip(hits, clusters, strict=True)):
-        stratum, cluster = place or (None, number)
-        strata.setdefault(stratum, {}).setdefault(cluster, []).append(hit)
-    variance = 0.0
-    for members in strata.values():
-        size = sum(map(len, members.values()))
-        own = sum(map(sum, members.values())) / size
-        variance += size * (own - share) ** 2
-        squares = sum((sum(each) - own * len(each)) ** 2 for each in members.values())
-        variance += squares * len(members) / max(1, len(members) - 1)
-    return max(1.0, variance / (total * share * (1.0 - share)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -163,15 +163,16 @@ def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, mon
     monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
     (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
     plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
-    start, windows = runs.profile.strata
+    start, pilot, windows = runs.profile.strata
     assert start.marker is None
+    assert (len(pilot.segments), pilot.complete) == (1, True)
     assert (len(windows.segments), windows.complete) == (3, False)
     hit = {runs.profile.window_of(entry) for entry in runs.records} - {None}
-    assert hit <= {(1, segment.start[0].count) for segment in windows.segments}
+    assert hit <= {(2, segment.start[0].count) for segment in windows.segments}
     assert len(hit) > 1
     (kernel,) = summarise(plan, [runs])["kernels"]
-    count = windows.windows_in_run
-    assert f"by sample: the beginning, 3 of {count} windows from collide" in kernel["population"]
+    count = 1 + windows.windows_in_run
+    assert f"by sample: the beginning, 4 of {count} windows from collide" in kernel["population"]
     assert all(not replay.differs for replay in replay_runs(tmp_path))
 
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, run_campaign
-from mavfi_cli.attack.outcome import RunOutcome, shares
+from mavfi_cli.attack.outcome import RunOutcome, Struck, shares
 from mavfi_cli.attack.program import OutputComparison, ProgramTarget, Workplace
 from mavfi_cli.attack.target import RunLimits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
@@ -33,7 +33,8 @@ from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism
 from mavfi_cli.report.tables.attacks import PROGRAM_COLUMNS, runs_csv, summarise_program
-from mavfi_cli.stats.shares import design_effect, wilson
+from mavfi_cli.stats.clusters import design_effect
+from mavfi_cli.stats.shares import wilson
 
 QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
 
@@ -351,7 +352,8 @@ def test_independent_runs_count_in_full():
     assert design_effect([True] * 9, [("f", 1)] * 9) == 1.0
     half = [RunOutcome.SDC, RunOutcome.BENIGN] * 50
     alone = shares(half)[RunOutcome.SDC]
-    alike = shares(half, [("f", number % 2) for number in range(100)])[RunOutcome.SDC]
+    windows = Struck(windows=[("f", number % 2) for number in range(100)], sampled={"f": 2})
+    alike = shares(half, windows)[RunOutcome.SDC]
     assert alike.share == alone.share == 0.5
     assert alike.high - alike.low > 2.0 * (alone.high - alone.low)
 

@@ -1,5 +1,6 @@
 """Windows that markers cut a run into are the whole run, and a sample of them is a fair one."""
 
+import subprocess
 from collections import Counter
 
 import numpy as np
@@ -25,6 +26,20 @@ int main(void) { for (long i = 0; i < 4; i++) leaf(i); tree(3); printf("%ld\\n",
 """
 
 
+# 40 windows of 7 to 163 instructions, and 20 of another function.
+UNEVEN = """
+#include <stdio.h>
+volatile long sink;
+__attribute__((noinline)) void few(long i) { sink += i; }
+__attribute__((noinline)) void many(long i) { for (long k = 0; k < i; k++) sink += k; }
+int main(void) {
+    for (long i = 0; i < 40; i++) { many((i * 23) % 41); if (i % 2) few(i); }
+    printf("%ld\\n", sink);
+    return 0;
+}
+"""
+
+
 @pytest.fixture
 def place(native_program):
     """Function from a program's name to a place where it runs."""
@@ -44,14 +59,23 @@ def place(native_program):
 @pytest.fixture
 def recursive(place, native_program):
     """A place of a program whose functions call themselves and each other."""
-    import subprocess
-
     folder = native_program("counting").parent
     source = folder / "recursive.c"
     source.write_text(RECURSIVE)
     path = folder / "recursive"
     subprocess.run(["gcc", "-O1", "-o", str(path), str(source)], check=True)
     return place("recursive")
+
+
+@pytest.fixture
+def known_length(place, native_program):
+    """A place of a short program, with the functions at which its windows begin."""
+    folder = native_program("counting").parent
+    source = folder / "uneven.c"
+    source.write_text(UNEVEN)
+    subprocess.run(["gcc", "-O1", "-o", str(folder / "uneven"), str(source)], check=True)
+    where = place("uneven")
+    return where, functions(where, "few", "many")
 
 
 def functions(place, *names):
@@ -79,6 +103,7 @@ def test_all_windows_of_one_marker_are_the_whole_run(place, mechanism):
     cut = profile_run(where, rng, markers=functions(where, "body"), windows=25)
     assert cut.complete
     beginning, windows = in_order(cut)
+    windows.sort(key=lambda segment: segment.start[0].count)
     assert [segment.start[0].count for segment in windows] == list(range(1, 26))
     traces = [segment.trace for segment in windows]
     assert np.array_equal(np.concatenate([beginning, *traces]), whole)
@@ -90,9 +115,11 @@ def test_windows_of_several_markers_share_the_run_without_gap_or_overlap(recursi
     whole = profile_run(recursive, rng)
     cut = profile_run(recursive, rng, markers=functions(recursive, "leaf", "tree"), windows=100)
     assert cut.complete
-    counts = [stratum.windows_in_run for stratum in cut.strata]
-    assert counts == [1, 4 + 7, 15]
-    assert cut.instructions == cut.executed == whole.executed
+    counts = Counter()
+    for stratum in cut.strata:
+        counts[stratum.marker] += stratum.windows_in_run
+    assert list(counts.values()) == [1, 4 + 7, 15]
+    assert cut.instructions.total == cut.executed == whole.executed
 
     def addresses(profile):
         found = Counter()
@@ -115,17 +142,21 @@ def test_calls_of_a_function_that_calls_itself_are_whole_calls(recursive):
     assert [segment.start[0].count for segment in stratum.segments] == list(range(1, 16))
 
 
-def test_a_sample_estimates_the_run(recursive):
-    """The mean over many samples is the run: no instruction is left out or counted twice."""
-    markers = functions(recursive, "leaf", "tree")
-    rng = np.random.default_rng(3)
-    whole = profile_run(recursive, rng).executed
-    samples = [profile_run(recursive, rng, markers=markers, windows=4, enough=0) for _ in range(40)]
-    assert not any(sample.complete for sample in samples)
-    estimates = np.array([sample.instructions for sample in samples])
+def test_a_sample_estimates_the_run(known_length):
+    """Over many seeds: on the average the true length, and in the interval as often as it says."""
+    where, markers = known_length
+    length = profile_run(where, np.random.default_rng(0)).executed
+    samples = [
+        profile_run(where, np.random.default_rng(seed), markers=markers, windows=4, enough=300)
+        for seed in range(60)
+    ]
+    assert len({sample.executed for sample in samples}) > 30
+    found = [sample.instructions for sample in samples]
+    estimates = np.array([each.total for each in found])
     error = estimates.std(ddof=1) / np.sqrt(len(estimates))
-    assert error < 0.1 * whole
-    assert abs(estimates.mean() - whole) < 4.0 * error
+    assert error < 0.05 * length
+    assert abs(estimates.mean() - length) < 3.0 * error
+    assert np.mean([each.low <= length <= each.high for each in found]) >= 0.85
 
 
 def test_short_windows_are_stepped_until_it_is_enough(place):
@@ -133,7 +164,7 @@ def test_short_windows_are_stepped_until_it_is_enough(place):
     marker = functions(where, "body")
     profile = profile_run(where, np.random.default_rng(2), markers=marker, windows=3)
     assert profile.complete
-    assert profile.strata[1].windows_in_run == 400
+    assert sum(stratum.windows_in_run for stratum in profile.strata) == 1 + 400
 
 
 def test_faults_are_drawn_evenly_over_all_windows(recursive):

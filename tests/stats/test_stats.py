@@ -13,7 +13,6 @@ from mavfi_cli.stats.bootstrap import BLOCKS, FEW, LARGE, interval, mean, median
 from mavfi_cli.stats.paired import holm, mcnemar, sign_flips, worst_case
 from mavfi_cli.stats.shares import (
     cross_layer,
-    design_effect,
     failures_per_hour,
     half_width,
     missions_for_margin,
@@ -234,21 +233,3 @@ def test_wilson_against_scipy(count, total):
     theirs = stats.binomtest(count, total).proportion_ci(method="wilson")
     assert ours.low == pytest.approx(theirs.low, abs=1e-12)
     assert ours.high == pytest.approx(theirs.high, abs=1e-12)
-
-
-def test_runs_of_a_window_count_less_the_more_they_are_alike():
-    """Against the spread of the share over repeated samples of windows and of runs in them."""
-    rng = np.random.default_rng(4)
-    chances = rng.beta(0.5, 0.5, size=5000)  # of a crash, window by window
-
-    def campaign():
-        drawn = rng.choice(chances, size=20)
-        windows = rng.integers(20, size=400)
-        return rng.random(400) < drawn[windows], [("f", int(window)) for window in windows]
-
-    campaigns = [campaign() for _ in range(300)]
-    spread = np.var([hits.mean() for hits, _ in campaigns])
-    binomial = chances.mean() * (1.0 - chances.mean()) / 400
-    effects = [design_effect(hits.tolist(), windows) for hits, windows in campaigns]
-    assert spread / binomial > 5.0
-    assert np.mean(effects) == pytest.approx(spread / binomial, rel=0.2)

@@ -8,7 +8,14 @@ from typing import Any
 from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.outcome import RunOutcome, counted, shares, shares_to_json, signal_name
+from mavfi_cli.attack.outcome import (
+    RunOutcome,
+    Struck,
+    counted,
+    shares,
+    shares_to_json,
+    signal_name,
+)
 from mavfi_cli.report.tables.columns import blocks, csv_text
 
 SCHEMA = 1
@@ -26,8 +33,11 @@ _SHOWN = tuple(RunOutcome)
 def _counts(runs: TargetRuns) -> dict[str, Any]:
     """The counts of one target."""
     records, profile = runs.records, runs.profile
-    windows = [] if profile is None else [profile.window_of(entry) for entry in records]
-    found = shares((RunOutcome(entry["outcome"]) for entry in records), windows)
+    struck = None
+    if profile is not None:
+        windows = [profile.window_of(entry) for entry in records]
+        struck = Struck(windows=windows, sampled=profile.sampled)
+    found = shares((RunOutcome(entry["outcome"]) for entry in records), struck)
     return {
         "outcomes": shares_to_json(found),
         "crashes": counted(_crash(entry) for entry in _with(records, RunOutcome.CRASH)),
@@ -82,7 +92,7 @@ def _kernel(runs: TargetRuns) -> dict[str, Any]:
         "runs": len(records),
         "population": "moments of one call" if profile is None else profile.in_words(),
         "complete": None if profile is None else profile.complete,
-        "instructions": None if profile is None else profile.instructions,
+        "instructions": None if profile is None else profile.instructions.total,
         "scope": runs.context["scope"],
         "golden": {
             "sha256": runs.golden.sha256,
