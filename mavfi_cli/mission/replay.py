@@ -131,13 +131,15 @@ def same_file(this: Path, other: Path) -> bool:
 
 
 def largest_deviation_m(this: Run, other: Run) -> float:
-    """Return the largest distance between two vehicles at equal stamps, m."""
-    if this.trace is None or other.trace is None:
+    """Return the largest distance between two vehicles at equal stamps, m; NaN without a trace.
+
+    A vehicle whose flight has ended stays where it is.
+    """
+    if not (this.trace and other.trace):
         return float("nan")
-    rows = min(this.trace.num_rows, other.trace.num_rows)
-    places = [
-        np.column_stack([run.trace[c].slice(0, rows).to_numpy() for c in ("x_m", "y_m", "z_m")])
-        for run in (this, other)
-        if run.trace is not None
-    ]
+    rows = max(this.trace.num_rows, other.trace.num_rows)
+    places = []
+    for trace in (this.trace, other.trace):
+        place = np.column_stack([trace[name].to_numpy() for name in ("x_m", "y_m", "z_m")])
+        places.append(np.pad(place, ((0, rows - len(place)), (0, 0)), mode="edge"))
     return float(np.linalg.norm(places[0] - places[1], axis=1).max(initial=0.0))

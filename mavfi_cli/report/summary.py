@@ -294,7 +294,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
     lines = [
         f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
         f"{_pair(parting.this, parting.other)}",
-        f"            at most {largest_deviation_m(run, golden):.2f} m off the golden path",
+        f"            at most {largest_deviation_m(run, golden):.2f} m from the golden vehicle",
     ]
     our_s, their_s = (each.quality_of_flight["flight_time_s"] for each in (ours, theirs))
     if our_s and their_s:

@@ -12,7 +12,13 @@ from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.replay import config_of, differing_results, first_difference, same_file
+from mavfi_cli.mission.replay import (
+    config_of,
+    differing_results,
+    first_difference,
+    largest_deviation_m,
+    same_file,
+)
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.report.summary import difference_lines
 from mavfi_cli.spec.fault import FaultConfig
@@ -60,6 +66,18 @@ def test_golden_and_faulty_flight_part_at_the_strike(sideways):
         "name": "setpoint", "stamp_s": strike["stamp_s"], "state": "command_vx",
     }  # fmt: skip
     assert json.loads(sideways.folder.fault.read_text()) == fault
+
+
+def test_a_vehicle_whose_flight_has_ended_stays_where_it_is(sideways):
+    """Else a fault that sends the vehicle far away late would seem harmless."""
+    rows = sideways.trace.num_rows // 2
+    cut = replace(sideways, trace=sideways.trace.slice(0, rows))
+    flown = [sideways.trace[name].to_numpy()[rows - 1 :] for name in ("x_m", "y_m", "z_m")]
+    farthest_m = max(math.dist(place, [p[0] for p in flown]) for place in zip(*flown, strict=True))
+    assert farthest_m > 1.0
+    assert largest_deviation_m(sideways, cut) == pytest.approx(farthest_m)
+    assert largest_deviation_m(cut, sideways) == pytest.approx(farthest_m)
+    assert math.isnan(largest_deviation_m(sideways, replace(cut, trace=None)))
 
 
 def test_a_fault_repeats_to_the_byte(sideways, tmp_path):
