@@ -77,7 +77,7 @@ class Point:
                     if name in _DETECTOR}  # fmt: skip
         if detector and "name" not in detector:
             raise ConfigError(f"{', '.join(sorted(detector))}: without a detector")
-        if detector:
+        if detector and detector["name"] != "none":
             mission["detector"] = detector
         return structure(mission, MissionConfig)
 

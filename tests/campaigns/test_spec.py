@@ -114,6 +114,17 @@ def test_detectors_and_what_they_protect():
     assert {m.config.fault for m in protected} == {faulty.config.fault}
 
 
+def test_the_detector_none_is_no_detector():
+    text = """
+    [[setting]]
+    stage = "control"
+    detector = ["none", "gad"]
+    """
+    without, watched = spec_of(text).missions()
+    assert (without.config.detector, watched.config.detector.name) == (None, "gad")
+    assert (without.config.fault, without.labels["detector"]) == (watched.config.fault, "none")
+
+
 def test_a_stack_is_a_factor_as_any_other():
     text = """
     [factors]
