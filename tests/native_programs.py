@@ -31,6 +31,23 @@ int main(int c, char **v) {
     printf("%ld %.17g\\n", sink, sum);
     return 0;
 }""",
+    # Each way in which a detour moves an instruction: relative to rip, jumps, calls, repeated ones,
+    # and blocks that are too short for a long jump.
+    "flows": r"""
+#include <stdio.h>
+long cell = 3; char from[64] = "0123456789", into[64];
+__attribute__((naked, noinline)) long flows(void) {
+    __asm__ volatile(
+        "mov $400, %r8d\nxor %eax, %eax\njmp 4f\n"
+        "1: dec %r8d\njz 3f\n"
+        "4: add cell(%rip), %rax\ntest $1, %al\njne 1b\n"
+        "nop\ncall 5f\nmov $8, %ecx\nlea from(%rip), %rsi\nlea into(%rip), %rdi\n"
+        "rep movsb\njmp 1b\n"
+        "3: ret\n"
+        "ud2\n.nops 16\n"
+        "5: imul $5, %rax, %rax\npushq %rax\nadd $8, %rsp\nret\n");
+}
+int main(void) { printf("%ld %s\n", flows(), into); return 0; }""",
     # Callbacks from libc into the program; every comparison is in scope.
     "sorting": """
 #include <stdio.h>

@@ -17,22 +17,25 @@ instruction uniformly from its stepped windows.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.attack.target import AttackPlace, TargetProfile, Watch
+from mavfi_cli.attack.target import AttackPlace, TargetProfile, Watch, code_of
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer.counted import CountedRun
 from mavfi_cli.fi.tracer.fault import CountedStop
-from mavfi_cli.fi.tracer.image import Location, short_name
+from mavfi_cli.fi.tracer.image import Image, Location, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Segment, Stratum, record_window
 from mavfi_cli.fi.tracer.tracee import Tracee
 
 STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
+_NOTHING = "executes nothing that may be hit"
+_CHECKED = 4  # instructions whose counts are checked, besides the most executed
 _FIRST = np.array([1])
 
 
@@ -88,7 +91,7 @@ def profile_run(
             strata.append(stepper.step(others[: max(windows, fit)], len(others)))
     strata = [stratum for stratum in strata if stratum.executed]
     if not strata:
-        raise TargetError(place.name, "executes nothing that may be hit")
+        raise TargetError(place.name, _NOTHING)
     return _profile(place, strata, begun)
 
 
@@ -137,6 +140,65 @@ def profile_calls(
     return _profile(place, [steppers[which].step(chosen, sum(counts))], begun)
 
 
+def profile_counted(
+    place: AttackPlace,
+    counts: Callable[[Sequence[str]], Mapping[str, Mapping[int, int]]],
+    begun: float,
+) -> TargetProfile:
+    """The profile of a whole run whose executions have been counted.
+
+    Args:
+        counts: function from the paths of objects to the executions of each linked address.
+        begun: when the counting began, `time.perf_counter`.
+
+    Raises:
+        TargetError: no instruction in scope executes.
+    """
+    image, code, scope = _code(place)
+    objects = [image.named(name) for name in scope.objects]
+    found = counts([loaded.path for loaded in objects if loaded.path is not None])
+    executions = {
+        loaded.bias + offset: count
+        for loaded in objects
+        for offset, count in found.get(loaded.path or "", {}).items()
+        if loaded.bias + offset in scope
+    }
+    if not executions:
+        raise TargetError(place.name, _NOTHING)
+    run = CountedRun.of(executions, lambda address: code_of(code, address))
+    cost_s = time.perf_counter() - begun
+    return TargetProfile(counted=run, image=image, code=code, cost_s=cost_s)
+
+
+def require_counts(place: AttackPlace, profile: TargetProfile, rng: np.random.Generator) -> None:
+    """Check some counts in runs of the place: the largest, and others in proportion to them.
+
+    Raises:
+        TargetError: an instruction is executed more or less often.
+    """
+    run = profile.counted
+    assert run is not None
+    drawn = rng.choice(len(run.counts), size=_CHECKED, p=run.reached / run.executed)
+    for index in sorted({int(np.argmax(run.reached)), *drawn.tolist()}):
+        if run.reached[index] < run.counts[index]:
+            continue
+        count, address = int(run.counts[index]), int(run.addresses[index])
+        with _started(place) as tracee:
+            stages = run.stages(index, count, profile.image.locate)
+            reached = all(
+                tracee.run_to(profile.image.address(each.location), each.count, each.detour)
+                for each in stages
+            )
+            more = reached and tracee.run_to(address, 2)
+        if more or not reached:
+            raise TargetError(
+                place.name,
+                f"executes {profile.image.locate(address)} {'more' if more else 'less'} often than "
+                f"the {count} times that callgrind counts: its way depends on the processor, on "
+                "addresses or on time; name a function or other objects",
+            )
+
+
 def function_of(place: AttackPlace, name: str) -> Location:
     """Find the entry of a function in scope.
 
@@ -159,13 +221,17 @@ def _started(place: AttackPlace) -> Iterator[Tracee]:
 
 
 def _profile(place: AttackPlace, strata: Iterable[Stratum], begun: float) -> TargetProfile:
+    image, code, _ = _code(place)
+    cost_s = time.perf_counter() - begun
+    return TargetProfile(strata=tuple(strata), image=image, code=code, cost_s=cost_s)
+
+
+def _code(place: AttackPlace) -> tuple[Image, tuple[tuple[int, bytes], ...], Scope]:
     with _started(place) as tracee:
         image = place.image(tracee)
-        spans = place.scope(image).spans
-        code = tuple((s.start, tracee.memory.read(s.start, len(s) + 16)) for s in spans)
-    return TargetProfile(
-        strata=tuple(strata), image=image, code=code, cost_s=time.perf_counter() - begun
-    )
+        scope = place.scope(image)
+        code = tuple((s.start, tracee.memory.read(s.start, len(s) + 16)) for s in scope.spans)
+    return image, code, scope
 
 
 @dataclass(frozen=True, slots=True)

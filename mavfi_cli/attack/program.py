@@ -1,13 +1,11 @@
-"""A user's program as a target: its start, its golden run, and the judgement of its runs.
+"""A user's program as a target: its start, golden run and profile, and the judgement of its runs.
 
-Standard output and files are compared with those of the golden run.
+A program that is not short is profiled by exact execution counts.
 """
 
 from __future__ import annotations
 
-import math
 import os
-import re
 import resource
 import shutil
 import tempfile
@@ -21,9 +19,16 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
-from mavfi_cli.attack.profile import function_of, profile_calls, profile_run
+from mavfi_cli.attack.comparison import OutputComparison, compared, joined
+from mavfi_cli.attack.counts import callgrind, read_counts, run_counted
+from mavfi_cli.attack.profile import (
+    function_of,
+    profile_calls,
+    profile_counted,
+    profile_run,
+    require_counts,
+)
 from mavfi_cli.attack.target import (
-    Difference,
     Golden,
     RunLimits,
     RunVerdict,
@@ -32,162 +37,12 @@ from mavfi_cli.attack.target import (
     digest,
     judged,
 )
-from mavfi_cli.core.errors import ConfigError, TargetError
+from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
-
-STDOUT = "stdout"
-_SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OutputComparison:
-    """The compared outputs, and how they are compared.
-
-    Attributes:
-        files: compared files, relative to the folder in which the program runs.
-        stdout: whether standard output is compared too.
-        tolerance: largest relative difference of a number that still counts as equal.
-        ignored: patterns (bytes); a line that contains one is left out.
-    """
-
-    files: tuple[str, ...] = ()
-    stdout: bool = True
-    tolerance: float = 0.0
-    ignored: tuple[bytes, ...] = ()
-
-    @classmethod
-    def of(
-        cls, outputs: Iterable[str], *, tolerance: float = 0.0, ignored: Iterable[str] = ()
-    ) -> OutputComparison:
-        """Make a comparison from options of the command line.
-
-        Args:
-            outputs: each `stdout`, or `file:PATH` relative to the program's folder; an empty list
-                means standard output.
-
-        Raises:
-            ConfigError: an output is neither of the two, a path leads out of the program's
-                folder, or a pattern is not a regular expression.
-        """
-        chosen = tuple(dict.fromkeys(outputs)) or (STDOUT,)
-        return cls(
-            files=tuple(_inside(text) for text in chosen if text != STDOUT),
-            stdout=STDOUT in chosen,
-            tolerance=tolerance,
-            ignored=tuple(_pattern(text) for text in ignored),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """The entries that results depend on."""
-        names: list[str | None] = [None] if self.stdout else []
-        names += self.files
-        told: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
-        if self.ignored:
-            told["ignored"] = [pattern.decode() for pattern in self.ignored]
-        return told | {"tolerance": self.tolerance}
-
-    def parts(self, folder: Path, stdout: Path) -> dict[str, bytes | None]:
-        """Read a run's outputs, by name; None for a file that it did not write."""
-        found: dict[str, bytes | None] = {}
-        if self.stdout:
-            found[STDOUT] = self._kept(stdout.read_bytes())
-        for name in self.files:
-            data = _read_inside(folder, name)
-            found[name] = None if data is None else self._kept(data)
-        return found
-
-    def _kept(self, data: bytes) -> bytes:
-        if not self.ignored:
-            return data
-        lines = re.findall(rb"[^\n]*\n|[^\n]+", data)
-        return b"".join(
-            line for line in lines if not any(re.search(each, line) for each in self.ignored)
-        )
-
-    def same(self, golden: bytes, output: bytes) -> bool:
-        """True if two outputs are equal, or differ only in numbers within the tolerance."""
-        if golden == output:
-            return True
-        size = magnitude(golden, output) if self.tolerance > 0.0 else None
-        return size is not None and size <= self.tolerance
-
-
-def _joined(parts: dict[str, bytes | None]) -> bytes:
-    """Join all outputs: a single one as it is, several each after its name."""
-    pieces = [b"\0missing" if data is None else data for data in parts.values()]
-    if len(pieces) == 1:
-        return pieces[0]
-    names = (f"== {name}\n".encode() for name in parts)
-    return b"".join(name + piece for name, piece in zip(names, pieces, strict=True))
-
-
-def _inside(text: str) -> str:
-    kind, _, name = text.partition(":")
-    if kind != "file" or not name:
-        raise ConfigError(f"cannot compare {text!r}; known: stdout, file:PATH", key="compare")
-    path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or not path.parts:
-        raise ConfigError(
-            f"{name!r} leads out of the scratch folder in which the program runs: name a file "
-            "relative to it, without '..'",
-            key="compare",
-        )
-    return str(path)
-
-
-def _pattern(text: str) -> bytes:
-    try:
-        re.compile(text.encode())
-    except re.error as error:
-        raise ConfigError(
-            f"{text!r} is no regular expression: {error}", key="ignore_lines"
-        ) from None
-    return text.encode()
-
-
-def _read_inside(folder: Path, name: str) -> bytes | None:
-    """Read a regular file below the folder; None if a link leads out of it."""
-    path = (folder / name).resolve()
-    if not path.is_relative_to(folder.resolve()) or not path.is_file():
-        return None
-    return path.read_bytes()
-
-
-def _compared(golden: bytes, output: bytes) -> Difference | None:
-    """The difference between the numbers of two texts; None if anything else differs."""
-    size = magnitude(golden, output)
-    return None if size is None else Difference(relative=size, absolute=size)
-
-
-def magnitude(golden: bytes, output: bytes) -> float | None:
-    """Largest relative difference between the numbers of two texts.
-
-    It is relative to the golden number's size, absolute if that is 0, and infinite if one of the
-    two is not finite and they differ. None if the texts differ in more than their numbers.
-    """
-    ours, theirs = _SEPARATORS.split(golden), _SEPARATORS.split(output)
-    if len(ours) != len(theirs):
-        return None
-    largest = 0.0
-    for a, b in zip(ours, theirs, strict=True):
-        size = 0.0 if a == b else _size(a, b)
-        if size is None or math.isinf(size):
-            return size
-        largest = max(largest, size)
-    return largest
-
-
-def _size(golden: bytes, other: bytes) -> float | None:
-    try:
-        expected, got = float(golden), float(other)
-    except ValueError:
-        return None
-    if not (math.isfinite(expected) and math.isfinite(got)):
-        return math.inf
-    return abs(got - expected) / (abs(expected) or 1.0)
 
 
 def absolute_arguments(
@@ -206,6 +61,9 @@ def absolute_arguments(
             yield argument
         else:
             yield str(path.resolve())
+
+
+_SHORT = 100_000  # instructions that are stepped rather than counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -265,9 +123,11 @@ class Workplace:
 
     def __init__(self, target: ProgramTarget) -> None:
         self.target, self.limits = target, target.limits
+        self._golden: Golden | None = None
         scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
         self._remove = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
         self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
+        self._counts = scratch / "counts"
         self._folder = scratch / "run" if target.comparison.files else None
         self._command = target.command
         if self._folder is not None:
@@ -325,18 +185,40 @@ class Workplace:
     def profile(
         self, rng: np.random.Generator, *, windows: int = 16, watch: Watch | None = None
     ) -> TargetProfile:
-        """Step the golden run, or sampled calls of the target's function.
+        """Step or count the golden run, or step sampled calls of the target's function.
 
         Raises:
-            WindowTooLong: too many instructions.
+            WindowTooLong: too many instructions to step, and nothing that counts them.
             UnknownName: no such object or function.
-            TargetError: the function is never called.
+            TargetError: the function is never called, or the counts are not those of a run.
         """
         function, limit = self.target.function, self.limits.profile_steps
-        if function is None:
+        if function is not None:
+            entry = function_of(self, function)
+            return profile_calls(self, rng, [entry], windows=windows, limit=limit, watch=watch)
+        if callgrind() is None:
             return profile_run(self, rng, limit=limit, watch=watch)
-        entry = function_of(self, function)
-        return profile_calls(self, rng, [entry], windows=windows, limit=limit, watch=watch)
+        try:
+            return profile_run(self, rng, limit=min(limit, _SHORT), watch=watch)
+        except WindowTooLong:
+            return self._counted(rng)
+
+    def _counted(self, rng: np.random.Generator) -> TargetProfile:
+        """Count the executions of a whole run by callgrind, and check some of them."""
+        begun, golden = time.perf_counter(), self._golden or self.fault_free()
+        self._renew_folder()
+        code = run_counted(
+            self._command, stdout=self._stdout, stderr=self._stderr, counts=self._counts,
+            wall_s=golden.wall_s,
+        )  # fmt: skip
+        counted = replace(golden, output=joined(self._parts()), exit_code=code)
+        if unlike := self.unlike(golden, counted):
+            problem = "does not run under callgrind as it does without, so it cannot be counted"
+            raise TargetError(self.name, f"{problem}: {unlike}")
+        profile = profile_counted(self, lambda paths: read_counts(self._counts, paths), begun)
+        self._counts.unlink()
+        require_counts(self, profile, rng)
+        return profile
 
     def fault_free(self) -> Golden:
         """Run once without a fault, timed from the entry point.
@@ -358,12 +240,13 @@ class Workplace:
                 f"writes no file {missing[0]} in the folder in which it runs, so there is nothing "
                 "to compare",
             )
-        return Golden(
-            output=_joined(parts),
+        self._golden = Golden(
+            output=joined(parts),
             exit_code=ended.exit_code,
             cpu_s=_children_cpu_s() - before_s,
             wall_s=time.perf_counter() - start,
         )
+        return self._golden
 
     def unlike(self, golden: Golden, again: Golden) -> str:
         """How two fault-free runs differ; empty if they are equal."""
@@ -380,8 +263,8 @@ class Workplace:
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None if it exceeded its limit."""
         parts, tolerance = self._parts(), self.target.comparison.tolerance
-        output = _joined(parts)
-        outcome, difference = judged(golden, ended, output, _compared, tolerance=tolerance)
+        output = joined(parts)
+        outcome, difference = judged(golden, ended, output, compared, tolerance=tolerance)
         return RunVerdict(
             outcome=outcome,
             output_sha256=digest(output if any(parts.values()) else b""),

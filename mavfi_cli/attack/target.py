@@ -9,13 +9,14 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from mavfi_cli.attack.outcome import RunOutcome, Window
+from mavfi_cli.fi.tracer.counted import CountedRun
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Strategy, Stratum, draw_fault
@@ -66,11 +67,20 @@ class RunVerdict:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
+def code_of(code: Iterable[tuple[int, bytes]], address: int) -> bytes:
+    """16 bytes at an address, from pieces of code with their start addresses."""
+    for start, data in code:
+        if start <= address < start + len(data):
+            return data[address - start : address - start + 16]
+    return b""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TargetProfile:
     """The instructions that can be hit in one run, with what is needed to draw from them."""
 
-    strata: tuple[Stratum, ...]
+    strata: tuple[Stratum, ...] = ()
+    counted: CountedRun | None = None  # a whole run that was counted instead of stepped
     image: Image
     code: tuple[tuple[int, bytes], ...]  # start address and bytes of the code in scope
     cost_s: float
@@ -89,11 +99,14 @@ class TargetProfile:
     @property
     def executed(self) -> int:
         """Number of executed instructions in scope, over the stepped windows."""
-        return sum(stratum.executed for stratum in self.strata)
+        stepped = sum(stratum.executed for stratum in self.strata)
+        return stepped if self.counted is None else self.counted.executed
 
     @property
     def instructions(self) -> Total:
         """Number of executed instructions in scope; estimated if the profile is not complete."""
+        if self.counted is not None:
+            return estimated_total([([self.counted.executed], 1)])
         return estimated_total(
             [
                 ([len(segment.trace) for segment in stratum.segments], stratum.windows_in_run)
@@ -101,12 +114,14 @@ class TargetProfile:
             ]
         )
 
+    @property
+    def not_reached(self) -> float:
+        """Share of the executed instructions that is not drawn, because no stop reaches it."""
+        return 0.0 if self.counted is None else self.counted.not_reached
+
     def code_at(self, address: int) -> bytes:
         """16 bytes of code."""
-        for start, data in self.code:
-            if start <= address < start + len(data):
-                return data[address - start : address - start + 16]
-        return b""
+        return code_of(self.code, address)
 
     def window_of(self, record: Mapping[str, Any]) -> Window | None:
         """The sampled window of a fault; None if no sample of windows was taken."""
@@ -133,10 +148,13 @@ class TargetProfile:
 
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
         """Draw one fault, uniformly over the executed instructions."""
+        drawn = self.counted or self._drawn_stratum(rng)
+        return draw_fault(drawn, plan, rng, code_at=self.code_at, locate=self.image.locate)
+
+    def _drawn_stratum(self, rng: np.random.Generator) -> Stratum:
         shares = np.array([stratum.instructions for stratum in self.strata])
         which = int(rng.choice(len(shares), p=shares / shares.sum())) if len(shares) > 1 else 0
-        stratum, locate = self.strata[which], self.image.locate
-        return draw_fault(stratum, plan, rng, code_at=self.code_at, locate=locate)
+        return self.strata[which]
 
     def after(self, begin: CountedStop) -> TargetProfile:
         """Make the same profile for a run that has to reach `begin` first."""

@@ -197,7 +197,8 @@ def _attack_program(options: dict[str, Any]) -> None:
 
 
 def _program(options: dict[str, Any]) -> AttackTarget:
-    from mavfi_cli.attack.program import OutputComparison, ProgramTarget, absolute_arguments
+    from mavfi_cli.attack.comparison import OutputComparison
+    from mavfi_cli.attack.program import ProgramTarget, absolute_arguments
     from mavfi_cli.fi.tracer.spawn import Program
 
     comparison = OutputComparison.of(

@@ -8,13 +8,12 @@ import pytest
 from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import golden_run
+from mavfi_cli.attack.comparison import OutputComparison, magnitude
 from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.program import (
-    OutputComparison,
     ProgramTarget,
     Workplace,
     absolute_arguments,
-    magnitude,
 )
 from mavfi_cli.cli.kernels import kernels
 from mavfi_cli.core.errors import ConfigError, TargetError

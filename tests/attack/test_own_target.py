@@ -6,7 +6,8 @@ import pytest
 from own_target import OwnPlace, OwnTarget
 
 from mavfi_cli.attack.campaign import Plan, run_campaign
-from mavfi_cli.attack.program import OutputComparison, ProgramTarget
+from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.spawn import Program
 

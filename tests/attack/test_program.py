@@ -12,8 +12,9 @@ from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, run_campaign
+from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.outcome import RunOutcome, Struck, shares
-from mavfi_cli.attack.program import OutputComparison, ProgramTarget, Workplace
+from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.attack.target import RunLimits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, generator

@@ -6,8 +6,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.profile import function_of, profile_calls, profile_run
-from mavfi_cli.attack.program import OutputComparison, ProgramTarget, Workplace
+from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.core.errors import TargetError, UnknownName
 from mavfi_cli.fi.tracer.fault import FaultModel, Site
 from mavfi_cli.fi.tracer.sampling import WindowTooLong, record_window, strategy

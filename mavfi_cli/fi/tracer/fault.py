@@ -12,7 +12,14 @@ import numpy as np
 from mavfi_cli.core.errors import BitOutsideWidth, FaultError, named_member
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, RegisterUse, register_kind, width_of
+from mavfi_cli.fi.tracer.arch import (
+    TRAITS,
+    Detour,
+    Instruction,
+    RegisterUse,
+    register_kind,
+    width_of,
+)
 from mavfi_cli.fi.tracer.image import Location
 
 
@@ -45,6 +52,7 @@ class CountedStop:
 
     location: Location
     count: int
+    detour: Detour | None = None  # None: the executions are counted by a breakpoint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

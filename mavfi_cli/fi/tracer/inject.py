@@ -64,7 +64,8 @@ def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
         Why it was not reached, or the empty string.
     """
     for stage in fault.trigger:
-        if not tracee.run_to(image.address(stage.location), stage.count):
+        address = image.address(stage.location)
+        if not tracee.run_to(address, stage.count, stage.detour):
             return f"the program ended before execution {stage.count} of {stage.location}"
     return ""
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import write_text
+from mavfi_cli.fi.tracer.arch import Detour
 from mavfi_cli.fi.tracer.fault import (
     CountedStop,
     InstructionCorruption,
@@ -46,10 +47,7 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
         "instruction": fault.instruction,
         "instruction_bytes": fault.instruction_bytes.hex(),
         "k": fault.execution,
-        "trigger": [
-            {"object": s.location.object, "offset": s.location.offset, "count": s.count}
-            for s in fault.trigger
-        ],
+        "trigger": [_stage_to_json(stage) for stage in fault.trigger],
         "corruption": corruption_to_json(fault.corruption),
         "build_ids": {
             name: image.named(name).build_id
@@ -57,6 +55,11 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
         },
         **context,
     }
+
+
+def _stage_to_json(stage: CountedStop) -> dict[str, Any]:
+    told = {"object": stage.location.object, "offset": stage.location.offset, "count": stage.count}
+    return told | ({} if stage.detour is None else {"detour": asdict(stage.detour)})
 
 
 def corruption_to_json(corruption: InstructionCorruption | None) -> dict[str, Any] | None:
@@ -92,7 +95,11 @@ def fault_of(record: Mapping[str, Any]) -> InstructionFault:
         corruption = record["corruption"]
         return InstructionFault(
             trigger=tuple(
-                CountedStop(Location(stage["object"], stage["offset"]), stage["count"])
+                CountedStop(
+                    Location(stage["object"], stage["offset"]),
+                    stage["count"],
+                    Detour(**stage["detour"]) if "detour" in stage else None,
+                )
                 for stage in record["trigger"]
             ),
             execution=record["k"],

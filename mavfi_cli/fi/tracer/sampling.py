@@ -27,6 +27,7 @@ from mavfi_cli.fi.tracer.compat import (
     draw_pinfi_with_bugs,
     draw_rosfi,
 )
+from mavfi_cli.fi.tracer.counted import CountedRun
 from mavfi_cli.fi.tracer.fault import (
     CountedStop,
     FaultModel,
@@ -85,7 +86,18 @@ class Stratum:
         """True if every window of the run was stepped."""
         return len(self.segments) == self.windows_in_run
 
-    def at(self, position: int) -> tuple[Segment, int]:
+    def address(self, position: int) -> int:
+        """The address of one executed instruction, counted over all segments."""
+        segment, index = self._at(position)
+        return int(segment.trace[index])
+
+    def trigger(
+        self, position: int, locate: Callable[[int], Location]
+    ) -> tuple[tuple[CountedStop, ...], int]:
+        """The trigger of one executed instruction, and k, the number of its execution."""
+        return plan_trigger(*self._at(position), locate)
+
+    def _at(self, position: int) -> tuple[Segment, int]:
         """The segment and index of one executed instruction, counted over all segments."""
         for segment in self.segments:
             if position < len(segment.trace):
@@ -95,13 +107,13 @@ class Stratum:
 
 
 class WindowTooLong(TargetError):
-    """A window has more instructions than the user allows to step."""
+    """A window has too many instructions to be stepped."""
 
     def __init__(self, program: str, limit: int) -> None:
         super().__init__(
             program,
-            f"executes more than {limit} instructions in scope; name a function whose "
-            "invocations are sampled, or allow more steps",
+            f"executes more than {limit} instructions in scope, too many to step; a program is "
+            "counted whole where valgrind is installed, or name a function with shorter calls",
         )
 
 
@@ -312,7 +324,7 @@ def strategy(name: str, model: FaultModel | None = None, *, compat: str | None =
 
 
 def draw_fault(
-    stratum: Stratum,
+    stratum: Stratum | CountedRun,
     plan: Strategy,
     rng: np.random.Generator,
     *,
@@ -333,8 +345,8 @@ def draw_fault(
     if not stratum.executed:
         raise FaultError("no instruction in scope was executed")
     for _ in range(10_000):
-        segment, index = stratum.at(int(rng.integers(stratum.executed)))
-        address = int(segment.trace[index])
+        position = int(rng.integers(stratum.executed))
+        address = stratum.address(position)
         instruction = decode(code_at(address), address)
         if instruction is None:
             continue
@@ -342,7 +354,7 @@ def draw_fault(
         corruption = plan.draw_at(instruction, rng, following)
         if corruption is None:
             continue
-        trigger, k = plan_trigger(segment, index, locate)
+        trigger, k = stratum.trigger(position, locate)
         return InstructionFault(
             trigger=trigger,
             execution=k,

@@ -179,6 +179,8 @@ def _program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
         "executed_in_scope": None if profile is None else profile.executed,
         "profile_complete": None if profile is None else profile.complete,
         "windows": None if profile is None else profile.windows,
+        "counted": profile is not None and profile.counted is not None,
+        "not_reached": None if profile is None else profile.not_reached,
         "profile_s": None if profile is None else profile.cost_s,
         "golden_wall_s": runs.golden.wall_s,
         "wall_s": runs.wall_s,
@@ -198,10 +200,15 @@ def program_table(summary: Mapping[str, Any]) -> str:
     lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
     if summary["executed_in_scope"] is not None:
         lines.append(
-            f"{summary['executed_in_scope']} executed instructions in scope, windows stepped: "
-            f"{summary['windows']}"
+            f"{summary['executed_in_scope']} executed instructions in scope, {_how(summary)}"
         )
     return "\n".join([*lines, *_count_lines(summary, "")])
+
+
+def _how(summary: Mapping[str, Any]) -> str:
+    if not summary["counted"]:
+        return f"windows stepped: {summary['windows']}"
+    return f"counted by callgrind; {100 * summary['not_reached']:.2g} % more are not reached"
 
 
 # -- both

@@ -93,7 +93,7 @@ def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism):
 
 
 def test_a_window_that_is_too_long_is_refused(start):
-    with pytest.raises(WindowTooLong, match="more than 100 instructions in scope; name a function"):
+    with pytest.raises(WindowTooLong, match="more than 100 instructions in scope, too many"):
         profile_of(start, "counting", "1000", limit=100)
 
 

@@ -59,6 +59,30 @@ class Instruction:
         return self.address + len(self.raw)
 
 
+@dataclass(frozen=True, slots=True)
+class Detour:
+    """Where a detour fits that counts an instruction.
+
+    Attributes:
+        size: length of the whole instructions from it on between which nothing jumps.
+        via: where bytes for the jump are that nothing executes, from the instruction; 0 if they
+            are not needed.
+    """
+
+    size: int
+    via: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flow:
+    """How control flows through one instruction, and whether it can be executed elsewhere."""
+
+    size: int
+    straight: bool  # the next instruction follows, always
+    movable: bool
+    repeated: bool  # a string instruction that may repeat itself
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traits:
     """One processor architecture under Linux."""
@@ -70,7 +94,13 @@ class Traits:
     breakpoint: bytes  # software breakpoint instruction
     breakpoint_advance: int  # bytes by which the instruction pointer is past it at the trap
     breakpoint_length: int  # of a hardware breakpoint, as perf_event_open wants it, bytes
-    perf_event_open: int  # system call number
+    perf_event_open: int  # system call numbers
+    mmap: int
+    munmap: int
+    system_call: bytes  # the instruction
+    jump_bytes: int  # of a jump to anywhere near
+    short_jump_bytes: int
+    short_jump: range  # where a short jump leads, from its own address
 
 
 class StepEnd(IntEnum):

@@ -93,6 +93,12 @@ TRAITS = Traits(
     breakpoint_advance=1,
     breakpoint_length=8,
     perf_event_open=298,
+    mmap=9,
+    munmap=11,
+    system_call=b"\x0f\x05",
+    jump_bytes=5,
+    short_jump_bytes=2,
+    short_jump=range(-126, 130),
 )
 
 
@@ -200,9 +206,7 @@ class Registers:
         if name in _SLOT:
             words = list(self.general())
             words[_SLOT[name]] = value
-            data = bytes((ctypes.c_uint64 * 27)(*words))
-            self.forget()
-            linux.set_registers(self.tid, NT_PRSTATUS, data)
+            self.write_general(words)
             return
         area = bytearray(self.extended())
         data = value.to_bytes(width_of(name) // 8, "little")
@@ -215,6 +219,12 @@ class Registers:
         area[XSTATE_BV : XSTATE_BV + 8] = present.to_bytes(8, "little")
         self.forget()
         linux.set_registers(self.tid, NT_X86_XSTATE, bytes(area))
+
+    def write_general(self, words: list[int]) -> None:
+        """Write `user_regs_struct` as 27 integers."""
+        data = bytes((ctypes.c_uint64 * 27)(*words))
+        self.forget()
+        linux.set_registers(self.tid, NT_PRSTATUS, data)
 
     def _spans(self, name: str) -> list[_Span]:
         if match := _VECTOR.match(name):

@@ -1,0 +1,164 @@
+"""Which outputs of a program are compared with those of the golden run, and how."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from mavfi_cli.attack.target import Difference
+from mavfi_cli.core.errors import ConfigError
+
+STDOUT = "stdout"
+_SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputComparison:
+    """The compared outputs, and how they are compared.
+
+    Attributes:
+        files: compared files, relative to the folder in which the program runs.
+        stdout: whether standard output is compared too.
+        tolerance: largest relative difference of a number that still counts as equal.
+        ignored: patterns (bytes); a line that contains one is left out.
+    """
+
+    files: tuple[str, ...] = ()
+    stdout: bool = True
+    tolerance: float = 0.0
+    ignored: tuple[bytes, ...] = ()
+
+    @classmethod
+    def of(
+        cls, outputs: Iterable[str], *, tolerance: float = 0.0, ignored: Iterable[str] = ()
+    ) -> OutputComparison:
+        """Make a comparison from options of the command line.
+
+        Args:
+            outputs: each `stdout`, or `file:PATH` relative to the program's folder; an empty list
+                means standard output.
+
+        Raises:
+            ConfigError: an output is neither of the two, a path leads out of the program's
+                folder, or a pattern is not a regular expression.
+        """
+        chosen = tuple(dict.fromkeys(outputs)) or (STDOUT,)
+        return cls(
+            files=tuple(_inside(text) for text in chosen if text != STDOUT),
+            stdout=STDOUT in chosen,
+            tolerance=tolerance,
+            ignored=tuple(_pattern(text) for text in ignored),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The entries that results depend on."""
+        names: list[str | None] = [None] if self.stdout else []
+        names += self.files
+        told: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
+        if self.ignored:
+            told["ignored"] = [pattern.decode() for pattern in self.ignored]
+        return told | {"tolerance": self.tolerance}
+
+    def parts(self, folder: Path, stdout: Path) -> dict[str, bytes | None]:
+        """Read a run's outputs, by name; None for a file that it did not write."""
+        found: dict[str, bytes | None] = {}
+        if self.stdout:
+            found[STDOUT] = self._kept(stdout.read_bytes())
+        for name in self.files:
+            data = _read_inside(folder, name)
+            found[name] = None if data is None else self._kept(data)
+        return found
+
+    def _kept(self, data: bytes) -> bytes:
+        if not self.ignored:
+            return data
+        lines = re.findall(rb"[^\n]*\n|[^\n]+", data)
+        return b"".join(
+            line for line in lines if not any(re.search(each, line) for each in self.ignored)
+        )
+
+    def same(self, golden: bytes, output: bytes) -> bool:
+        """True if two outputs are equal, or differ only in numbers within the tolerance."""
+        if golden == output:
+            return True
+        size = magnitude(golden, output) if self.tolerance > 0.0 else None
+        return size is not None and size <= self.tolerance
+
+
+def joined(parts: dict[str, bytes | None]) -> bytes:
+    """Join all outputs: a single one as it is, several each after its name."""
+    pieces = [b"\0missing" if data is None else data for data in parts.values()]
+    if len(pieces) == 1:
+        return pieces[0]
+    names = (f"== {name}\n".encode() for name in parts)
+    return b"".join(name + piece for name, piece in zip(names, pieces, strict=True))
+
+
+def _inside(text: str) -> str:
+    kind, _, name = text.partition(":")
+    if kind != "file" or not name:
+        raise ConfigError(f"cannot compare {text!r}; known: stdout, file:PATH", key="compare")
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or not path.parts:
+        raise ConfigError(
+            f"{name!r} leads out of the scratch folder in which the program runs: name a file "
+            "relative to it, without '..'",
+            key="compare",
+        )
+    return str(path)
+
+
+def _pattern(text: str) -> bytes:
+    try:
+        re.compile(text.encode())
+    except re.error as error:
+        raise ConfigError(
+            f"{text!r} is no regular expression: {error}", key="ignore_lines"
+        ) from None
+    return text.encode()
+
+
+def _read_inside(folder: Path, name: str) -> bytes | None:
+    """Read a regular file below the folder; None if a link leads out of it."""
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()) or not path.is_file():
+        return None
+    return path.read_bytes()
+
+
+def compared(golden: bytes, output: bytes) -> Difference | None:
+    """The difference between the numbers of two texts; None if anything else differs."""
+    size = magnitude(golden, output)
+    return None if size is None else Difference(relative=size, absolute=size)
+
+
+def magnitude(golden: bytes, output: bytes) -> float | None:
+    """Largest relative difference between the numbers of two texts.
+
+    It is relative to the golden number's size, absolute if that is 0, and infinite if one of the
+    two is not finite and they differ. None if the texts differ in more than their numbers.
+    """
+    ours, theirs = _SEPARATORS.split(golden), _SEPARATORS.split(output)
+    if len(ours) != len(theirs):
+        return None
+    largest = 0.0
+    for a, b in zip(ours, theirs, strict=True):
+        size = 0.0 if a == b else _size(a, b)
+        if size is None or math.isinf(size):
+            return size
+        largest = max(largest, size)
+    return largest
+
+
+def _size(golden: bytes, other: bytes) -> float | None:
+    try:
+        expected, got = float(golden), float(other)
+    except ValueError:
+        return None
+    if not (math.isfinite(expected) and math.isfinite(got)):
+        return math.inf
+    return abs(got - expected) / (abs(expected) or 1.0)

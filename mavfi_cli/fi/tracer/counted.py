@@ -1,0 +1,192 @@
+"""A whole run as execution counts: the population of a program that is too long to be stepped.
+
+The k-th execution of an instruction is reached by counting. Instructions that always execute
+together have the same counts; so a hot one is counted at a place among them where a detour fits,
+that is, where nothing jumps between the replaced instructions: one of them leads to the next, and
+both are executed equally often.
+"""
+
+from __future__ import annotations
+
+import functools
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavfi_cli.fi.tracer.arch import TRAITS, Detour, Flow, flow
+from mavfi_cli.fi.tracer.fault import CountedStop
+from mavfi_cli.fi.tracer.image import Location
+
+_BY_BREAKPOINT = 100_000  # most executions that are counted by a breakpoint: about a second
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CountedRun:
+    """How often each instruction in scope is executed in one run.
+
+    Attributes:
+        addresses: (n,) instructions, ascending.
+        counts: (n,) executions of each.
+        places: (n,) index of the instruction at which each is counted.
+        detours: for each instruction, the detour that counts it; None if none fits.
+    """
+
+    addresses: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    places: NDArray[np.int64]
+    detours: tuple[Detour | None, ...]
+
+    @classmethod
+    def of(cls, executions: Mapping[int, int], code_at: Callable[[int], bytes]) -> CountedRun:
+        """Make the population from the number of executions of each address.
+
+        Args:
+            code_at: 16 bytes of code at an address.
+        """
+        addresses = sorted(executions)
+        flows = [flow(code_at(address), address) for address in addresses]
+        counts = _without_repeats(addresses, [executions[each] for each in addresses], flows)
+        joined = _joined(addresses, counts, flows)
+        sizes = [_straight_bytes(at, flows, joined) for at in range(len(addresses))]
+        detours = tuple(_detours(addresses, sizes, flows))
+        return cls(
+            addresses=np.array(addresses, np.int64),
+            counts=np.array(counts, np.int64),
+            places=np.array(_places(detours, joined), np.int64),
+            detours=detours,
+        )
+
+    @functools.cached_property
+    def reached(self) -> NDArray[np.int64]:
+        """(n,) executions of each instruction, from the first, that can be reached."""
+        detoured = np.array([self.detours[place] is not None for place in self.places])
+        return np.where(detoured, self.counts, np.minimum(self.counts, _BY_BREAKPOINT))
+
+    @functools.cached_property
+    def _ends(self) -> NDArray[np.int64]:
+        return np.cumsum(self.reached)
+
+    @property
+    def executed(self) -> int:
+        """Number of executed instructions that can be reached."""
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    @property
+    def not_reached(self) -> float:
+        """Share of the executed instructions that cannot be reached."""
+        return 1.0 - self.executed / max(1, int(self.counts.sum()))
+
+    def _at(self, position: int) -> tuple[int, int]:
+        """Index and number of the execution, from 1, of one executed instruction."""
+        index = int(np.searchsorted(self._ends, position, side="right"))
+        return index, position - int(self._ends[index] - self.reached[index]) + 1
+
+    def address(self, position: int) -> int:
+        """The address of one executed instruction."""
+        return int(self.addresses[self._at(position)[0]])
+
+    def trigger(
+        self, position: int, locate: Callable[[int], Location]
+    ) -> tuple[tuple[CountedStop, ...], int]:
+        """The trigger of one executed instruction, and k, the number of its execution."""
+        index, k = self._at(position)
+        return self.stages(index, k, locate), k
+
+    def stages(
+        self, index: int, k: int, locate: Callable[[int], Location]
+    ) -> tuple[CountedStop, ...]:
+        """The stages to execution k of an instruction."""
+        place = int(self.places[index])
+        here, there = (locate(int(self.addresses[at])) for at in (index, place))
+        detour = self.detours[place]
+        if place == index:
+            return (CountedStop(here, k, detour),)
+        before = k if place < index else k - 1  # executions of the place until then
+        first = (CountedStop(there, before, detour),) if before else ()
+        return (*first, CountedStop(here, 1))
+
+
+def _without_repeats(
+    addresses: list[int], counts: list[int], flows: list[Flow | None]
+) -> list[int]:
+    """Count a repeated string instruction once, however often it repeats itself."""
+    counts = list(counts)
+    for at, how in enumerate(flows):
+        if how is None or not how.repeated or at + 1 == len(addresses):
+            continue
+        if addresses[at + 1] == addresses[at] + how.size:
+            counts[at] = min(counts[at], counts[at + 1])
+    return counts
+
+
+def _joined(addresses: list[int], counts: list[int], flows: list[Flow | None]) -> list[bool]:
+    """Whether each instruction always leads to the next, and nothing else does."""
+    joined = [
+        how is not None
+        and how.straight
+        and addresses[at + 1] == addresses[at] + how.size
+        and counts[at + 1] == counts[at]
+        for at, how in enumerate(flows[:-1])
+    ]
+    return [*joined, False]
+
+
+def _straight_bytes(at: int, flows: list[Flow | None], joined: list[bool]) -> int:
+    """Bytes of the instructions from one on that a detour can replace, as many as it needs."""
+    size = 0
+    while (how := flows[at]) is not None and how.movable:
+        size += how.size
+        if size >= TRAITS.jump_bytes or not joined[at]:
+            return size
+        at += 1
+    return size if how is not None and size >= TRAITS.short_jump_bytes else 0
+
+
+def _detours(
+    addresses: list[int], sizes: list[int], flows: list[Flow | None]
+) -> Iterator[Detour | None]:
+    """The detour at each instruction."""
+    ends = [at + how.size if how else at for at, how in zip(addresses, flows, strict=True)]
+    gaps = [
+        range(end, start - TRAITS.jump_bytes + 1)
+        for end, start in zip(ends, addresses[1:], strict=False)
+        if start - end >= TRAITS.jump_bytes
+    ]
+    starts = [gap.start for gap in gaps]
+    for address, size in zip(addresses, sizes, strict=True):
+        if size >= TRAITS.jump_bytes:
+            yield Detour(size)
+        elif size >= TRAITS.short_jump_bytes:
+            near = range(address + TRAITS.short_jump.start, address + TRAITS.short_jump.stop)
+            yield _over_gap(
+                address, size, gaps[max(0, bisect_left(starts, near.start) - 1) :], near
+            )
+        else:
+            yield None
+
+
+def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> Detour | None:
+    """A detour over the first bytes nearby that nothing executes."""
+    for gap in gaps:
+        first = max(gap.start, near.start)
+        if first >= near.stop:
+            return None
+        if first in gap:
+            return Detour(size, first - address)
+    return None
+
+
+def _places(detours: Sequence[Detour | None], joined: list[bool]) -> list[int]:
+    """The index at which each is counted: its own, or the first possible of its block."""
+    places: list[int] = []
+    start = 0
+    for at, more in enumerate(joined):
+        if not more:
+            block = range(start, at + 1)
+            fits = [each for each in block if detours[each]]
+            places += [each if detours[each] or not fits else fits[0] for each in block]
+            start = at + 1
+    return places

@@ -1,0 +1,88 @@
+"""Programs that are counted by callgrind instead of being stepped."""
+
+import shutil
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from mavfi_cli.attack import profile as profiles
+from mavfi_cli.attack import program as programs
+from mavfi_cli.attack.campaign import Plan, run_campaign
+from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.program import ProgramTarget
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.spawn import Program
+from mavfi_cli.report.tables.attacks import program_table, summarise_program
+
+pytestmark = pytest.mark.skipif(shutil.which("valgrind") is None, reason="valgrind is missing")
+
+
+@pytest.fixture
+def place(native_program):
+    places = []
+
+    def make(name, *arguments):
+        command = Program.of([str(native_program(name)), *arguments])
+        places.append(ProgramTarget(command=command, comparison=OutputComparison()).open())
+        return places[-1]
+
+    yield make
+    for each in places:
+        each.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"), [("counting", ("300",)), ("flows", ()), ("sorting", ())]
+)
+def test_callgrind_counts_what_is_stepped(place, monkeypatch, name, arguments):
+    where = place(name, *arguments)
+    stepped = where.profile(np.random.default_rng(1))
+    monkeypatch.setattr(programs, "_SHORT", 0)
+    counted = where.profile(np.random.default_rng(1))
+    (window,), run = stepped.strata[0].segments, counted.counted
+    assert stepped.counted is None
+    assert Counter(window.trace.tolist()) == dict(zip(run.addresses, run.counts, strict=True))
+
+
+def test_a_long_program_is_attacked_whole(native_program):
+    command = Program.of([str(native_program("counting")), "300000"])
+    target = ProgramTarget(command=command, comparison=OutputComparison())
+    plan = Plan(runs=12, seed=3)
+    (runs,) = run_campaign(plan, [target])
+    assert runs.profile.instructions.total > 1e6
+    assert max(entry["k"] for entry in runs.records) > 100_000
+    assert not any(entry["not_injected_reason"] for entry in runs.records)
+    again = [record.fault_of(entry) for entry in runs.records]
+    assert [fault.trigger[-1].location.offset for fault in again] == [
+        entry["offset"] for entry in runs.records
+    ]
+    summary = summarise_program(plan, runs)["summary"]
+    assert summary["counted"]
+    assert summary["not_reached"] < 0.02
+    assert "counted by callgrind; 0 % more are not reached" in program_table(summary)
+
+
+def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):
+    where = place("counting", "60000")
+    counts = programs.read_counts
+    monkeypatch.setattr(
+        programs,
+        "read_counts",
+        lambda *given: {
+            path: {at: n - (n > 50_000) for at, n in found.items()}
+            for path, found in counts(*given).items()
+        },
+    )
+    with pytest.raises(TargetError, match="more often than the 59999 times that callgrind counts"):
+        where.profile(np.random.default_rng(1))
+
+
+def test_without_valgrind_a_long_program_is_refused_by_advice(place, monkeypatch):
+    monkeypatch.setattr(programs, "callgrind", lambda: None)
+    monkeypatch.setattr(profiles, "STEPS", 1000)
+    where = place("counting", "60000")
+    where.limits = programs.RunLimits(profile_steps=1000)
+    with pytest.raises(TargetError, match="counted whole where valgrind is installed"):
+        where.profile(np.random.default_rng(1))
