@@ -1,10 +1,11 @@
-# Two commands do everything: `make fly` and `make test`; `make test-all` takes longer.
+# Two commands do everything: `make fly` and `make test`. `make test-all` takes longer, and
+# `make docs` builds the documentation.
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 SOURCES := mavfi_cli sitl tests benchmarks examples
 
-.PHONY: fly test test-all install install-dev lint clean
+.PHONY: fly test test-all docs install install-dev lint clean
 
 fly: install
 	$(BIN)/mavfi fly --world dense --inject planning
@@ -15,6 +16,10 @@ test: install-dev lint
 
 test-all: install-dev lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+docs: install-dev
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/sphinx-build -q -W --keep-going -E -b html docs build/docs
+	@echo "Open build/docs/index.html"
 
 lint: install-dev
 	$(BIN)/ruff check $(SOURCES)

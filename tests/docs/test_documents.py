@@ -45,8 +45,10 @@ def test_the_readme_has_its_commands():
     "line", [c for c in commands() if c[0] != "sitl" and "--link" not in c], ids=" ".join
 )
 def test_a_command_of_the_readme_runs(line, mavfi, tmp_path):
-    """The world of one's own is the example of CONTRIBUTING; flights are cut short."""
-    (example,) = (b for b in blocks(ROOT / "CONTRIBUTING.md", "toml") if "bounds_enu_m" in b)
+    """The world of one's own is the example of docs/contributing.md; flights are cut short."""
+    (example,) = (
+        b for b in blocks(ROOT / "docs" / "contributing.md", "toml") if "bounds_enu_m" in b
+    )
     (tmp_path / "my_world.toml").write_text(example)
     if line[0] == "fly" and "--expect" not in line:
         line = [*line, "--time-limit", "9", "--no-picture"]
@@ -108,7 +110,9 @@ def test_a_foreign_autopilot(mavfi, autopilot_on_udp, free_port, tmp_path):
 
 
 def test_the_example_world_is_checked_and_drawn(mavfi, tmp_path):
-    (example,) = (b for b in blocks(ROOT / "CONTRIBUTING.md", "toml") if "bounds_enu_m" in b)
+    (example,) = (
+        b for b in blocks(ROOT / "docs" / "contributing.md", "toml") if "bounds_enu_m" in b
+    )
     (tmp_path / "yard.toml").write_text(example)
     for command in ("check", "draw"):
         done = mavfi("world", command, "yard.toml", cwd=tmp_path)
@@ -127,3 +131,18 @@ def test_every_relative_link_leads_to_a_file(document):
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_placeholder_is_left(document):
     assert "@@" not in document.read_text()
+
+
+@pytest.mark.slow
+def test_the_pages_build_without_a_warning(tmp_path):
+    """A warning is a dead link, a page that no other lists, or a name that no longer exists."""
+    line = ["-q", "-W", "--keep-going", "-b", "html", "-d", tmp_path / "cache", ROOT / "docs"]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", *line, tmp_path / "pages"],
+        capture_output=True, text=True, check=False, env={**os.environ, "PATH": path},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    commands = (tmp_path / "pages" / "reference" / "commands.html").read_text()
+    assert "--fault-seed" in commands
+    assert "--allow-unsigned" in commands  # of `mavfi sitl`, whose help is its own
