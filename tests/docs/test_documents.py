@@ -30,6 +30,11 @@ def named(*words):
     return [line for line in commands() if all(word in line for word in words)]
 
 
+def example_world():
+    (found,) = (b for b in blocks(ROOT / "docs/contributing.md", "toml") if "bounds_enu_m" in b)
+    return found
+
+
 # What takes long is done on a small scale: the same command with fewer flights.
 SMALL = {
     "train": ["--flights", "3", "--kind", "l2"],
