@@ -156,7 +156,8 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     from mavfi_cli.campaigns.ledger import Ledger
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.record.run_folder import load_run
-    from mavfi_cli.report.trajectories import Panel, lines, write_trajectories
+    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.trajectories import Panel, draw_trajectories, lines
 
     with Ledger(folder_of(what)) as ledger:
         chosen = pair(ledger, number)
@@ -167,7 +168,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         )
         for panel in chosen["panels"]
     ]
-    write_trajectories(panels, output)
+    write_svg(draw_trajectories(panels), output)
     if as_json:
         told = {**chosen, "picture": output}
         click.echo(json.dumps(plain(told), indent=2, default=str))

@@ -162,15 +162,16 @@ def fly(
     """
     from mavfi_cli import library
     from mavfi_cli.cli.progress import progress_view
+    from mavfi_cli.report.drawing import write_svg
     from mavfi_cli.report.summary import outcome_line, summary_lines
-    from mavfi_cli.report.top_view import write_top_view
+    from mavfi_cli.report.top_view import draw_top_view
 
     mission = _mission_of(config)
     with progress_view(mission, quiet=quiet) as view:
         run = library.fly(mission, out=out, watcher=view)
     folder = run.folder
     if picture:
-        write_top_view(run, folder.picture)
+        write_svg(draw_top_view(run), folder.picture)
     if as_json:
         click.echo(json.dumps(run.result, indent=2, sort_keys=True))
     else:

@@ -155,7 +155,8 @@ def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.kernels.catalogue import select
     from mavfi_cli.attack.kernels.target import KernelTarget
     from mavfi_cli.mission.kernel_inputs import inputs_of_flight
-    from mavfi_cli.report.kernel_plot import write_kernel_plot
+    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.kernel_plot import draw_kernel_plot
     from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, summarise, table
     from mavfi_cli.spec.mission import MissionConfig
 
@@ -171,7 +172,7 @@ def _attack_kernels(options: dict[str, Any]) -> None:
         summary = summarise(plan, campaign)
         if out is not None:
             _save(out, summary, campaign, KERNEL_COLUMNS)
-            write_kernel_plot(summary, out / "kernels.svg")
+            write_svg(draw_kernel_plot(summary), out / "kernels.svg")
     _tell(summary, table(summary), "kernels.json, kernels.csv, kernels.svg, runs.jsonl", options)
 
 

@@ -25,9 +25,10 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
 
     record = load_run(run)
     if picture is not None:
-        from mavfi_cli.report.top_view import write_top_view
+        from mavfi_cli.report.drawing import write_svg
+        from mavfi_cli.report.top_view import draw_top_view
 
-        write_top_view(record, picture)
+        write_svg(draw_top_view(record), picture)
     if as_json:
         click.echo(json.dumps(record.result, indent=2, sort_keys=True))
         return

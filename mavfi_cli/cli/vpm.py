@@ -225,9 +225,12 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
     """Write all files; return their names."""
     from mavfi_cli.core.errors import RecordError
     from mavfi_cli.core.files import write_json, write_text
-    from mavfi_cli.report.flight_plot import write_flight_plot
-    from mavfi_cli.report.redundancy_plot import write_redundancy_plot
-    from mavfi_cli.report.roofline_plot import write_roofline_plot
+    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.model_plots import (
+        draw_flight_plot,
+        draw_redundancy_plot,
+        draw_roofline_plot,
+    )
     from mavfi_cli.report.tables.model import model_csv
     from mavfi_cli.report.tables.redundancy import redundancy_csv
 
@@ -237,11 +240,11 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
         raise RecordError(f"{out}: {error.strerror or error}") from None
     write_json(out / "vpm.json", told)
     write_text(out / "vpm.csv", model_csv(told))
-    write_roofline_plot(told, out / "roofline.svg")
-    write_redundancy_plot(told, out / "redundancy.svg")
+    write_svg(draw_roofline_plot(told), out / "roofline.svg")
+    write_svg(draw_redundancy_plot(told), out / "redundancy.svg")
     names = ["vpm.json", "vpm.csv", "roofline.svg", "redundancy.svg"]
     if "flights" in told:
         write_text(out / "flights.csv", redundancy_csv(told["flights"]))
-        write_flight_plot(told, out / "flights.svg")
+        write_svg(draw_flight_plot(told), out / "flights.svg")
         names += ["flights.csv", "flights.svg"]
     return names

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, PLATFORMS, write_svg
+from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, PLATFORMS, new_figure, open_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,16 +26,9 @@ _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministi
 Row = Mapping[str, Any]
 
 
-def write_compare_plot(comparison: Row, path: Path) -> None:
-    """Write the plot of a comparison as SVG, atomically. Equal comparisons give equal bytes."""
-    write_svg(draw_compare_plot(comparison), path)
-
-
 def draw_compare_plot(comparison: Row) -> Figure:
     """Draw a figure of five panels with one colour per platform, times in s, shares in %."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.0, 8.0), layout="constrained")
+    figure = new_figure(12.0, 8.0)
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     panels = figure.subplot_mosaic("TTTTSS;RRMMWW")
     colours = {
@@ -79,7 +71,7 @@ def _frame(axes: Axes, title: str, grid: str) -> None:
     axes.grid(visible=True, axis=grid, color=GRID, linewidth=0.7)  # type: ignore[arg-type]
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8.5)
-    axes.spines[["top", "right"]].set_visible(False)
+    open_frame(axes)
 
 
 def _places(comparison: Row, settings: Sequence[str]) -> tuple[dict[tuple[str, str], float], float]:

@@ -1,4 +1,4 @@
-"""Colours of all pictures, and the function that saves them."""
+"""Colours and frames of all pictures, and the function that saves them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from mavfi_cli.core.files import require_svg, write_atomically
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 INK = "#1d232b"
@@ -40,16 +41,28 @@ def detector_colours(names: Sequence[str]) -> dict[str, str]:
     }
 
 
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure that finds room for its labels by itself."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def open_frame(axes: Axes) -> None:
+    """Leave out the frame's upper and right line."""
+    axes.spines[["top", "right"]].set_visible(False)
+
+
 def write_svg(figure: Figure, path: Path) -> None:
     """Write a figure as SVG, atomically. Equal figures give equal bytes.
 
     Raises:
-        RecordError: The file could not be written. or its name does not end in .svg.
+        ConfigError: Its name does not end in .svg.
+        RecordError: The file could not be written.
     """
     import matplotlib as mpl
 
     require_svg(path)
-
     with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})

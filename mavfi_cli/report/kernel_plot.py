@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.report.drawing import INK, NOTE, write_svg
+from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,17 +20,10 @@ _VISIBLE = 0.5  # per cent; minimum width of a drawn interval
 _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 
-def write_kernel_plot(summary: Mapping[str, Any], path: Path) -> None:
-    """Write the plot of a kernel campaign as SVG, atomically. Equal summaries give equal bytes."""
-    write_svg(_draw_kernel_plot(summary), path)
-
-
-def _draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
+def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
     """Draw a figure with one bar per kernel and the shares of its injected runs in per cent."""
-    from matplotlib.figure import Figure
-
     kernels = summary["kernels"]
-    figure = Figure(figsize=(max(5.2, 1.8 + 1.05 * len(kernels)), 4.4), layout="constrained")
+    figure = new_figure(max(5.2, 1.8 + 1.05 * len(kernels)), 4.4)
     axes = figure.add_subplot()
     for place, kernel in enumerate(kernels):
         _bar(axes, place, kernel["outcomes"])
@@ -39,7 +31,7 @@ def _draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
     axes.set_ylim(0.0, 100.0)
     axes.set_xlim(-0.6, len(kernels) - 0.4)
     axes.set_ylabel("share of injected runs, %")
-    axes.spines[["top", "right"]].set_visible(False)
+    open_frame(axes)
     handles = [axes.bar(0, 0, color=colour, label=_LABELS[n]) for n, colour in _COLOURS.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=4, frameon=False)
     figure.supxlabel(_caption(summary), fontsize=7, color=NOTE)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, write_svg
+from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,21 +29,14 @@ _LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window from which texts go t
 Row = Mapping[str, Any]
 
 
-def write_timeline(comparison: Row, path: Path) -> None:
-    """Write the timeline of a comparison as SVG, atomically. Equal input gives equal bytes."""
-    write_svg(draw_timeline(comparison), path)
-
-
 def draw_timeline(comparison: Row) -> Figure:
     """Draw a figure with simulated time since the frame on x and a lane per kernel.
 
     All platforms share the time axis, so equal lengths are equal times.
     """
-    from matplotlib.figure import Figure
-
     rows = comparison["timeline"]["platforms"]
     known = {row["platform"]: row for row in comparison["plan"]["platforms"]}
-    figure = Figure(figsize=(11.0, 0.9 + 2.9 * max(1, len(rows))), layout="constrained")
+    figure = new_figure(11.0, 0.9 + 2.9 * max(1, len(rows)))
     panels = figure.subplots(max(1, len(rows)), 1, squeeze=False, sharex=True)[:, 0]
     if not rows:
         panels[0].set_axis_off()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mavfi_cli.mission.record.measures import FlightRecord
 from mavfi_cli.mission.record.run_folder import Run
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,16 +37,9 @@ _LABELS = {
 }
 
 
-def write_top_view(run: Run, path: Path) -> None:
-    """Write the top view of a run as SVG, atomically. Equal runs give equal bytes."""
-    write_svg(draw_top_view(run), path)
-
-
 def draw_top_view(run: Run) -> Figure:
     """Draw a figure of the run in metres, with east to the right and north up."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 6.0), layout="constrained")
+    figure = new_figure(6.4, 6.0)
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
     axes = figure.add_subplot()
     flight = run.record

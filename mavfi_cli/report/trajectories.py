@@ -6,14 +6,13 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mavfi_cli.mission.record.measures import FlightRecord
 from mavfi_cli.mission.record.run_folder import Run
-from mavfi_cli.report.drawing import DETECTORS, INK, write_svg
+from mavfi_cli.report.drawing import DETECTORS, INK, new_figure
 from mavfi_cli.report.top_view import (
     draw_end,
     draw_marks,
@@ -45,15 +44,6 @@ class Panel:
     flights: Sequence[tuple[str, Run]]
 
 
-def write_trajectories(panels: Sequence[Panel], path: Path) -> None:
-    """Write flights of one world as SVG, atomically. Equal flights give equal bytes.
-
-    Raises:
-        RecordError: The file could not be written.
-    """
-    write_svg(draw_trajectories(panels), path)
-
-
 def draw_trajectories(panels: Sequence[Panel]) -> Figure:
     """Draw a figure with a top view per panel, in metres, east to the right and north up.
 
@@ -61,12 +51,10 @@ def draw_trajectories(panels: Sequence[Panel]) -> Figure:
         panels: At least one panel, each with at least one flight. The first flight without fault
             and detector is the reference for the flight times of the others.
     """
-    from matplotlib.figure import Figure
-
     columns = min(_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     most = max(len(panel.flights) for panel in panels)
-    figure = Figure(figsize=(5.2 * columns, (5.3 + 0.19 * most) * rows), layout="constrained")
+    figure = new_figure(5.2 * columns, (5.3 + 0.19 * most) * rows)
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
     colours = _colours(panels)
     grid = figure.subplots(rows, columns, squeeze=False)

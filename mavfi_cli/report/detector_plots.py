@@ -1,14 +1,13 @@
-"""Plots of a detector evaluation: ROC, precision-recall and recovery."""
+"""Plots of detectors: training loss, ROC, precision-recall and recovery."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.report.drawing import GRID, INK, NOTE, detector_colours, write_svg
+from mavfi_cli.report.drawing import GRID, INK, NOTE, detector_colours, new_figure, open_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,24 +16,12 @@ if TYPE_CHECKING:
 Evaluation = Mapping[str, Any]
 
 
-def write_roc_plot(evaluation: Evaluation, path: Path) -> None:
-    """Write the curves of an evaluation as SVG, atomically. Equal evaluations give equal bytes."""
-    write_svg(draw_roc_plot(evaluation), path)
-
-
-def write_recovery_plot(evaluation: Evaluation, path: Path) -> None:
-    """Write the recovery plot of an evaluation as SVG, atomically, with reproducible bytes."""
-    write_svg(draw_recovery_plot(evaluation), path)
-
-
 def draw_roc_plot(evaluation: Evaluation) -> Figure:
     """Draw a figure with ROC on the left and precision over recall on the right.
 
     A dot marks the detector at its own threshold.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.4, 4.4), layout="constrained")
+    figure = new_figure(8.4, 4.4)
     roc, precision = figure.subplots(1, 2)
     colours = detector_colours(list(evaluation["curves"]))
     drawn = [(name, c) for name, c in evaluation["curves"].items() if c["thresholds"]]
@@ -79,17 +66,15 @@ def _square(axes: Axes, x: str, y: str) -> None:
     axes.set_ylabel(y, fontsize=8.5)
     axes.tick_params(labelsize=8)
     axes.grid(visible=True, color=GRID, linewidth=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
+    open_frame(axes)
 
 
 def draw_recovery_plot(evaluation: Evaluation) -> Figure:
     """Draw a figure of recovered harmful faults by stage and worst flights by world."""
-    from matplotlib.figure import Figure
-
     rows = evaluation["faults"]
     names = list(dict.fromkeys(row["detector"] for row in rows))
     colours = detector_colours(names)
-    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    figure = new_figure(9.6, 4.2)
     shares, times = figure.subplots(1, 2)
     stages = [row for row in rows if row["by"] in ("all", "stage") and row["detector"] != "none"]
     _bars(
@@ -157,4 +142,23 @@ def _bars(
     axes.tick_params(labelsize=8)
     axes.grid(visible=True, axis="y", color=GRID, linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    open_frame(axes)
+
+
+def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:
+    """Draw a figure of the mean squared errors of scaled deltas, logarithmic, over the epochs.
+
+    Args:
+        curve: Rows of epoch, mean training error and largest validation error.
+    """
+    figure = new_figure(5.2, 3.2)
+    axes = figure.add_subplot()
+    epochs, training, validation = zip(*curve, strict=True)
+    axes.plot(epochs, training, color="#1b4965", linewidth=1.4, label="training, mean")
+    axes.plot(epochs, validation, color="#e4572e", linewidth=1.4, label="validation, largest")
+    axes.set_yscale("log")
+    axes.set_xlabel("epoch")
+    axes.set_ylabel("mean squared error of scaled deltas")
+    axes.grid(visible=True, color="#edf0f4", linewidth=0.6)
+    axes.legend(frameon=False, fontsize=8)
+    return figure
