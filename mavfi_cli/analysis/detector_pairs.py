@@ -7,7 +7,9 @@ from enum import Enum
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.campaigns.missions import Injected
 
 LONGER = 0.05  # fraction of the golden flight time beyond which a fault is harmful
@@ -207,3 +209,9 @@ def _faults(
             continue
         labels = {**dict(zip(KEY, key, strict=True)), "detector": detector}
         yield fault_pair(labels, golden, faulty, watched, protected, complete=complete(key[1]))
+
+
+def harmful(faults: pa.Table) -> pa.Table:
+    """The pairs without a detector whose fault was active and did harm."""
+    active = chosen(faults, active=True, detector=NONE)
+    return active.filter(pc.not_equal(active["harm"], Harm.NONE.value))

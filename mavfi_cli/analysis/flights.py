@@ -116,6 +116,12 @@ def flown(table: pa.Table) -> pa.Table:
     return table.filter(pc.equal(table["state"], ResultState.FLOWN.value))
 
 
+def errors(table: pa.Table, phrase: str) -> list[str]:
+    """A phrase of the columns `number`, `labels` and `reason` for each that could not begin."""
+    rows = table.select(["number", "labels", "state", "reason"]).to_pylist()
+    return [phrase.format_map(row) for row in rows if row["state"] == ResultState.ERROR.value]
+
+
 def numbers(table: pa.Table, name: str) -> FloatArray:
     """A column as floats, (n,); NaN if a cell is empty."""
     column = table[name].cast(pa.float64())

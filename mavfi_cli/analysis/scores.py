@@ -14,6 +14,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import pyarrow as pa
+
+from mavfi_cli.analysis.detector_pairs import NONE, harmful
+from mavfi_cli.analysis.detectors import Scored
+from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.states import BY_NAME
 from mavfi_cli.core.types import Stage, Trajectory
@@ -79,15 +84,36 @@ class Scores:
         }
         self._kept: dict[str, dict[str, float | None]] = _read(self._path)
 
-    def score_all(
-        self, flights: Iterable[tuple[str | None, float | None]], tell: Callable[[str], None]
-    ) -> None:
-        """Score the flights without scores; flights without a trace are skipped.
+    def scored(self, error_free: pa.Table, faults: pa.Table, tell: Callable[[str], None]) -> Scored:
+        """Scores of the harmful faults and of the error-free flights, by detector.
 
         Args:
-            flights: run folder and time of the strike, s.
+            error_free, faults: as `detector_pairs.pairs_of` returns them.
             tell: receives a text with the number of replayed flights.
         """
+        struck = harmful(faults)
+        paths, golden = (
+            table[name].to_pylist()
+            for table, name in (
+                (struck, "faulty_path"),
+                (chosen(error_free, detector=NONE), "golden_path"),
+            )
+        )
+        begins = [*struck["faulty_struck_s"].to_pylist(), *[None] * len(golden)]
+        self._score_all(zip([*paths, *golden], begins, strict=True), tell)
+
+        def of(detector: str) -> tuple[pa.Table, list[float]]:
+            positive = pa.array([self._of(path, detector) for path in paths], pa.float64())
+            table = struck.select(["stage", "field"]).append_column("score", positive)
+            negative = (self._of(path, detector) for path in golden)
+            return table.drop_null(), [score for score in negative if score is not None]
+
+        return of
+
+    def _score_all(
+        self, flights: Iterable[tuple[str | None, float | None]], tell: Callable[[str], None]
+    ) -> None:
+        """Score the flights that have none, by run folder and time of the strike, s."""
         missing = [
             (Path(path), struck_s)
             for path, struck_s in flights
@@ -105,7 +131,7 @@ class Scores:
                     kept[path.name] = self._score(flight, struck_s, detector)
         write_json(self._path, self._kept)
 
-    def of(self, path: str | None, detector: str) -> float | None:
+    def _of(self, path: str | None, detector: str) -> float | None:
         """The score of a flight; None where it has no trace. A score that is NaN is an alarm."""
         kept = self._kept.get(self._names[detector], {})
         if path is None or Path(path).name not in kept:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaigns.factors import check_names
+from mavfi_cli.autonomy import planners
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import (
     PlannedMission,
@@ -22,14 +22,23 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, require_unchanged, store_plan
-from mavfi_cli.campaigns.specification import FixedWorld, Spec, differences
+from mavfi_cli.campaigns.specification import Spec, differences
 from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, replaced, to_toml
 from mavfi_cli.campaigns.stopping import BatchLimiter
 from mavfi_cli.campaigns.world_search import with_worlds
-from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName, VehicleProcessError
+from mavfi_cli.core.errors import (
+    ConfigError,
+    FaultSpecError,
+    MavfiError,
+    UnknownName,
+    VehicleProcessError,
+)
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.vehicle import VehicleInProcess
+from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.spec.stack import load_stack
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
 _APPEND = "--append adds what is new"
@@ -81,7 +90,10 @@ def chosen_spec(
     with Ledger(Path(what)) as ledger:
         if scale is not None or changes or not folder_fits:
             raise ConfigError("goes without --scale, --set and --out: it has all", path=Path(what))
-        return _stored_spec(ledger)
+        stored = stored_spec(ledger)
+    if stored is None:
+        raise ConfigError("has no specification: a program made its list", path=Path(what))
+    return stored
 
 
 def folder_of(what: str) -> Path:
@@ -142,10 +154,9 @@ def resumed(asked: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[
     if not (folder / LEDGER).is_file():
         return asked, False
     with Ledger(folder) as ledger:
-        text = ledger.meta("spec")
-    if text is None:  # killed before it was stored, or another study: the list decides
+        stored = stored_spec(ledger)
+    if stored is None:  # killed before it was stored, or another study: the list decides
         return asked, False
-    stored = parse_spec(text, folder / LEDGER)
     ours = replace(asked, name=stored.name, about=stored.about, keep=stored.keep)
     grows = asked.repetitions > stored.repetitions
     alike = replace(ours, repetitions=stored.repetitions) if grows else ours
@@ -156,26 +167,19 @@ def resumed(asked: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[
     return ours, grows
 
 
-def _stored_spec(ledger: Ledger) -> Spec:
+def stored_spec(ledger: Ledger) -> Spec | None:
+    """The specification with which a campaign was begun; None if a program made its list."""
     text = ledger.meta("spec")
-    if text is None:
-        raise ConfigError("has no specification: a program made its list", path=ledger.folder)
-    return parse_spec(text, ledger.folder / SPEC)
-
-
-def _differing(ledger: Ledger, spec: Spec) -> list[str]:
-    """Differences of a specification from the stored one; empty if a program made the list."""
-    return [] if ledger.meta("spec") is None else differences(_stored_spec(ledger), spec)
+    return None if text is None else parse_spec(text, ledger.folder / SPEC)
 
 
 def stopped(ledger: Ledger) -> list[str]:
     """The settings that the campaign's stopping rule has ended early."""
-    text = ledger.meta("spec")
-    stop = None if text is None else parse_spec(text, ledger.folder / SPEC).stop
-    if stop is None:
+    spec = stored_spec(ledger)
+    if spec is None or spec.stop is None:
         return []
     cells = ledger.cells()
-    gate = BatchLimiter(stop, ledger.cell_of_each(), ledger.fates())
+    gate = BatchLimiter(spec.stop, ledger.cell_of_each(), ledger.fates())
     return [label_text(cells[cell]) for cell in sorted(gate.stopped)]
 
 
@@ -215,11 +219,12 @@ def begin(
         if begun and ledger.meta("spec") == text:  # the list is what it would expand to
             require_unchanged(ledger)
         else:
+            stored = stored_spec(ledger)
             store_plan(
                 ledger,
                 missions or flyable(spec),
                 append=append,
-                differing=_differing(ledger, spec),
+                differing=[] if stored is None else differences(stored, spec),
                 can_append=_APPEND,
             )
             ledger.set_meta({"spec": text, "name": spec.name})
@@ -235,10 +240,9 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
         ConfigError: the worlds of missions to append follow another rule.
     """
     with Ledger(folder) as ledger:
-        told = ledger.meta("spec") is not None
-        there = _stored_spec(ledger).fixed_world if told else None
-    here = spec.fixed_world
-    if append and told and (here and here.rule()) != (there and there.rule()):
+        stored = stored_spec(ledger)
+    here, there = spec.fixed_world, stored.fixed_world if stored else None
+    if append and stored and (here and here.rule()) != (there and there.rule()):
         raise ConfigError(
             "holds a campaign with another [fixed_world]; another folder starts anew", path=folder
         )
@@ -250,11 +254,6 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
         flown={**there.flown, **here.flown},
     )
     return replace(spec, fixed_world=known)
-
-
-def fixed_world(ledger: Ledger) -> FixedWorld | None:
-    """The campaign's rule of fixed worlds, with the worlds that it has found."""
-    return None if ledger.meta("spec") is None else _stored_spec(ledger).fixed_world
 
 
 def flyable(spec: Spec) -> list[PlannedMission]:
@@ -270,22 +269,16 @@ def flyable(spec: Spec) -> list[PlannedMission]:
 def _check(missions: list[PlannedMission]) -> None:
     """Check each kind of mission once, and each kind of vehicle process once."""
     seen: set[str] = set()
-    asked: set[str] = set()
-
-    def vehicle(config: MissionConfig) -> None:
-        """Have the vehicle process check world, vehicle, start and goal, once for each kind."""
-        simple = replace(golden_of(config), seed=0)
-        key = canonical({**changes_of(simple), "planner": None, "platform": None, "stack": None})
-        if key not in asked:
-            asked.add(key)
-            ask_vehicle(config)
-
     for mission in missions:
-        key = canonical(_kind(changes_of(mission.config)))
-        if key not in seen:
-            seen.add(key)
-            with naming(mission.labels):
-                check_names(mission.config, vehicle)
+        config = mission.config
+        key = canonical(_kind(changes_of(config)))
+        if key in seen:
+            continue
+        simple = changes_of(replace(golden_of(config), seed=0))
+        vehicle = canonical({**simple, "planner": None, "platform": None, "stack": None})
+        with naming(mission.labels):
+            check_names(config, start=vehicle not in seen)
+        seen |= {key, vehicle}
 
 
 def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -295,6 +288,32 @@ def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:
         if kind.get(name) is not None:
             kind[name] = {**kind[name], "seed": 0}
     return kind
+
+
+def check_names(config: MissionConfig, *, start: bool = True) -> None:
+    """Raise now what would keep every mission like this one from being flown.
+
+    Args:
+        start: start the simulated vehicle, too, which checks world, vehicle, start and goal.
+
+    Raises:
+        MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model is
+            for another stack; values make no fault; or the start is blocked.
+    """
+    planners.find(config.planner)
+    load_platform(config.platform)
+    load_stack(config.stack)
+    if config.fault is not None:
+        config.fault.check()
+    if config.instruction is not None:
+        config.instruction.strategy()
+        config.instruction.node()
+    if config.detector is not None:
+        detector_of(config.detector, config.stack)
+    elif config.fault is not None and config.fault.attacks_detector:
+        raise FaultSpecError("a fault in the detector needs one")
+    if start:
+        ask_vehicle(config)
 
 
 def ask_vehicle(config: MissionConfig) -> None:

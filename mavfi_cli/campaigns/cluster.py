@@ -16,14 +16,14 @@ import time
 import uuid
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.campaigns.workers import TASK, Assignment, AttemptEnd, LocalWorkers, Workers
+from mavfi_cli.campaigns.workers import TASK, AttemptEnd, LocalWorkers, Workers
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.fork_server import SCRATCH
 from mavfi_cli.core.versions import installed_versions, version_differences
@@ -76,22 +76,14 @@ class Cluster(Workers):
             self._looked_s = time.monotonic()
         return _BACKLOG * self._threads - len(self._futures)
 
-    def start(self, mission: Assignment, limit_s: float) -> None:
+    def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
         """Send a mission to the cluster."""
-        number = mission.number
-        order = _Order(
-            number=number,
-            changes=mission.changes,
-            limit_s=limit_s,
-            keep=self._keep.value,
-            task=self._task,
-            versions=self._versions,
-        )
         self._submitted += 1
         future = self._client.submit(
-            fly, order, key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0
-        )
-        self._futures[number] = (future, Path(mission.out))
+            fly, number, changes, limit_s, self._keep.value, self._task, self._versions,
+            key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0,
+        )  # fmt: skip
+        self._futures[number] = (future, out)
         future.add_done_callback(lambda _future: self._done.put(number))
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
@@ -107,11 +99,15 @@ class Cluster(Workers):
         future, out = self._futures.pop(number)
         if future.status != "finished":
             return AttemptEnd(number=number, lost=f"lost by the cluster: {future.exception()}")
-        answer: _Answer = future.result()
-        if answer.ended is None:
-            raise ClusterError(f"a worker has other versions: {answer.refused}")
-        _unpack(answer.files, out)
-        return AttemptEnd(**answer.ended)
+        answer = future.result()
+        if isinstance(answer, str):
+            raise ClusterError(f"a worker has other versions: {answer}")
+        ended, files = answer
+        for name, data in files.items():  # where the mission would have written them
+            path = out / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(zlib.decompress(data))
+        return AttemptEnd(**ended)
 
     def close(self) -> None:
         """Cancel missions that have not begun; results of missions in flight are dropped."""
@@ -161,56 +157,43 @@ _SMALL = (RESULT, FAULT)  # files that the runner reads of a run folder that is 
 _thread = threading.local()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Order:
-    """One mission for a worker."""
-
-    number: int
-    changes: Mapping[str, Any]
-    limit_s: float
-    keep: str
-    task: str
-    versions: Mapping[str, str]  # versions of the runner
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Answer:
-    """A worker's answer to an order.
-
-    Attributes:
-        refused: how this worker's versions differ from the runner's; it then does not fly.
-        ended: how the mission ended; None if it was refused.
-        files: its files, compressed, by path in its folder.
-    """
-
-    refused: str = ""
-    ended: Mapping[str, Any] | None = None
-    files: Mapping[str, bytes] = field(default_factory=dict)
-
-
 @cache
 def _worker_versions() -> dict[str, str]:
     """Versions on this worker that results depend on."""
     return installed_versions()
 
 
-def fly(order: _Order) -> _Answer:
-    """Fly a mission; run folders that the campaign does not keep are sent without their traces."""
-    differing = version_differences(order.versions, _worker_versions())
+def fly(
+    number: int,
+    changes: Mapping[str, Any],
+    limit_s: float,
+    keep: str,
+    task: str,
+    versions: Mapping[str, str],
+) -> str | tuple[dict[str, Any], dict[str, bytes]]:
+    """Fly a mission; run folders that the campaign does not keep are sent without their traces.
+
+    Args:
+        versions: those of the runner.
+
+    Returns:
+        Fields of its `AttemptEnd`, and its files, compressed, by path in its folder. Or how this
+        worker's versions differ from the runner's; it then does not fly.
+    """
+    differing = version_differences(versions, _worker_versions())
     if differing:
-        return _Answer(refused="; ".join(differing))
-    place = _scratch() / f"{order.number}-{threading.get_ident()}"
+        return "; ".join(differing)
+    place = _scratch() / f"{number}-{threading.get_ident()}"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
     (place / ".profiles").symlink_to(_scratch() / "profiles")
     try:
-        workers = _workers(order.task)
-        mission = Assignment(number=order.number, changes=order.changes, out=str(place))
-        workers.start(mission, order.limit_s)
+        workers = _workers(task)
+        workers.start(number, changes, place, limit_s)
         ended: list[AttemptEnd] = []
         while not ended:
             ended = workers.wait(60.0)
-        return _Answer(ended=asdict(ended[0]), files=_packed(place, order))
+        return asdict(ended[0]), _packed(place, number, Keep(keep))
     finally:
         shutil.rmtree(place, ignore_errors=True)
 
@@ -231,11 +214,11 @@ def _scratch() -> Path:
     return folder
 
 
-def _packed(place: Path, order: _Order) -> dict[str, bytes]:
+def _packed(place: Path, number: int, keep: Keep) -> dict[str, bytes]:
     outcome = None
     for result in place.glob(f"[!.]*/{RESULT}"):
         outcome = json.loads(result.read_text(encoding="utf-8")).get("outcome")
-    whole = Keep(order.keep).wants(order.number, outcome)
+    whole = keep.wants(number, outcome)
     return {
         str(path.relative_to(place)): zlib.compress(path.read_bytes(), 1)
         for path in sorted(place.glob("[!.]*/*")) + sorted(place.glob("[!.]*"))
@@ -243,11 +226,3 @@ def _packed(place: Path, order: _Order) -> dict[str, bytes]:
         and path.parent.name != SCRATCH
         and (whole or path.name in _SMALL or path.parent == place)
     }
-
-
-def _unpack(files: Mapping[str, bytes], out: Path) -> None:
-    """Write a worker's files where the mission would have written them."""
-    for name, data in files.items():
-        path = out / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(zlib.decompress(data))

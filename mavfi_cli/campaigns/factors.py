@@ -6,13 +6,13 @@ field.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import fields
 from enum import Enum
 from typing import Any
 
 from mavfi_cli.core.config import structure
-from mavfi_cli.core.errors import ConfigError, FaultSpecError, nearest
+from mavfi_cli.core.errors import ConfigError, nearest
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig
@@ -50,58 +50,45 @@ def _names() -> tuple[str, ...]:
 NAMES = _names()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
-    """One combination of factors: a mission without its seeds."""
+def target_of(values: Mapping[str, Any]) -> str:
+    """The target of the fault in a combination of factors; empty without a fault."""
+    return next((str(values[name]) for name in _ALIASES if name in values), "")
 
-    values: Mapping[str, Any]
 
-    @property
-    def target(self) -> str:
-        """The target of the fault; empty without a fault."""
-        return next((str(self.values[name]) for name in _ALIASES if name in self.values), "")
+def mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> MissionConfig:
+    """The mission of a combination of factors.
 
-    def mission(self, seed: int, fault_seed: int) -> MissionConfig:
-        """The mission.
+    Raises:
+        ConfigError: factors contradict each other, or a value has the wrong type.
+    """
+    mission = {name: values[name] for name in MISSION if name in values}
+    mission["seed"] = values.get("seed", seed)
+    mission |= _fault(values, fault_seed)
+    detector = {_DETECTOR[name]: value for name, value in values.items() if name in _DETECTOR}
+    if detector and "name" not in detector:
+        raise ConfigError(f"{', '.join(sorted(detector))}: without a detector")
+    if detector and detector["name"] != "none":
+        mission["detector"] = detector
+    return structure(mission, MissionConfig)
 
-        Raises:
-            ConfigError: factors contradict each other, or a value has the wrong type.
-        """
-        mission = {name: self.values[name] for name in MISSION if name in self.values}
-        mission["seed"] = self.values.get("seed", seed)
-        fault = self._fault(fault_seed)
-        if fault:
-            level, values = fault
-            mission["fault" if level is _Level.SOURCE else "instruction"] = values
-        detector = {_DETECTOR[name]: value for name, value in self.values.items()
-                    if name in _DETECTOR}  # fmt: skip
-        if detector and "name" not in detector:
-            raise ConfigError(f"{', '.join(sorted(detector))}: without a detector")
-        if detector and detector["name"] != "none":
-            mission["detector"] = detector
-        return structure(mission, MissionConfig)
 
-    def _fault(self, seed: int) -> tuple[_Level, dict[str, Any]] | None:
-        elsewhere = {*MISSION, *_DETECTOR}
-        asked = {name: value for name, value in self.values.items() if name not in elsewhere}
-        level_name = asked.pop("level", _Level.SOURCE.value)
-        targets = [name for name in _ALIASES if name in asked]
-        level = _member(level_name)
-        if not targets:
-            for name in asked:
-                if name not in _FAULT[level]:
-                    raise _no_factor(name, level)
-            if asked or "level" in self.values:
-                named = sorted({*asked, *({"level"} & set(self.values))})
-                raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
-            return None
-        if len(targets) > 1:
-            raise ConfigError("a fault strikes a stage or a site, not both")
-        values = {_ALIASES.get(name, name): value for name, value in asked.items()}
-        for name in values:
-            if name not in _FAULT[level]:
-                raise _no_factor(name, level)
-        return level, {**values, "seed": seed}
+def _fault(values: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """The field `fault` or `instruction` of the mission; empty without a fault."""
+    asked = {name: each for name, each in values.items() if name not in (*MISSION, *_DETECTOR)}
+    level = _member(asked.pop("level", _Level.SOURCE.value))
+    targets = [name for name in _ALIASES if name in asked]
+    if len(targets) > 1:
+        raise ConfigError("a fault strikes a stage or a site, not both")
+    fault = {_ALIASES[name] if name in targets else name: each for name, each in asked.items()}
+    for name in fault:
+        if name not in _FAULT[level]:
+            raise _no_factor(name, level)
+    if targets:
+        return {"fault" if level is _Level.SOURCE else "instruction": {**fault, "seed": seed}}
+    if asked or "level" in values:
+        named = sorted({*asked, *({"level"} & set(values))})
+        raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
+    return {}
 
 
 def _no_factor(name: str, level: _Level) -> ConfigError:
@@ -116,34 +103,3 @@ def _member(name: Any) -> _Level:
     except ValueError:
         known = " or ".join(level.value for level in _Level)
         raise ConfigError(f"expected {known}, got {name!r}", key="level") from None
-
-
-def check_names(config: MissionConfig, simulator: Callable[[MissionConfig], None]) -> None:
-    """Raise now what would keep every mission like this one from being flown.
-
-    Args:
-        config: one of these missions.
-        simulator: raises the simulated vehicle's error for the mission, if there is one.
-
-    Raises:
-        MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model is
-            for another stack; values make no fault; or the start is blocked.
-    """
-    from mavfi_cli.autonomy import planners
-    from mavfi_cli.spec.detector import detector_of
-    from mavfi_cli.spec.platform import load_platform
-    from mavfi_cli.spec.stack import load_stack
-
-    planners.find(config.planner)
-    load_platform(config.platform)
-    load_stack(config.stack)
-    if config.fault is not None:
-        config.fault.check()
-    if config.instruction is not None:
-        config.instruction.strategy()
-        config.instruction.node()
-    if config.detector is not None:
-        detector_of(config.detector, config.stack)
-    elif config.fault is not None and config.fault.attacks_detector:
-        raise FaultSpecError("a fault in the detector needs one")
-    simulator(config)

@@ -28,11 +28,12 @@ from mavfi_cli.campaigns.missions import (
     ResultState,
     canonical,
     changes_of,
-    config_from,
 )
+from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.record.measures import fields_of, record_of
+from mavfi_cli.spec.mission import MissionConfig
 
 SCHEMA = 1
 LEDGER, LOCK, RUNS = "ledger.sqlite", "ledger.lock", "runs"
@@ -310,7 +311,9 @@ class Ledger:
             yield MissionResult(
                 number=number,
                 mission=PlannedMission(
-                    config=config_from(json.loads(changes)), labels=json.loads(labels), pair=pair
+                    config=structure(json.loads(changes), MissionConfig),
+                    labels=json.loads(labels),
+                    pair=pair,
                 ),
                 state=ResultState(state),
                 outcome=outcome,

@@ -11,7 +11,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.mission.record.measures import FlightRecord, record_of
 from mavfi_cli.spec.mission import MissionConfig
@@ -60,15 +59,6 @@ def changes_of(config: MissionConfig) -> dict[str, Any]:
     }
     plain = json.loads(json.dumps(changed, default=asdict))
     return {name: value for name, value in plain.items() if value != _BASE[name]}
-
-
-def config_from(changes: Mapping[str, Any]) -> MissionConfig:
-    """Make the mission from the result of `changes_of`.
-
-    Raises:
-        ConfigError: a key or a value that this version of mavfi does not have.
-    """
-    return structure(changes, MissionConfig)
 
 
 def golden_of(config: MissionConfig) -> MissionConfig:

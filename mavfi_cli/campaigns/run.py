@@ -19,7 +19,6 @@ from mavfi_cli.campaigns.missions import (
     ResultState,
     canonical,
     changes_of,
-    config_from,
     injected_of,
 )
 from mavfi_cli.campaigns.progress import Progress, Spectator
@@ -27,7 +26,6 @@ from mavfi_cli.campaigns.specification import Keep, Stop
 from mavfi_cli.campaigns.stopping import BatchLimiter, Entry, Queue
 from mavfi_cli.campaigns.workers import (
     TASK,
-    Assignment,
     AttemptEnd,
     CampaignStopped,
     LocalWorkers,
@@ -35,12 +33,14 @@ from mavfi_cli.campaigns.workers import (
     Workers,
     judge,
 )
+from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.versions import installed_versions, version_differences
 from mavfi_cli.mission.record.measures import record_of
 from mavfi_cli.mission.record.run_folder import RESULT
+from mavfi_cli.spec.mission import MissionConfig
 
 WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # most attempts at a mission that something outside ends
@@ -252,20 +252,20 @@ class _Run:
             entry = self._again.pop() if self._again else self._queue.next()
             if entry is None:
                 return
-            workers.start(self._assigned(entry), self._options.limit_s)
+            number, _, changes = entry
+            self._attempts[number] += 1
+            self._flying[number] = entry
+            workers.start(number, changes, self._made(number), self._options.limit_s)
 
-    def _assigned(self, entry: Entry) -> Assignment:
-        """The next attempt at a mission, in a folder of its own."""
-        number, _, changes = entry
-        self._attempts[number] += 1
-        self._flying[number] = entry
+    def _made(self, number: int) -> Path:
+        """A folder for the next attempt at a mission."""
         out = self._out(number)
         try:
             out.mkdir()
             (out / ".profiles").symlink_to(self._folder / PROFILES)
         except OSError as error:
             raise RecordError(f"{out}: {error.strerror or error}") from None
-        return Assignment(number=number, changes=changes, out=str(out))
+        return out
 
     def _out(self, number: int) -> Path:
         return self._folder / WORK / f"{number}-{self._attempts[number]}"
@@ -275,7 +275,7 @@ class _Run:
         number = ended.number
         entry = self._flying.pop(number)
         self._inside_s += ended.wall_s
-        config = config_from(entry[2]).to_dict()
+        config = structure(entry[2], MissionConfig).to_dict()
         out = self._out(number)
         verdict = judge(ended, out, config, self._options.limit_s)
         last = self._attempts[number] >= ATTEMPTS

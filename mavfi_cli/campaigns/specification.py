@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from mavfi_cli.campaigns.factors import Point
+from mavfi_cli.campaigns.factors import mission_of, target_of
 from mavfi_cli.campaigns.missions import Label, PlannedMission, naming
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.seeds import Stream, derive
@@ -209,9 +209,9 @@ class Spec:
         """
         points = self._points()
         return [
-            self._mission(point, labels, repetition)
+            self._mission(values, labels, repetition)
             for repetition in range(max(count for *_, count in points))
-            for point, labels, count in points
+            for values, labels, count in points
             if repetition < count
         ]
 
@@ -221,14 +221,14 @@ class Spec:
         Raises:
             ConfigError: as `missions`.
         """
-        return [self._mission(point, labels, 0) for point, labels, _ in self._points()]
+        return [self._mission(values, labels, 0) for values, labels, _ in self._points()]
 
-    def _points(self) -> list[tuple[Point, dict[str, Label], int]]:
+    def _points(self) -> list[tuple[dict[str, Any], dict[str, Label], int]]:
         """Combine the factors; return each combination with its labels and repetitions."""
         if (planned := sum(self._size(setting) for setting in self.settings)) > MOST:
             raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
         points = [
-            (Point(values={**self.fixed, **values}), labels, self._count(setting))
+            ({**self.fixed, **values}, labels, self._count(setting))
             for setting in self.settings
             for values, labels in self._combinations(setting)
         ]
@@ -252,14 +252,14 @@ class Spec:
             yield chosen, {**named, **{name: _label(value) for name, value in varied.items()}}
 
     def _mission(
-        self, point: Point, labels: Mapping[str, Label], repetition: int
+        self, values: Mapping[str, Any], labels: Mapping[str, Label], repetition: int
     ) -> PlannedMission:
-        seed = point.values.get("seed", self.first_seed + repetition)
+        seed = values.get("seed", self.first_seed + repetition)
         # The target is part of it, or the faults of all states would share one draw. Nothing else
         # is: the same target gets the same fault under every detector and platform.
-        fault_seed = derive(self.seed, Stream.FAULT, "campaign", seed, repetition, point.target)
+        drawn = (Stream.FAULT, "campaign", seed, repetition, target_of(values))
         with naming(labels):
-            config = point.mission(seed, fault_seed)
+            config = mission_of(values, seed, derive(self.seed, *drawn))
             if self.fixed_world is not None and config.world_seed is None:
                 config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
             return PlannedMission(config=config, labels=labels)

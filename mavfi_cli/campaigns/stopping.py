@@ -13,7 +13,7 @@ from typing import Any
 
 from mavfi_cli.campaigns.missions import COUNTED
 from mavfi_cli.campaigns.specification import Stop
-from mavfi_cli.stats.shares import half_width, rate
+from mavfi_cli.stats.shares import rate
 
 Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission
 Row = tuple[str | None, str | None]  # outcome, what happened to the fault
@@ -77,7 +77,7 @@ class BatchLimiter:
         counted = [outcome for outcome, injected in rows if injected in COUNTED]
         wins = sum(outcome == "success" for outcome in counted)
         share = rate(wins, len(counted), self._stop.confidence)
-        return half_width(share) <= self._stop.margin
+        return (share.high - share.low) / 2.0 <= self._stop.margin
 
 
 class Queue:

@@ -30,8 +30,9 @@ def perform(changes: Mapping[str, Any], out: Path) -> Path:
     Raises:
         MavfiError: the mission could not begin, or its record could not be written.
     """
-    from mavfi_cli.campaigns.missions import config_from
+    from mavfi_cli.core.config import structure
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.spec.mission import MissionConfig
 
-    return fly_mission(config_from(changes), out, Watcher()).path
+    return fly_mission(structure(changes, MissionConfig), out, Watcher()).path

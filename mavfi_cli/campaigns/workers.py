@@ -45,21 +45,6 @@ class AttemptEnd:
     wall_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Assignment:
-    """One mission to be flown.
-
-    Attributes:
-        number: number of the mission.
-        changes: its values that differ from the defaults.
-        out: the folder for its run folder.
-    """
-
-    number: int
-    changes: Mapping[str, Any]
-    out: str
-
-
 class Workers(ABC):
     """Keeps missions flying. A context manager that ends them."""
 
@@ -75,8 +60,15 @@ class Workers(ABC):
         """Number of missions that may be started now."""
 
     @abstractmethod
-    def start(self, mission: Assignment, limit_s: float) -> None:
-        """Start a mission with a limit of wall time, s."""
+    def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
+        """Start a mission.
+
+        Args:
+            number: its number, for the message of its end.
+            changes: its values that differ from the defaults.
+            out: the folder for its run folder.
+            limit_s: limit of wall time, s.
+        """
 
     @abstractmethod
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
@@ -114,16 +106,16 @@ class LocalWorkers(Workers):
         """Number of missions that may be started now."""
         return self._jobs - len(self._number)
 
-    def start(self, mission: Assignment, limit_s: float) -> None:
+    def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
         """Start a mission.
 
         Raises:
             ForkServerFailed: the processes cannot be started.
         """
-        channel = self._server.start(mission.changes, Path(mission.out), limit_s)
+        channel = self._server.start(changes, out, limit_s)
         self._selector.register(channel, selectors.EVENT_READ)
-        self._number[channel] = mission.number
-        self.running[mission.number] = 0
+        self._number[channel] = number
+        self.running[number] = 0
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
         """Wait for a guard's message or the time-out; return the missions that ended."""

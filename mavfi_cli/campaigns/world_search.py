@@ -22,19 +22,6 @@ SEARCH = "world-search"  # the folder
 _AT_ONCE = 4  # candidates that are flown at the same time
 
 
-class _NoWorldFits(ConfigError):
-    """None of the candidates fits the rule; the message has the replans of their flights."""
-
-    def __init__(self, world: str, rule: FixedWorld, flown: Flown) -> None:
-        often = sorted(count for replans in flown for count in replans)
-        seen = f"; they replan {often[0]} to {often[-1]} times" if often else ""
-        super().__init__(
-            f"no world seed of {world} up to {rule.candidates} is {rule.rule()}{seen}; leave the "
-            f"world out of `worlds`, or name its seed in [fixed_world.world_seed]",
-            key="fixed_world",
-        )
-
-
 class _Notes(Spectator):
     """Passes on notes only, because the progress of a search is not that of the campaign."""
 
@@ -107,7 +94,13 @@ def _search(
             flown = (*flown, tuple(count for count in counts if count is not None))
             if rule.fits(flown[-1]):
                 return flown[:seed]
-    raise _NoWorldFits(config.world, rule, flown)
+    often = sorted(count for replans in flown for count in replans)
+    seen = f"; they replan {often[0]} to {often[-1]} times" if often else ""
+    raise ConfigError(
+        f"no world seed of {config.world} up to {rule.candidates} is {rule.rule()}{seen}; leave "
+        f"the world out of `worlds`, or name its seed in [fixed_world.world_seed]",
+        key="fixed_world",
+    )
 
 
 def _replans(

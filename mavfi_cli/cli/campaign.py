@@ -279,12 +279,13 @@ def _show(
     from dataclasses import asdict
 
     from mavfi_cli.analysis.summary import summarise
-    from mavfi_cli.campaigns.begin import fixed_world, stopped
+    from mavfi_cli.campaigns.begin import stopped, stored_spec
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.tables.campaign import summary_lines
 
     summary = summarise(ledger, by or [], confidence)
-    ended, worlds = stopped(ledger), fixed_world(ledger)
+    ended, spec = stopped(ledger), stored_spec(ledger)
+    worlds = None if spec is None else spec.fixed_world
     told = {**summary, "stopped": ended}
     lines = [f"{summary['name']}: {summary['over']} of {summary['missions']} missions"]
     if worlds is not None:

@@ -31,7 +31,9 @@ def platforms(names: tuple[str, ...], as_json: bool) -> None:
             "measured:FACTOR  this host's own kernel times while it flies, times FACTOR; for "
             "`mavfi fly --realtime` only"
         )
-        click.echo("\n`mavfi platforms NAME` shows every kernel; docs/contributing.md how to add one.")
+        click.echo(
+            "\n`mavfi platforms NAME` shows every kernel; docs/contributing.md how to add one."
+        )
 
 
 def _all_s(profile: Any) -> float:

@@ -60,9 +60,6 @@ def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
     return wilson(successes, total, confidence_z=z_of(confidence))
 
 
-def half_width(share: Share) -> float:
-    """Half of the width of the interval."""
-    return (share.high - share.low) / 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,7 +37,7 @@ class Beside:
 
     plan: FlightPlan | str
     flights: pa.Table | None = None
-    errors: tuple[str, ...] = ()
+    errors: Sequence[str] = ()
 
     def measured(self, name: str, flights: pa.Table) -> FloatArray:
         """A quantity of MODEL for each flight, (n,); NaN if a flight has none.

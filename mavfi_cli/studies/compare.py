@@ -11,21 +11,21 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.flights import errors, flights
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, compared, figures, platforms_told
 from mavfi_cli.analysis.timeline import timeline_seed, timelines
 from mavfi_cli.campaigns.begin import begin, resumed
-from mavfi_cli.campaigns.missions import PlannedMission, ResultState
+from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options, fly_missing, run_campaign
+from mavfi_cli.campaigns.run import Options, fly_missing
 from mavfi_cli.campaigns.specification import Keep, Setting, Spec
-from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import DEFAULT
+from mavfi_cli.studies.flying import fly, require_named
 
 FAULTY = "FI"  # names of settings, as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings
@@ -39,14 +39,11 @@ class ComparePlan:
 
     Attributes:
         platforms: names or files; the others are compared with the first.
-        inject: stages, states or groups to corrupt, one per flight; empty flies golden
-            missions only.
+        inject: stages, states or groups to corrupt, one per flight; empty flies golden ones only.
         detectors: names; `none` is always flown, named or not.
         missions: number per platform, setting and target of `inject`.
-        first_seed: seed of the first mission; each further mission adds 1.
         seed: root of the faults' seeds.
         field: field of the bits; None draws any bit.
-        stack: stack of all missions: a name, a file or a variant.
 
     Raises:
         ConfigError: there is nothing to fly, or a name appears twice.
@@ -63,14 +60,11 @@ class ComparePlan:
     stack: str = DEFAULT
 
     def __post_init__(self) -> None:
-        named: dict[str, tuple[str, ...]] = {
-            "platform": self.platforms,
-            "detector": self.detectors,
-            "inject": self.inject,
-        }
-        for key, names in named.items():
-            if not names and key != "inject":
-                raise ConfigError("name at least one", key=key)
+        for key, names in (("platform", self.platforms), ("detector", self.detectors)):
+            require_named(key, names)
+        require_named("inject", self.inject, least=0)
+        files = [str(Path(n).resolve()) if n.endswith(".toml") else n for n in self.platforms]
+        require_named("platform", files)
         if not 1 <= self.missions <= MOST:
             limit = "least 1" if self.missions < 1 else f"most {MOST}"
             raise ConfigError(f"must be at {limit}, got {self.missions}", key="missions")
@@ -79,9 +73,6 @@ class ComparePlan:
                 raise ConfigError(f"must not be negative, got {getattr(self, key)}", key=key)
         if self.field is not None and not self.inject:
             raise ConfigError(f"{self.field}: there is no fault", key="field")
-        files = [str(Path(n).resolve()) if n.endswith(".toml") else n for n in self.platforms]
-        for key, names in (*named.items(), ("platform", tuple(files))):
-            require_distinct(names, key)
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -96,10 +87,10 @@ class ComparePlan:
 
     def spec(self) -> Spec:
         """The specification of the campaign."""
-        axis = "stage" if set(self.inject) <= set(STAGES) else "site"
-        faults: dict[str, tuple[Any, ...]] = {axis: self.inject}
-        if self.field is not None:
-            faults["field"] = (self.field,)
+        faults: dict[str, tuple[Any, ...]] = {
+            "stage" if set(self.inject) <= set(STAGES) else "site": self.inject,
+            **({} if self.field is None else {"field": (self.field,)}),
+        }
         settings = [Setting(name=GOLDEN)]
         for name in self.settings[1:]:
             detector = {} if name == NONE else {"detector": (name,)}
@@ -144,11 +135,7 @@ def compare(
         "schema": SCHEMA,
         "plan": plan.told(),
         "versions": installed_versions(),
-        "errors": [
-            f"mission {row['number']}: {row['reason']}"
-            for row in table.select(["number", "state", "reason"]).to_pylist()
-            if row["state"] == ResultState.ERROR.value
-        ],
+        "errors": errors(table, "mission {number}: {reason}"),
         **found,
         "timeline": _timelines(plan, found["flights"], folder / TIMELINE, options, spectator),
     }
@@ -164,20 +151,12 @@ def _timelines(
     """Kernel invocations of a golden flight, one row per platform that flew."""
     seed = timeline_seed(flown, plan.platforms) or plan.first_seed
     spectator.on_note(f"the golden flights of seed {seed} again, for the timeline")
-    missions = {
-        name: PlannedMission(
-            config=MissionConfig(world=plan.world, platform=name, stack=plan.stack, seed=seed),
-            labels={"platform": name},
-        )
+    golden = MissionConfig(world=plan.world, stack=plan.stack, seed=seed)
+    missions = [
+        PlannedMission(config=replace(golden, platform=name), labels={"platform": name})
         for name in plan.platforms
-    }
-    with run_campaign(
-        [*missions.values()], folder, replace(options, keep=Keep.ALL), spectator, append=True
-    ) as ledger:
-        paths = {each.mission.pair: each.path for each in ledger.results()}
-    runs = {
-        name: load_run(path)
-        for name, mission in missions.items()
-        if (path := paths.get(mission.pair)) is not None
-    }
+    ]
+    table = fly(missions, folder, Keep.ALL, options, spectator)
+    paths = dict(zip(table["platform"].to_pylist(), table["path"].to_pylist(), strict=True))
+    runs = {name: load_run(Path(paths[name])) for name in plan.platforms if paths.get(name)}
     return {"seed": seed, "platforms": timelines(runs)}

@@ -8,15 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.flights import chosen, flights
+from mavfi_cli.analysis.flights import chosen, errors, flown
 from mavfi_cli.analysis.overhead import compute_overheads
-from mavfi_cli.campaigns.begin import ask_vehicle
-from mavfi_cli.campaigns.factors import check_names
-from mavfi_cli.campaigns.missions import PlannedMission, ResultState, canonical, changes_of
+from mavfi_cli.campaigns.begin import ask_vehicle, check_names
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.run import Options
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
@@ -24,6 +23,7 @@ from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.studies.beside_model import BASE, Beside, Key, side_by_side
 from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan, write_files
+from mavfi_cli.studies.flying import fly, require_named
 from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS
 from mavfi_cli.studies.train import TrainingPlan, train
 from mavfi_cli.vpm.model import DETECTORS, Scheme, schemes_with
@@ -31,7 +31,7 @@ from mavfi_cli.vpm.report import CHAINS, Choices, report, setting_of
 from mavfi_cli.vpm.vehicle import ModelVehicle
 
 WORLDS = ("sparse", "dense")
-FLOWN, TRAINING = "flown", "training"
+FLOWN, TRAINING, FLIGHTS = "flown", "training", "flights"  # folders
 PLATFORM = "x86"  # platform whose latencies are scaled by default
 
 
@@ -62,9 +62,10 @@ class RedundancyPlan:
     def models_told(self) -> str:
         """Origin of the detectors' models."""
         if self.train:
-            worlds = ", ".join(TRAINING_WORLDS)
-            flown = f"{self.train} error-free flights in each of {worlds} at its safe velocity"
-            return f"fitted for each vehicle to {flown}"
+            return (
+                f"fitted for each vehicle to {self.train} error-free flights in each of "
+                f"{', '.join(TRAINING_WORLDS)} at its safe velocity"
+            )
         if self.models is not None:
             return f"of {self.models}"
         return "the shipped ones, fitted to flights of the Solo at 3 m/s"
@@ -84,67 +85,40 @@ class RedundancyPlan:
         ]
 
 
-def _make_plans(
-    plan: RedundancyPlan, schemes: Sequence[Scheme], options: Options, spectator: Spectator
-) -> dict[Key, FlightPlan | str]:
-    """Make a plan, or a reason for its absence, for each vehicle and scheme; write the files.
-
-    Args:
-        options, spectator: for the flights to which detectors are fitted, if requested.
-    """
-    require_distinct(plan.worlds, "world")
-    if plan.train:
-        _require_held_out(plan)
-    for world in plan.worlds:
-        check_names(MissionConfig(world=world, seed=plan.first_seed, stack=plan.stack), ask_vehicle)
-    return {
-        (vehicle.name, scheme): each
-        for vehicle in plan.vehicles
-        for scheme, each in _plans_of(plan, vehicle, schemes, options, spectator)
-    }
-
-
 def _plans_of(
     plan: RedundancyPlan,
     vehicle: ModelVehicle,
     schemes: Sequence[Scheme],
     options: Options,
     spectator: Spectator,
-) -> Iterator[tuple[str, FlightPlan | str]]:
-    """The schemes of a vehicle, one board without protection first."""
+) -> Iterator[tuple[Key, FlightPlan | str]]:
+    """Each scheme's plan or the reason for its absence; the first one has one bare board.
+
+    Args:
+        options, spectator: for the flights to which detectors are fitted, if requested.
+    """
     platform = plan.choices.platform or load_platform(PLATFORM)
-    chain = CHAINS[plan.choices.chain][0]
-    chain_s = chain([kernel.latency_s for kernel in platform.kernels.values()])
+    chain_s = CHAINS[plan.choices.chain][0]([k.latency_s for k in platform.kernels.values()])
     setting, models = setting_of(vehicle, plan.choices), plan.models
     folder = plan.folder.absolute() / FLOWN
     refused: dict[int, str | None] = {}  # number of boards -> the simulator's answer
     for scheme in schemes:
+        bare, key = scheme.name == BASE, (vehicle.name, scheme.name)
         try:
             each = flight_plan(setting, scheme, platform, chain_s, folder, models, plan.stack)
-        except CannotLift as error:
-            if scheme.name == BASE:
+            if each.mission.detector is not None:
+                detector_of(each.mission.detector, each.mission.stack)
+            write_files(each)
+            if scheme.copies not in refused:
+                ask_vehicle(replace(each.mission, world=plan.worlds[0], seed=plan.first_seed))
+                refused[scheme.copies] = None
+        except (CannotLift, VehicleProcessError) as error:
+            if bare:
                 raise
-            yield scheme.name, str(error)
-            continue
-        if each.mission.detector is not None:
-            detector_of(each.mission.detector, each.mission.stack)
-        write_files(each)
-        if scheme.copies not in refused:
-            refused[scheme.copies] = _refusal(plan, each, bare=scheme.name == BASE)
-        yield scheme.name, refused[scheme.copies] or each
-        if scheme.name == BASE and plan.train:
+            refused[scheme.copies] = str(error)
+        yield key, refused[scheme.copies] or each
+        if bare and plan.train:
             models = fitted(plan, vehicle.name, each, options, spectator)
-
-
-def _refusal(plan: RedundancyPlan, flown: FlightPlan, *, bare: bool) -> str | None:
-    """Why the simulator cannot fly this many boards; an error for one board."""
-    try:
-        ask_vehicle(replace(flown.mission, world=plan.worlds[0], seed=plan.first_seed))
-    except VehicleProcessError as error:
-        if bare:
-            raise
-        return str(error)
-    return None
 
 
 def fitted(
@@ -179,9 +153,6 @@ def _require_held_out(plan: RedundancyPlan) -> None:
         )
 
 
-FLIGHTS = "flights"
-
-
 def fly_and_report(
     plan: RedundancyPlan,
     overheads: Mapping[str, tuple[float, str]],
@@ -199,30 +170,27 @@ def fly_and_report(
     Raises:
         MavfiError: as `run_campaign`; a world or vehicle that does not exist.
     """
+    require_named("world", plan.worlds)
+    if plan.train:
+        _require_held_out(plan)
+    for world in plan.worlds:
+        check_names(MissionConfig(world=world, seed=plan.first_seed, stack=plan.stack))
     schemes = schemes_with(overheads)
-    plans = _make_plans(plan, schemes, options, spectator)
-    flown = {key: each for key, each in plans.items() if isinstance(each, FlightPlan)}
-    missions = plan.list_of(flown)
-    with run_campaign(
-        missions, plan.folder / FLIGHTS, replace(options, keep=Keep.NONE), spectator, append=True
-    ) as ledger:
-        table = flights(ledger, missions)
-        arms = {key: chosen(table, label_group=key[0], label_arm=key[1]) for key in flown}
+    plans = {
+        key: each
+        for vehicle in plan.vehicles
+        for key, each in _plans_of(plan, vehicle, schemes, options, spectator)
+    }
+    missions = plan.list_of({k: each for k, each in plans.items() if isinstance(each, FlightPlan)})
+    table = fly(missions, plan.folder / FLIGHTS, Keep.NONE, options, spectator)
+    arms = {key: chosen(table, label_group=key[0], label_arm=key[1]) for key in plans}
+    watched = [flown(arms[key])["number"].to_pylist() for key in plans if key[1] in DETECTORS]
+    with Ledger(plan.folder / FLIGHTS) as ledger:
         measured = compute_overheads(
-            each.result
-            for (_, scheme), arm in arms.items()
-            if scheme in DETECTORS
-            for each in ledger.results(arm["number"].to_pylist())
-            if each.state is ResultState.FLOWN
+            each.result for numbers in watched for each in ledger.results(numbers)
         )
     beside = {
-        key: Beside(
-            plan=each,
-            flights=chosen(arms[key], state=ResultState.FLOWN.value) if key in arms else None,
-            errors=tuple(chosen(arms[key], state=ResultState.ERROR.value)["reason"].to_pylist())
-            if key in arms
-            else (),
-        )
+        key: Beside(plan=each, flights=flown(arms[key]), errors=errors(arms[key], "{reason}"))
         for key, each in plans.items()
     }
     found = {name: (100.0 * each.share, each.told("--fly")) for name, each in measured.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -13,15 +14,16 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.vpm.calibrate import Calibrated, calibrated
 from mavfi_cli.vpm.model import (
+    DETECTORS,
     KNEE_SHARE,
     REFERENCE,
+    TABLE_V,
     ModelInputs,
     Scheme,
     SchemePerformance,
     named,
     outcome,
     safe_velocity_mps,
-    unlike_sources,
 )
 from mavfi_cli.vpm.vehicle import SMALLEST, Board, ModelVehicle, load_board
 
@@ -31,7 +33,12 @@ CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
     "pipelined": (max, "slowest"),
 }
 OTHER_BOARD = "tx2"  # calibrations are repeated with this heavier board
-RATIOS = ("velocity", "flight_time", "energy", "missions")
+RATIOS = {
+    "velocity_ratio": "velocity_mps",
+    "flight_time_ratio": "flight_time_s",
+    "energy_ratio": "energy_j",
+    "missions_ratio": "missions",
+}
 _CURVE_HZ = np.logspace(-1.0, 3.0, 161)
 _COMMAND = "command line"
 _FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # units of what a calibration sets
@@ -63,9 +70,22 @@ def report(
         "knee_velocity_over_roof_ratio": KNEE_SHARE,
         "distance_m": choices.distance_m,
         "ratios_over": REFERENCE,
-        "notes": [note for note in (unlike_sources(schemes),) if note],
+        "notes": _unlike_sources(schemes),
         "vehicles": [_one(vehicle, choices, schemes) for vehicle in vehicles],
     }
+
+
+def _unlike_sources(schemes: tuple[Scheme, ...]) -> list[str]:
+    """A note if one detector's overhead is from the paper and another's is not."""
+    detectors = [scheme for scheme in schemes if scheme.name in DETECTORS]
+    papers = [scheme.name for scheme in detectors if scheme.source == TABLE_V]
+    others = [scheme.name for scheme in detectors if scheme.source != TABLE_V]
+    if not papers or not others:
+        return []
+    return [
+        f"the overhead of {' and '.join(papers)} is the paper's and that of {' and '.join(others)} "
+        "is not: different sources, so these rows are not to be ranked"
+    ]
 
 
 def _one(vehicle: ModelVehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
@@ -215,7 +235,7 @@ def _row(setting: ModelInputs, scheme: Scheme, reference: SchemePerformance) -> 
     }  # fmt: skip
     numbers = [key.name for key in fields(SchemePerformance) if key.name not in ("scheme", "bound")]
     if setting.velocity_mps(scheme) is None:
-        nothing = dict.fromkeys([*numbers, *(f"{name}_ratio" for name in RATIOS), "bound"])
+        nothing = dict.fromkeys([*numbers, *RATIOS, "bound"])
         weights = {"mass_kg": setting.mass_kg(scheme.copies),
                    "compute_kg": setting.carried_kg(scheme.copies)}  # fmt: skip
         return {**told, **nothing, **weights, "problem": str(setting.too_heavy(scheme.copies))}
@@ -224,10 +244,7 @@ def _row(setting: ModelInputs, scheme: Scheme, reference: SchemePerformance) -> 
         **told,
         **{key: getattr(flown, key) for key in numbers},
         "bound": flown.bound.value,
-        "velocity_ratio": flown.velocity_mps / reference.velocity_mps,
-        "flight_time_ratio": flown.flight_time_s / reference.flight_time_s,
-        "energy_ratio": flown.energy_j / reference.energy_j,
-        "missions_ratio": flown.missions / reference.missions,
+        **{ratio: getattr(flown, of) / getattr(reference, of) for ratio, of in RATIOS.items()},
         "problem": None,
     }
 
@@ -268,41 +285,27 @@ def _curves(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> dict[str, Any]
     }
 
 
-def schemes_of(told: dict[str, Any]) -> list[dict[str, Any]]:
-    """One flat row for each vehicle and scheme, for CSV."""
-    return [
-        {"vehicle": one["vehicle"], "board": one["board"], "distance_m": told["distance_m"], **row}
-        for one in told["vehicles"]
-        for row in one["schemes"]
-    ]
-
-
 FACTORS = (0.5, 0.8, 1.25, 2.0)
 _STEP = 1.001  # factor of the numerical derivative
 
 
-def _with_range(setting: ModelInputs, factor: float) -> ModelInputs:
-    return replace(setting, range_m=factor * setting.range_m)
-
-
-def _with_response(setting: ModelInputs, factor: float) -> ModelInputs:
-    return replace(setting, compute_s=factor * setting.compute_s)
-
-
-def _with_mass(setting: ModelInputs, factor: float) -> ModelInputs:
-    return replace(setting, board=replace(setting.board, mass_kg=factor * setting.board.mass_kg))
-
-
-def _with_power(setting: ModelInputs, factor: float) -> ModelInputs:
-    return replace(setting, board=replace(setting.board, power_w=factor * setting.board.power_w))
-
-
-_PARAMETERS: dict[str, tuple[str, Callable[[ModelInputs], float], Callable[..., ModelInputs]]] = {
-    "sensing range": ("m", lambda setting: setting.range_m, _with_range),
-    "response time": ("s", lambda setting: setting.compute_s, _with_response),
-    "board mass": ("kg", lambda setting: setting.board.mass_kg, _with_mass),
-    "board power": ("W", lambda setting: setting.board.power_w, _with_power),
+# name -> unit, and field of the inputs
+_PARAMETERS = {
+    "sensing range": ("m", "range_m"),
+    "response time": ("s", "compute_s"),
+    "board mass": ("kg", "board.mass_kg"),
+    "board power": ("W", "board.power_w"),
 }
+
+
+def _scaled(setting: ModelInputs, field: str, factor: float) -> ModelInputs:
+    """The inputs with one of them times a factor."""
+    value = factor * attrgetter(field)(setting)
+    if field.startswith("board."):
+        return replace(
+            setting, board=replace(setting.board, **{field.removeprefix("board."): value})
+        )
+    return replace(setting, **{field: value})
 
 
 def _sensitivity(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> list[dict[str, Any]]:
@@ -314,11 +317,11 @@ def _sensitivity(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> list[dict
     fly. Power also changes the mass of the heat sink.
     """
     rows = []
-    for name, (unit, value, scaled) in _PARAMETERS.items():
-        middle = value(setting)
+    for name, (unit, field) in _PARAMETERS.items():
+        middle = attrgetter(field)(setting)
         if middle == 0.0:
             continue
-        below, above = (_answers(scaled(setting, f), schemes) for f in (1.0 / _STEP, _STEP))
+        below, above = (_answers(_scaled(setting, field, f), schemes) for f in (1.0 / _STEP, _STEP))
         slopes = [
             None if low is None or high is None else math.log(high / low) / (2 * math.log(_STEP))
             for low, high in zip(below, above, strict=True)
@@ -331,7 +334,7 @@ def _sensitivity(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> list[dict
                 "velocity_elasticity_ratio": slopes[0],
                 "tmr_time_elasticity_ratio": slopes[1],
                 "points": [
-                    _point(scaled(setting, factor), schemes, factor * middle) for factor in FACTORS
+                    _point(_scaled(setting, field, f), schemes, f * middle) for f in FACTORS
                 ],
             }
         )

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.campaigns import begin as beginning
-from mavfi_cli.campaigns.begin import begin, fixed_world
+from mavfi_cli.campaigns.begin import begin, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.specification import FixedWorld
 from mavfi_cli.campaigns.specification_file import parse_spec, replaced, to_toml
@@ -45,7 +45,7 @@ def begun(campaign, monkeypatch):
         with begin(
             spec, campaign.folder, options=campaign.options, spectator=campaign.notes, **how
         ) as ledger:
-            return fixed_world(ledger), [row[3] for row in ledger.rows()]
+            return stored_spec(ledger).fixed_world, [row[3] for row in ledger.rows()]
 
     return of
 

@@ -12,11 +12,11 @@ from mavfi_cli.campaigns.missions import (
     PlannedMission,
     ResultState,
     changes_of,
-    config_from,
     golden_of,
     injected_of,
     pair_of,
 )
+from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig
@@ -49,7 +49,7 @@ def written(folder, count=3):
 @pytest.mark.parametrize("config", CONFIGS)
 def test_a_mission_comes_back_as_it_was(tmp_path, config):
     mission = PlannedMission(config=config, labels={"bits": 3, "stage": None})
-    assert config_from(changes_of(config)) == config
+    assert structure(changes_of(config), MissionConfig) == config
     with Ledger(tmp_path, writing=True) as ledger:
         ledger.plan([mission])
         ledger.add(0, **ROW)

@@ -10,7 +10,7 @@ from plans import planned
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.campaigns.specification import Stop
 from mavfi_cli.campaigns.stopping import BatchLimiter, Queue
-from mavfi_cli.stats.shares import half_width, rate
+from mavfi_cli.stats.shares import rate
 
 STOP = Stop(margin=0.12, batch=10)
 
@@ -43,12 +43,14 @@ def test_slots_and_order_make_no_difference(outcomes, seed):
     assert gate.stopped == same.stopped
     for cell in (0, 1):
         mine = [outcomes[number] for number in flown if cells[number] == cell]
-        width = half_width(rate(mine.count("success"), len(mine)))
+        share = rate(mine.count("success"), len(mine))
+        width = (share.high - share.low) / 2
         assert len(mine) % STOP.batch == 0
         assert len(mine) == 60 or width <= STOP.margin
         if len(mine) > STOP.batch:
             before = mine[: -STOP.batch]
-            assert half_width(rate(before.count("success"), len(before))) > STOP.margin
+            share = rate(before.count("success"), len(before))
+            assert (share.high - share.low) / 2 > STOP.margin
 
 
 def test_faults_that_did_nothing_make_no_interval_narrow():

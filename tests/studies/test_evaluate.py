@@ -12,7 +12,8 @@ from mavfi_cli.core.files import write_json
 from mavfi_cli.report.detector_plots import draw_recovery_plot, draw_roc_plot
 from mavfi_cli.report.drawing import write_svg
 from mavfi_cli.report.tables.detectors import detector_csv, detector_lines
-from mavfi_cli.studies.evaluate import EvaluationPlan, told
+from mavfi_cli.studies.evaluate import told
+from mavfi_cli.studies.evaluation_plan import EvaluationPlan
 
 # The thresholds of the plan are not used: scores are given.
 PLAN = EvaluationPlan(worlds=("dense", "farm"), detectors=("gad",), flights=2, golden_flights=2)

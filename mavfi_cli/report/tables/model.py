@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.report.tables.columns import columns as aligned
-from mavfi_cli.report.tables.columns import csv_text, wrapped
-from mavfi_cli.vpm.report import schemes_of
+from mavfi_cli.report.tables.columns import columns, csv_text, wrapped
+from mavfi_cli.vpm.report import RATIOS
 
 
 def model_lines(told: Mapping[str, Any]) -> list[str]:
@@ -26,7 +25,11 @@ def model_lines(told: Mapping[str, Any]) -> list[str]:
 
 def model_csv(told: Mapping[str, Any]) -> str:
     """CSV text, one row per vehicle and scheme; the header names the units."""
-    return csv_text(schemes_of(dict(told)))
+    return csv_text(
+        {"vehicle": one["vehicle"], "board": one["board"], "distance_m": told["distance_m"], **row}
+        for one in told["vehicles"]
+        for row in one["schemes"]
+    )
 
 
 def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
@@ -34,33 +37,32 @@ def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
     yield f"== {one['vehicle']}{title}; board {one['board']} =="
     yield from (f"Note: {note}" for note in one["notes"])
     flying = [row for row in one["schemes"] if row["problem"] is None]
-    yield from columns(
+    yield from columns([
         ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof", "knee"],
-        [[row["scheme"], f"{row['boards']}", f"{row['compute_kg']:.3f} kg",
-          f"{row['mass_kg']:.3f} kg", f"{row['thrust_to_weight']:.2f} N/N",
-          f"{row['acceleration_mps2']:.2f} m/s²", f"{row['roof_mps']:.2f} m/s",
-          f"{row['knee_hz']:.1f} Hz"]
-         for row in flying],
-    )  # fmt: skip
+        *([row["scheme"], f"{row['boards']}", f"{row['compute_kg']:.3f} kg",
+           f"{row['mass_kg']:.3f} kg", f"{row['thrust_to_weight']:.2f} N/N",
+           f"{row['acceleration_mps2']:.2f} m/s²", f"{row['roof_mps']:.2f} m/s",
+           f"{row['knee_hz']:.1f} Hz"]
+          for row in flying),
+    ])  # fmt: skip
     yield ""
-    yield from columns(
+    yield from columns([
         ["scheme", "overhead", "throughput", "velocity", "bound by", "sensor ceiling",
          "compute ceiling"],
-        [[row["scheme"], f"{row['overhead_percent']:.4g} %", f"{row['throughput_hz']:.3f} Hz",
-          f"{row['velocity_mps']:.3f} m/s", row["bound"], f"{row['sensor_ceiling_mps']:.2f} m/s",
-          f"{row['compute_ceiling_mps']:.2f} m/s"]
-         for row in flying],
-    )  # fmt: skip
+        *([row["scheme"], f"{row['overhead_percent']:.4g} %", f"{row['throughput_hz']:.3f} Hz",
+           f"{row['velocity_mps']:.3f} m/s", row["bound"], f"{row['sensor_ceiling_mps']:.2f} m/s",
+           f"{row['compute_ceiling_mps']:.2f} m/s"]
+          for row in flying),
+    ])  # fmt: skip
     yield ""
-    yield from columns(
+    yield from columns([
         [f"over {over}", "velocity", "time", "energy", "missions", "flight time", "power",
          "energy", "a charge"],
-        [[row["scheme"], *(f"x {row[f'{name}_ratio']:.4f}"
-                           for name in ("velocity", "flight_time", "energy", "missions")),
-          f"{row['flight_time_s']:.1f} s", f"{row['power_w']:.1f} W",
-          f"{row['energy_j'] / 1000:.2f} kJ", f"{row['missions']:.1f} missions"]
-         for row in flying],
-    )  # fmt: skip
+        *([row["scheme"], *(f"x {row[name]:.4f}" for name in RATIOS),
+           f"{row['flight_time_s']:.1f} s", f"{row['power_w']:.1f} W",
+           f"{row['energy_j'] / 1000:.2f} kJ", f"{row['missions']:.1f} missions"]
+          for row in flying),
+    ])  # fmt: skip
     for row in one["schemes"]:
         if row["problem"] is not None:
             yield f"{row['scheme']}: {row['problem']}"
@@ -79,7 +81,7 @@ def _sensitivity(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             f"  {row['parameter']} {row['value']:.4g} {row['unit']}; 1 % more: velocity {told[0]}, "
             f"TMR's time ratio {told[1]}"
         )
-        yield from columns([], [_point(point, row["unit"]) for point in row["points"]])
+        yield from columns(_point(point, row["unit"]) for point in row["points"])
 
 
 def _point(point: Mapping[str, Any], unit: str) -> list[str]:
@@ -96,13 +98,13 @@ def _calibrations(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         return
     yield ""
     yield "Paper, Fig. 15, flight time over detection and recovery; one number is calibrated:"
-    yield from columns(
+    yield from columns([
         ["  board", "a copy", "calibrated", "TMR", "paper's TMR", "DMR, predicted"],
-        [[f"  {row['board']}", f"{1000 * row['board_kg']:.0f} g",
-          f"{row['parameter']} = {row['value']:.4g} {row['unit']}", f"x {row['tmr_ratio']:.4f}",
-          f"x {row['published_tmr_ratio']:g}", f"x {row['predicted_dmr_ratio']:.4f}"]
-         for row in rows],
-    )  # fmt: skip
+        *([f"  {row['board']}", f"{1000 * row['board_kg']:.0f} g",
+           f"{row['parameter']} = {row['value']:.4g} {row['unit']}", f"x {row['tmr_ratio']:.4f}",
+           f"x {row['published_tmr_ratio']:g}", f"x {row['predicted_dmr_ratio']:.4f}"]
+          for row in rows),
+    ])  # fmt: skip
 
 
 def _sources(one: Mapping[str, Any]) -> Iterator[str]:
@@ -117,8 +119,3 @@ def _sources(one: Mapping[str, Any]) -> Iterator[str]:
         for row in one["schemes"]
     ]
     yield from wrapped(rows)
-
-
-def columns(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """Left-aligned columns, with an optional head."""
-    yield from aligned([head, *rows] if head else rows)

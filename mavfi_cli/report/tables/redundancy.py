@@ -7,18 +7,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
-from mavfi_cli.report.tables.columns import csv_text, wrapped
-from mavfi_cli.report.tables.model import columns
+from mavfi_cli.report.tables.columns import columns, csv_text, wrapped
 
 MANY_ALARMS = 10.0  # alarms of an error-free flight; more is not the detector's usual rate
 _NUMBERS = (
-    # name, unit in the key, unit as printed, factor, digits, heading
-    ("velocity", "_mps", "m/s", 1.0, 2, "Mean velocity against the model's safe velocity"),
-    ("top_velocity", "_mps", "m/s", 1.0, 2, "Top velocity against it"),
-    ("flight_time", "_s", "s", 1.0, 1, "Flight time"),
-    ("energy", "_j", "kJ", 1.0e-3, 2, "Energy of rotors and boards"),
-    ("response", "_s", "s", 1.0, 3, "Response time, median"),
+    # heading, name, unit in the key, unit as printed, factor, digits
+    ("Mean velocity against the model's safe velocity", "velocity", "_mps", "m/s", 1.0, 2),
+    ("Top velocity against it", "top_velocity", "_mps", "m/s", 1.0, 2),
+    ("Flight time", "flight_time", "_s", "s", 1.0, 1),
+    ("Energy of rotors and boards", "energy", "_j", "kJ", 1.0e-3, 2),
+    ("Response time, median", "response", "_s", "s", 1.0, 3),
 )
+_HEAD = ["scheme", "model", "flight", "", "flight against model"]
 _RATIOS = (("velocity", "Velocity"), ("flight_time", "Flight time"), ("energy", "Energy"))
 
 
@@ -58,23 +58,21 @@ def redundancy_csv(flights: Mapping[str, Any]) -> str:
 def _vehicle(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str]:
     yield f"== {one['vehicle']} flown, board {one['board']} =="
     rows = [row for row in one["schemes"] if row["problem"] is None]
-    yield from columns(
+    yield from columns([
         ["scheme", "mass", "v-max", "a-max", "safe, braking", "success", "ends"],
-        [[row["scheme"], f"{row['mass_kg']:.3f} kg", f"{row['v_max_mps']:.3f} m/s",
-          f"{row['a_max_mps2']:.2f} m/s²", f"{row['braking_velocity_mps']:.3f} m/s",
-          _success(row), _ends(row)]
-         for row in rows],
-    )  # fmt: skip
-    for name, key, unit, factor, digits, heading in _NUMBERS:
+        *([row["scheme"], f"{row['mass_kg']:.3f} kg", f"{row['v_max_mps']:.3f} m/s",
+           f"{row['a_max_mps2']:.2f} m/s²", f"{row['braking_velocity_mps']:.3f} m/s",
+           _success(row), ", ".join(f"{count} {name}" for name, count in row["outcomes"].items())]
+          for row in rows),
+    ])  # fmt: skip
+    for heading, name, key, unit, factor, digits in _NUMBERS:
         yield ""
         yield f"{heading}:"
-        yield from columns(
-            ["scheme", "model", "flight", "", "flight against model"],
-            [_number(row, name, key, unit, factor, digits) for row in rows],
-        )
+        told = (_number(row, name, key, unit, factor, digits) for row in rows)
+        yield from columns([_HEAD, *told])
     yield ""
     yield "Why flights take longer than the model says:"
-    yield from columns(["scheme", "path", "pace", "replans", "alarms"], [_why(r) for r in rows])
+    yield from columns([["scheme", "path", "pace", "replans", "alarms"], *(_why(r) for r in rows)])
     over, paper = flights["ratios_over"], flights["paper_ratios_over"]
     for name, title, suffix in (
         *((name, f"{title} over {over}", "") for name, title in _RATIOS),
@@ -82,10 +80,8 @@ def _vehicle(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str
     ):
         yield ""
         yield f"{title}:"
-        yield from columns(
-            ["scheme", "model", "flight", "", "flight against model"],
-            [_ratio(row, name, suffix) for row in rows if f"pairs{suffix}" in row],
-        )
+        told = (_ratio(row, name, suffix) for row in rows if f"pairs{suffix}" in row)
+        yield from columns([_HEAD, *told])
     for row in one["schemes"]:
         yield from _remarks(row)
 
@@ -95,10 +91,6 @@ def _success(row: Mapping[str, Any]) -> str:
         f"{row['success_percent']:.0f} % ({row['success_low_percent']:.0f} to "
         f"{row['success_high_percent']:.0f} %)"
     )
-
-
-def _ends(row: Mapping[str, Any]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in row["outcomes"].items())
 
 
 def _number(
@@ -157,7 +149,11 @@ def _remarks(row: Mapping[str, Any]) -> Iterator[str]:
             f"{row['scheme']}: an overhead of {row['overhead_percent']:.4g} % in its flights and "
             "in the model beside them"
         )
-    yield from _false_alarms(row)
+    if row["flight_alarms"] >= MANY_ALARMS:
+        yield (
+            f"{row['scheme']}: {row['flight_alarms']:.0f} alarms in a flight without a fault: its "
+            "model was fitted to other flights; --train fits one to these"
+        )
     if row["cut"]:
         yield f"{row['scheme']}: flown with {', '.join(row['cut'])}"
     if row["errors"]:
@@ -165,25 +161,17 @@ def _remarks(row: Mapping[str, Any]) -> Iterator[str]:
         yield f"{row['scheme']}: {many} could not begin, the first: {row['errors'][0]}"
 
 
-def _false_alarms(row: Mapping[str, Any]) -> Iterator[str]:
-    if row["flight_alarms"] >= MANY_ALARMS:
-        yield (
-            f"{row['scheme']}: {row['flight_alarms']:.0f} alarms in a flight without a fault: its "
-            "model was fitted to other flights; --train fits one to these"
-        )
-
-
 def _overheads(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     if not rows:
         yield "Overhead of detection and recovery: no flight with a detector"
         return
     yield "Overhead of detection and recovery, of the kernels' time on the flights' platform:"
-    yield from columns(
+    yield from columns([
         ["detector", "measured", "of it checks", "paper", "recomputations",
          "checks of this host's kernel time"],
-        [[row["detector"], f"{row['measured_percent']:.4g} %", f"{row['checks_percent']:.4g} %",
-          f"{row['paper_percent']:.4g} %", f"{row['alarms']} in {row['flights']} flights",
-          f"{row['checks_of_host_kernels_percent']:.4g} %"]
-         for row in rows],
-    )  # fmt: skip
+        *([row["detector"], f"{row['measured_percent']:.4g} %", f"{row['checks_percent']:.4g} %",
+           f"{row['paper_percent']:.4g} %", f"{row['alarms']} in {row['flights']} flights",
+           f"{row['checks_of_host_kernels_percent']:.4g} %"]
+          for row in rows),
+    ])  # fmt: skip
     yield f"({HOST_CHECKS})"
