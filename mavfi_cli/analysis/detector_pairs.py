@@ -72,8 +72,20 @@ def _lengthening(golden: Flight, flown: Flight) -> float | None:
     return float(flown["flight_time_s"] / golden["flight_time_s"] - 1.0)
 
 
-def _ended(prefix: str, flown: Flight) -> dict[str, Any]:
-    return {f"{prefix}outcome": flown["outcome"], f"{prefix}time_s": flown["flight_time_s"]}
+def _common(kind: str, golden: Flight, flown: Flight) -> dict[str, Any]:
+    """Columns of all pairs."""
+    return {
+        "kind": kind,
+        "golden_outcome": golden["outcome"],
+        "golden_time_s": golden["flight_time_s"],
+        "golden_won": golden["succeeded"],
+        "outcome": flown["outcome"],
+        "time_s": flown["flight_time_s"],
+        "won": flown["succeeded"],
+        "lengthening": _lengthening(golden, flown),
+        "alarms": flown["alarm_count"] or 0,
+        "episodes": flown["episodes"],
+    }
 
 
 def _first_alarm(flown: Flight, from_s: float | None) -> Mapping[str, Any] | None:
@@ -87,20 +99,8 @@ def error_free_pair(
     world: str, seed: int, detector: str, golden: Flight, watched: Flight
 ) -> dict[str, Any]:
     """A golden flight and the same with a detector, as a row of SCHEMA."""
-    return {
-        "kind": ERROR_FREE,
-        "world": world,
-        "seed": seed,
-        "detector": detector,
-        **_ended("golden_", golden),
-        **_ended("", watched),
-        "lengthening": _lengthening(golden, watched),
-        "alarms": watched["alarm_count"] or 0,
-        "episodes": watched["episodes"],
-        "golden_won": golden["succeeded"],
-        "won": watched["succeeded"],
-        "golden_path": golden["path"],
-    }
+    labels = {"world": world, "seed": seed, "detector": detector}
+    return {**labels, **_common(ERROR_FREE, golden, watched), "golden_path": golden["path"]}
 
 
 def fault_pair(
@@ -129,28 +129,22 @@ def fault_pair(
     struck_s = protected["struck_s"]
     alarm = _first_alarm(protected, struck_s)
     return {
-        "kind": FAULT,
         **labels,
+        **_common(FAULT, golden, protected),
         "state": "+".join(faulty["struck_sites"]) or labels["target"],
         "bits": " ".join(map(str, faulty["first_bits"])),
         "injected": faulty["injected"],
         "harm": harm.value if active else "",
         "crashed": faulty["crashed"],
-        **_ended("golden_", golden),
-        **_ended("faulty_", faulty),
-        **_ended("", protected),
-        "lengthening": _lengthening(golden, protected),
+        "faulty_outcome": faulty["outcome"],
+        "faulty_time_s": faulty["flight_time_s"],
         "struck_s": struck_s,
         "alarm_s": alarm and alarm["stamp_s"],
         "alarm_stage": alarm and alarm["stage"],
         "latency_s": None if alarm is None else max(0.0, alarm["stamp_s"] - struck_s),
         "by_chance": _first_alarm(watched, struck_s) is not None,
         "remaining_harm": remaining.value if active else "",
-        "alarms": protected["alarm_count"] or 0,
-        "episodes": protected["episodes"],
-        "golden_won": golden["succeeded"],
         "faulty_won": faulty["succeeded"],
-        "won": protected["succeeded"],
         "active": active,
         "struck": struck_s is not None,
         "seen": alarm is not None,
@@ -172,11 +166,21 @@ def pairs_of(
         complete: whether all faults of the mission with this seed are flown with detectors.
     """
     known = {place: row for table in flights for place, row in _placed(table)}
-    chosen = [(place, row) for place, row in known.items() if place[1] in detectors]
-    return (
-        pa.Table.from_pylist([*_error_free(known, chosen)], SCHEMA),
-        pa.Table.from_pylist([*_faults(known, chosen, complete)], SCHEMA),
-    )
+    free, struck = [], []
+    for (kind, detector, key), flight in known.items():
+        mission = (*key[:2], *[None] * (len(KEY) - 2))
+        golden = known.get((ERROR_FREE, NONE, mission))
+        watched = known.get((ERROR_FREE, detector, mission))
+        faulty = known.get((kind, NONE, key))
+        if detector not in detectors or golden is None:
+            continue
+        if kind == ERROR_FREE:
+            free.append(error_free_pair(key[0], key[1], detector, golden, flight))
+        elif watched is not None and faulty is not None:
+            labels = {**dict(zip(KEY, key, strict=True)), "detector": detector}
+            whole = complete(key[1])
+            struck.append(fault_pair(labels, golden, faulty, watched, flight, complete=whole))
+    return pa.Table.from_pylist(free, SCHEMA), pa.Table.from_pylist(struck, SCHEMA)
 
 
 def _placed(table: pa.Table) -> Iterator[tuple[Place, Flight]]:
@@ -184,31 +188,6 @@ def _placed(table: pa.Table) -> Iterator[tuple[Place, Flight]]:
     for row in table.select([*(f"label_{name}" for name in names), *WANTED]).to_pylist():
         key = tuple(row.get(f"label_{name}") for name in KEY)
         yield (str(row["label_kind"]), str(row["label_detector"]), key), row
-
-
-def _error_free(
-    known: Mapping[Place, Flight], chosen: Iterable[tuple[Place, Flight]]
-) -> Iterator[dict[str, Any]]:
-    for (kind, detector, key), watched in chosen:
-        golden = known.get((ERROR_FREE, NONE, key))
-        if kind == ERROR_FREE and golden is not None:
-            yield error_free_pair(key[0], key[1], detector, golden, watched)
-
-
-def _faults(
-    known: Mapping[Place, Flight],
-    chosen: Iterable[tuple[Place, Flight]],
-    complete: Callable[[int], bool],
-) -> Iterator[dict[str, Any]]:
-    for (kind, detector, key), protected in chosen:
-        mission = (*key[:2], *[None] * (len(KEY) - 2))
-        golden = known.get((ERROR_FREE, NONE, mission))
-        watched = known.get((ERROR_FREE, detector, mission))
-        faulty = known.get((kind, NONE, key))
-        if kind == ERROR_FREE or golden is None or watched is None or faulty is None:
-            continue
-        labels = {**dict(zip(KEY, key, strict=True)), "detector": detector}
-        yield fault_pair(labels, golden, faulty, watched, protected, complete=complete(key[1]))
 
 
 def harmful(faults: pa.Table) -> pa.Table:

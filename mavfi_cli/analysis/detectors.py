@@ -97,17 +97,15 @@ def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[dict[str, A
     return rows
 
 
-def _curves(harmful: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
-    """Curves over all faults, and the areas of each stage and bit field."""
-    table = asdict(curves(harmful["score"].to_pylist(), error_free))
+def _curves(scores: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
+    """Curves over all harmful faults, and the areas of each stage and bit field."""
     told = ("positives", "area", "area_low", "area_high", "average_precision")
-    table["areas"] = []
+    areas = []
     for by in ("stage", "field"):
-        for value in pc.unique(harmful[by]).to_pylist():
-            part = curves(chosen(harmful, **{by: value})["score"].to_pylist(), error_free)
-            numbers_of = {name: getattr(part, name) for name in told}
-            table["areas"].append({"by": by, "value": value, **numbers_of})
-    return table
+        for value in pc.unique(scores[by]).to_pylist():
+            part = curves(chosen(scores, **{by: value})["score"].to_pylist(), error_free)
+            areas.append({"by": by, "value": value, **{name: part[name] for name in told}})
+    return {**curves(scores["score"].to_pylist(), error_free), "areas": areas}
 
 
 # Without faults -------------------------------------------------------------------------------
@@ -221,7 +219,7 @@ def fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
             "golden": _share(active, "golden_won"),
             "unprotected": _share(active, "faulty_won"),
         }.items()},
-        "protected": asdict(protected),
+        "protected": protected,
         "success": asdict(_ends(complete, "faulty_won")),
         "worst": _worst(flown),
     }  # fmt: skip

@@ -75,7 +75,7 @@ def failures(
                 "name": group.name,
                 "failure": asdict(failure),
                 "kernel": kernel,
-                "layers": None if layers is None else asdict(layers),
+                "layers": layers,
                 "per_hour": hourly,
             }
         )

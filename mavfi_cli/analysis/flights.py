@@ -27,7 +27,6 @@ from mavfi_cli.campaigns.missions import (
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.mission.record.measures import QUALITY, STRUCK, measures_of
 from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
-from mavfi_cli.stats.paired import McNemar, mcnemar
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
 FAULT = ("target", "seed", "bits", "field")
@@ -170,18 +169,15 @@ def both_succeed(first: pa.Table, second: pa.Table) -> BoolArray:
     return flags(first, "succeeded") & flags(second, "succeeded")
 
 
-def success_test(first: pa.Table, second: pa.Table) -> McNemar:
-    """McNemar's test of the success of these pairs."""
-    return mcnemar(flags(first, "succeeded"), flags(second, "succeeded"))
-
-
-def ratio(
+def changed(
     missions: Iterable[Hashable],
     first: Iterable[float],
     second: Iterable[float],
+    *,
+    ratio: bool = True,
     resamples: int = RESAMPLES,
 ) -> Interval:
-    """Geometric mean of second over first; its interval is that of the mean logarithm.
+    """Geometric mean of second over first, whose interval is that of the mean logarithm.
 
     Pairs with a value that is not positive are left out. Several pairs of one mission are not
     independent, so their mean counts as one value.
@@ -189,33 +185,15 @@ def ratio(
     Args:
         missions: key that dependent pairs share, (n,).
         first, second: values of each pair, (n,).
+        ratio: false takes the mean of second minus first, of values that may be zero.
     """
-    pairs = zip(missions, first, second, strict=True)
-    logs = [(mission, math.log(b / a)) for mission, a, b in pairs if a > 0.0 and b > 0.0]
-    found = interval(_means(logs), resamples=resamples)
-    return Interval(
-        value=math.exp(found.value),
-        low=math.exp(found.low),
-        high=math.exp(found.high),
-        count=found.count,
-    )
-
-
-def difference(
-    missions: Iterable[Hashable],
-    first: Iterable[float],
-    second: Iterable[float],
-    resamples: int = RESAMPLES,
-) -> Interval:
-    """Mean of second minus first, for values that may be zero; otherwise as `ratio`."""
-    pairs = zip(missions, first, second, strict=True)
-    changes = [(mission, b - a) for mission, a, b in pairs if not math.isnan(b - a)]
-    return interval(_means(changes), resamples=resamples)
-
-
-def _means(values: Iterable[tuple[Hashable, float]]) -> list[float]:
-    """The mean of each mission, in the order of first occurrence."""
-    found: dict[Hashable, list[float]] = {}
-    for mission, value in values:
-        found.setdefault(mission, []).append(value)
-    return [math.fsum(each) / len(each) for each in found.values()]
+    changes: dict[Hashable, list[float]] = {}
+    for mission, a, b in zip(missions, first, second, strict=True):
+        if a > 0.0 and b > 0.0 if ratio else not math.isnan(b - a):
+            changes.setdefault(mission, []).append(math.log(b / a) if ratio else b - a)
+    means = [math.fsum(each) / len(each) for each in changes.values()]
+    found = interval(means, resamples=resamples)
+    if not ratio:
+        return found
+    value, low, high = (math.exp(each) for each in (found.value, found.low, found.high))
+    return Interval(value=value, low=low, high=high, count=found.count)

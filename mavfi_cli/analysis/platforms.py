@@ -23,21 +23,19 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import (
     both_succeed,
+    changed,
     chosen,
-    difference,
     flags,
     flown,
     known,
     numbers,
     paired,
-    ratio,
-    success_test,
 )
 from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, mean, median
-from mavfi_cli.stats.paired import sign_flips, worst_case, worst_over_own
+from mavfi_cli.stats.paired import mcnemar, sign_flips, worst_case, worst_over_own
 from mavfi_cli.stats.shares import rate
 
 LATE = 0.95  # quantile given with the worst case, which has no interval
@@ -370,7 +368,7 @@ def _ratio(
     platform: str, reference: str, setting: str, first: pa.Table, second: pa.Table
 ) -> dict[str, Any]:
     pairs = paired(first, second, MISSION)
-    test = success_test(*pairs)
+    test = mcnemar(*(flags(each, "succeeded") for each in pairs))
     return {
         "platform": platform,
         "reference": reference,
@@ -388,11 +386,11 @@ def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> dict[str
         both = pa.array(both_succeed(first, second))
         first, second = first.filter(both), second.filter(both)
     before, after = (numbers(each, quantity.name).tolist() for each in (first, second))
-    change = ratio if quantity.ratio else difference
-    found = asdict(change(first["seed"].to_pylist(), before, after, resamples=RESAMPLES))
-    if quantity.ratio:
-        return {"kind": "ratio", "unit": "ratio", **found}
-    return {"kind": "difference", "unit": quantity.unit, **found}
+    found = changed(
+        first["seed"].to_pylist(), before, after, ratio=quantity.ratio, resamples=RESAMPLES
+    )
+    kind, unit = ("ratio", "ratio") if quantity.ratio else ("difference", quantity.unit)
+    return {"kind": kind, "unit": unit, **asdict(found)}
 
 
 # Descriptions of the platforms ----------------------------------------------------------------

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.campaigns.workers import TASK, AttemptEnd, LocalWorkers, Workers
-from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.campaigns.workers import TASK, AttemptEnd, CampaignStopped, LocalWorkers, Workers
 from mavfi_cli.core.fork_server import SCRATCH
 from mavfi_cli.core.versions import installed_versions, version_differences
 from mavfi_cli.mission.record.run_folder import FAULT, RESULT
@@ -37,10 +36,6 @@ _BACKLOG = 2  # missions queued for each thread, so that it never waits for us
 _LOOK_S = 2.0  # interval between queries for the number of threads
 
 
-class ClusterError(MavfiError):
-    """The cluster cannot be used."""
-
-
 class Cluster(Workers):
     """The workers of one scheduler.
 
@@ -50,8 +45,8 @@ class Cluster(Workers):
         task: the module that does the work.
 
     Raises:
-        ClusterError: dask is not installed, the scheduler does not answer, no worker connects, or
-            a worker has another version of something that results depend on.
+        CampaignStopped: dask is not installed, the scheduler does not answer, no worker connects,
+            or a worker has another version of something that results depend on.
     """
 
     def __init__(self, address: str, keep: Keep, task: str = TASK) -> None:
@@ -101,7 +96,7 @@ class Cluster(Workers):
             return AttemptEnd(number=number, lost=f"lost by the cluster: {future.exception()}")
         answer = future.result()
         if isinstance(answer, str):
-            raise ClusterError(f"a worker has other versions: {answer}")
+            raise CampaignStopped(f"a worker has other versions: {answer}")
         ended, files = answer
         for name, data in files.items():  # where the mission would have written them
             path = out / name
@@ -121,7 +116,7 @@ def _connect(address: str) -> Client:
     try:
         from distributed import Client
     except ImportError:
-        raise ClusterError(
+        raise CampaignStopped(
             "--cluster needs dask.distributed: pip install 'mavfi[cluster]'"
         ) from None
     parts = urlsplit(address)
@@ -130,12 +125,12 @@ def _connect(address: str) -> Client:
     except ValueError:  # the port is not a number
         usable = False
     if not usable:  # dask would retry for half a minute, and then raise a traceback
-        raise ClusterError(f"{address}: expected the scheduler's address, as tcp://host:8786")
+        raise CampaignStopped(f"{address}: expected the scheduler's address, as tcp://host:8786")
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         first = str(error).partition("\n")[0]
-        raise ClusterError(f"no scheduler at {address}: {first}") from None
+        raise CampaignStopped(f"no scheduler at {address}: {first}") from None
 
 
 def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> None:
@@ -143,14 +138,14 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
     try:
         client.wait_for_workers(1, timeout=WORKERS_S)
     except TimeoutError:
-        raise ClusterError(f"{address}: no worker within {WORKERS_S:g} s") from None
+        raise CampaignStopped(f"{address}: no worker within {WORKERS_S:g} s") from None
     told = client.run(_worker_versions, on_error="return")
     for worker, versions in sorted(told.items()):
         if not isinstance(versions, dict):
-            raise ClusterError(f"worker {worker} cannot fly missions: {versions!r}")
+            raise CampaignStopped(f"worker {worker} cannot fly missions: {versions!r}")
         differing = version_differences(ours, versions)
         if differing:
-            raise ClusterError(f"worker {worker} has other versions: {'; '.join(differing)}")
+            raise CampaignStopped(f"worker {worker} has other versions: {'; '.join(differing)}")
 
 
 _SMALL = (RESULT, FAULT)  # files that the runner reads of a run folder that is not kept

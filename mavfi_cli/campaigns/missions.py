@@ -27,7 +27,8 @@ class PlannedMission:
         config: the mission's configuration.
         labels: the setting that the mission belongs to; missions of equal labels are counted
             together.
-        pair: missions of equal pairs share world, start and noise; empty: by `pair_of`.
+        pair: missions of equal pairs share world, start and noise; empty: a hash of everything
+            that golden, faulty and protected flights of a pair share.
     """
 
     config: MissionConfig
@@ -36,7 +37,9 @@ class PlannedMission:
 
     def __post_init__(self) -> None:
         if not self.pair:
-            object.__setattr__(self, "pair", pair_of(self.config))
+            text = canonical(changes_of(golden_of(self.config)))
+            digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+            object.__setattr__(self, "pair", digest)
 
 
 _DEFAULT = MissionConfig()
@@ -67,12 +70,6 @@ def golden_of(config: MissionConfig) -> MissionConfig:
         each.name: each.default for each in fields(MissionConfig) if each.name in _TREATMENT
     }
     return replace(config, **bare)
-
-
-def pair_of(config: MissionConfig) -> str:
-    """A hash of everything that golden, faulty and protected flights of a pair share."""
-    text = canonical(changes_of(golden_of(config)))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def label_text(labels: Mapping[str, Any]) -> str:

@@ -6,17 +6,113 @@ import itertools
 import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
 
-from mavfi_cli.campaigns.factors import mission_of, target_of
 from mavfi_cli.campaigns.missions import Label, PlannedMission, naming
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError, nearest
 from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 SAMPLE = 20  # `sampled` keeps about one success in 20
 _WORD = 1 << 32
+
+
+# Factors: what may differ between missions, and the record that has it as a field ----------------
+
+
+class _Level(Enum):
+    """The level at which faults strike."""
+
+    SOURCE = "source"
+    INSTRUCTION = "instruction"
+
+
+_RECORDS = {_Level.SOURCE: FaultConfig, _Level.INSTRUCTION: InstructionConfig}
+# Other names in a specification for fields of the mission and of either level's fault.
+_ALIASES = {"stage": "target", "site": "target"}
+_NESTED = {"fault", "instruction", "detector"}  # written flat: see below
+_NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
+# Factors that may differ without any fault.
+MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NESTED | _NEVER)
+_DETECTOR = {"detector": "name"} | {
+    each.name: each.name for each in fields(DetectorConfig) if each.name != "name"
+}
+_FAULT = {
+    level: tuple(each.name for each in fields(record) if each.name != "seed")
+    for level, record in _RECORDS.items()
+}
+
+
+def _names() -> tuple[str, ...]:
+    fault = dict.fromkeys((*_ALIASES, "level", *_FAULT[_Level.SOURCE], *_FAULT[_Level.INSTRUCTION]))
+    return (*MISSION, *_DETECTOR, *(name for name in fault if name != "target"))
+
+
+NAMES = _names()
+
+
+def _target_of(values: Mapping[str, Any]) -> str:
+    """The target of the fault in a combination of factors; empty without a fault."""
+    return next((str(values[name]) for name in _ALIASES if name in values), "")
+
+
+def _mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> MissionConfig:
+    """The mission of a combination of factors.
+
+    Raises:
+        ConfigError: factors contradict each other, or a value has the wrong type.
+    """
+    mission = {name: values[name] for name in MISSION if name in values}
+    mission["seed"] = values.get("seed", seed)
+    mission |= _fault(values, fault_seed)
+    detector = {_DETECTOR[name]: value for name, value in values.items() if name in _DETECTOR}
+    if detector and "name" not in detector:
+        raise ConfigError(f"{', '.join(sorted(detector))}: without a detector")
+    if detector and detector["name"] != "none":
+        mission["detector"] = detector
+    return structure(mission, MissionConfig)
+
+
+def _fault(values: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """The field `fault` or `instruction` of the mission; empty without a fault."""
+    asked = {name: each for name, each in values.items() if name not in (*MISSION, *_DETECTOR)}
+    level = _member(asked.pop("level", _Level.SOURCE.value))
+    targets = [name for name in _ALIASES if name in asked]
+    if len(targets) > 1:
+        raise ConfigError("a fault strikes a stage or a site, not both")
+    fault = {_ALIASES[name] if name in targets else name: each for name, each in asked.items()}
+    for name in fault:
+        if name not in _FAULT[level]:
+            raise _no_factor(name, level)
+    if targets:
+        return {"fault" if level is _Level.SOURCE else "instruction": {**fault, "seed": seed}}
+    if asked or "level" in values:
+        named = sorted({*asked, *({"level"} & set(values))})
+        raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
+    return {}
+
+
+def _no_factor(name: str, level: _Level) -> ConfigError:
+    match = nearest(name, (*_ALIASES, *_FAULT[level]))
+    hint = f"; did you mean {match!r}?" if match else ""
+    return ConfigError(f"no factor of faults at {level.value} level{hint}", key=name)
+
+
+def _member(name: Any) -> _Level:
+    try:
+        return _Level(name)
+    except ValueError:
+        known = " or ".join(level.value for level in _Level)
+        raise ConfigError(f"expected {known}, got {name!r}", key="level") from None
+
+
+# Settings, repetitions, stopping rule, worlds -----------------------------------------------------
 
 
 class Keep(Enum):
@@ -257,9 +353,9 @@ class Spec:
         seed = values.get("seed", self.first_seed + repetition)
         # The target is part of it, or the faults of all states would share one draw. Nothing else
         # is: the same target gets the same fault under every detector and platform.
-        drawn = (Stream.FAULT, "campaign", seed, repetition, target_of(values))
+        drawn = (Stream.FAULT, "campaign", seed, repetition, _target_of(values))
         with naming(labels):
-            config = mission_of(values, seed, derive(self.seed, *drawn))
+            config = _mission_of(values, seed, derive(self.seed, *drawn))
             if self.fixed_world is not None and config.world_seed is None:
                 config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
             return PlannedMission(config=config, labels=labels)

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.autonomy import canonical_planner
-from mavfi_cli.campaigns.factors import MISSION, NAMES
-from mavfi_cli.campaigns.specification import LISTS, Axes, Keep, Spec
+from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Spec
 from mavfi_cli.core.config import (
     read_text,
     shipped_names,

@@ -128,7 +128,7 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 def export(what: str, path: Path) -> None:
     """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli import library
-    from mavfi_cli.report.tables.export import flights_csv, write_flights
+    from mavfi_cli.report.tables.campaign import flights_csv, write_flights
 
     table = library.campaign(what).table
     if path == Path("-"):
@@ -157,7 +157,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.drawing import write_svg
-    from mavfi_cli.report.trajectories import Panel, draw_trajectories, lines
+    from mavfi_cli.report.top_view import Panel, draw_trajectories, lines
 
     with Ledger(folder_of(what)) as ledger:
         chosen = pair(ledger, number)
@@ -270,7 +270,7 @@ def _plan_lines(told: dict[str, Any], options: dict[str, Any]) -> list[str]:
 
 def _show(
     ledger: Ledger,
-    by: list[str] | None = None,
+    by: Sequence[str] = (),
     confidence: float = 0.95,
     *,
     as_json: bool,
@@ -281,51 +281,35 @@ def _show(
     from mavfi_cli.analysis.summary import summarise
     from mavfi_cli.campaigns.begin import stopped, stored_spec
     from mavfi_cli.core.files import plain
-    from mavfi_cli.report.tables.campaign import summary_lines
+    from mavfi_cli.report.tables.campaign import campaign_lines
 
-    summary = summarise(ledger, by or [], confidence)
     ended, spec = stopped(ledger), stored_spec(ledger)
-    worlds = None if spec is None else spec.fixed_world
-    told = {**summary, "stopped": ended}
-    lines = [f"{summary['name']}: {summary['over']} of {summary['missions']} missions"]
-    if worlds is not None:
-        told["fixed_world"] = asdict(worlds)
-        lines.append(worlds.told())
+    told = {**summarise(ledger, by, confidence), "stopped": ended}
+    lines = [f"{told['name']}: {told['over']} of {told['missions']} missions"]
+    if spec is not None and spec.fixed_world is not None:
+        told["fixed_world"] = asdict(spec.fixed_world)
+        lines.append(spec.fixed_world.told())
+    told |= _more(ledger, by, confidence, more or {})
     lines += [f"known well enough, so not flown on: {text}" for text in ended]
-    lines += summary_lines(summary)
-    if more is not None:
-        _add_more(ledger, by or [], confidence, more, told, lines)
+    lines += campaign_lines(told)
     click.echo(json.dumps(plain(told), indent=2) if as_json else "\n".join(lines))
 
 
-def _add_more(
-    ledger: Ledger,
-    by: list[str],
-    confidence: float,
-    more: Mapping[str, Any],
-    told: dict[str, Any],
-    lines: list[str],
-) -> None:
-    """Add the results of --quality, --overhead and --failures, as plain values and as text."""
+def _more(
+    ledger: Ledger, by: Sequence[str], confidence: float, asked: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The results of --quality, --overhead and --failures, as plain values."""
     from mavfi_cli.analysis.failures import failures
     from mavfi_cli.analysis.groups import groups
     from mavfi_cli.analysis.overhead import flight_overheads
     from mavfi_cli.analysis.summary import qualities
-    from mavfi_cli.report.tables import campaign as text
 
-    if not (more["quality"] or more["overhead"] or more["failures"]):
-        return
-    found = groups(ledger, by)
-    if more["quality"]:
-        quality = qualities(found, confidence)
-        told["quality"] = quality
-        lines += text.quality_lines(quality, confidence)
-    if more["overhead"]:
-        overheads = flight_overheads(ledger, found, confidence)
-        told["overhead"] = overheads
-        lines += text.overhead_lines(overheads, confidence)
-    if more["failures"]:
-        rows = failures(ledger, found, more["kernels"], more["upsets"], confidence)
-        told["failures"] = rows
-        lines += ["", "injected faults that fail missions which succeed without:"]
-        lines += text.failure_lines(rows)
+    told: dict[str, Any] = {}
+    found = groups(ledger, by) if any(map(asked.get, ("quality", "overhead", "failures"))) else []
+    if asked.get("quality"):
+        told["quality"] = qualities(found, confidence)
+    if asked.get("overhead"):
+        told["overhead"] = flight_overheads(ledger, found, confidence)
+    if asked.get("failures"):
+        told["failures"] = failures(ledger, found, asked["kernels"], asked["upsets"], confidence)
+    return told

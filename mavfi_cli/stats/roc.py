@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,70 +22,45 @@ from mavfi_cli.stats.shares import z_of
 _HALVINGS = 60
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Curves:
-    """One detector's curves, in descending order of threshold, from one without alarms.
+def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, Any]:
+    """Curves from scores in units of the threshold; empty unless both kinds have flights.
 
-    Attributes:
-        positives, negatives: flights with a harmful fault, and error-free flights.
-        thresholds: (m,) in units of the detector's own; scores above are alarms.
-        false_positive_rate: (m,) share of error-free flights with an alarm.
-        recall: (m,) share of harmful faults with an alarm.
-        precision: (m,) share of harmful faults among all flights with an alarm; 1 at the first.
-        area, area_low, area_high: under the ROC curve, with its 95 % interval.
-        average_precision: under the precision-recall curve; it depends on the mix of flights,
-            chance is positives / (positives + negatives).
-        operating_point: false positive rate and recall at the detector's own threshold.
+    Returns:
+        `positives`, `negatives`: number of scores of each kind. In descending order of threshold,
+        from one without alarms, (m,) each: `thresholds`; `false_positive_rate`, the share of
+        error-free flights with an alarm; `recall`, that of harmful faults; `precision`, the share
+        of harmful faults among all with an alarm, 1 at the first. `area`, `area_low`, `area_high`:
+        under the ROC curve, with its 95 % interval. `average_precision`: under the precision-recall
+        curve; it depends on the mix of flights, chance is positives / (positives + negatives).
+        `operating_point`: false positive rate and recall at the detector's own threshold.
     """
-
-    positives: int
-    negatives: int
-    thresholds: list[float]
-    false_positive_rate: list[float]
-    recall: list[float]
-    precision: list[float]
-    area: float
-    area_low: float
-    area_high: float
-    average_precision: float
-    operating_point: tuple[float, float]
-
-
-def curves(harmful: Sequence[float], error_free: Sequence[float]) -> _Curves:
-    """Curves from scores in units of the threshold; empty unless both kinds have flights."""
-    positive, negative = np.sort(np.asarray(harmful, np.float64)), np.sort(
-        np.asarray(error_free, np.float64)
-    )  # fmt: skip
+    positive, negative = (np.sort(np.asarray(s, np.float64)) for s in (harmful, error_free))
+    found: dict[str, Any] = {"positives": len(positive), "negatives": len(negative)}
     if not len(positive) or not len(negative):
-        nan = math.nan
-        return _Curves(
-            positives=len(positive), negatives=len(negative), thresholds=[],
-            false_positive_rate=[], recall=[], precision=[], area=nan, area_low=nan, area_high=nan,
-            average_precision=nan, operating_point=(nan, nan),
-        )  # fmt: skip
+        lists = ("thresholds", "false_positive_rate", "recall", "precision")
+        numbers = ("area", "area_low", "area_high", "average_precision")
+        found |= {name: [] for name in lists} | dict.fromkeys(numbers, math.nan)
+        return {**found, "operating_point": (math.nan, math.nan)}
     levels = np.unique(np.concatenate([positive, negative]))[::-1]
     # At the n-th threshold, alarms are the flights whose score is at least the n-th level.
     hits = len(positive) - np.searchsorted(positive, levels, side="left")
     false = len(negative) - np.searchsorted(negative, levels, side="left")
-    recall, fallout = hits / len(positive), false / len(negative)
-    precision = hits / (hits + false)
-    gains = np.diff(np.concatenate([[0.0], recall]))
+    recall, precision = hits / len(positive), hits / (hits + false)
+    below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
     area = _area(positive, negative)
     low, high = _area_interval(area, len(positive), len(negative))
-    below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
-    return _Curves(
-        positives=len(positive),
-        negatives=len(negative),
-        thresholds=[float(levels[0]), *below.tolist()],
-        false_positive_rate=[0.0, *fallout.tolist()],
-        recall=[0.0, *recall.tolist()],
-        precision=[1.0, *precision.tolist()],
-        area=area,
-        area_low=low,
-        area_high=high,
-        average_precision=float((precision * gains).sum()),
-        operating_point=(float((negative > 1.0).mean()), float((positive > 1.0).mean())),
-    )
+    return {
+        **found,
+        "thresholds": [float(levels[0]), *below.tolist()],
+        "false_positive_rate": [0.0, *(false / len(negative)).tolist()],
+        "recall": [0.0, *recall.tolist()],
+        "precision": [1.0, *precision.tolist()],
+        "area": area,
+        "area_low": low,
+        "area_high": high,
+        "average_precision": float((precision * np.diff(recall, prepend=0.0)).sum()),
+        "operating_point": (float((negative > 1.0).mean()), float((positive > 1.0).mean())),
+    }
 
 
 def _area(positive: FloatArray, negative: FloatArray) -> float:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from statistics import NormalDist
+from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
 
@@ -62,17 +63,8 @@ def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
 
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Mixture:
-    """A rate over differently sampled parts, with its interval."""
-
-    share: float
-    low: float
-    high: float
-
-
-def mixture(parts: Sequence[tuple[int, Share]]) -> _Mixture:
-    """The rate of a whole from the rates of its parts, each weighted by its true size.
+def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
+    """`share`, `low` and `high` of a whole from its parts, each weighted by its true size.
 
     The interval adds the distances to the ends of the parts' Wilson intervals in squares (MOVER,
     G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). The result is NaN if a
@@ -80,12 +72,12 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> _Mixture:
     """
     whole = sum(size for size, _ in parts)
     if not whole:
-        return _Mixture(share=math.nan, low=0.0, high=1.0)
+        return {"share": math.nan, "low": 0.0, "high": 1.0}
     weighted = [(size / whole, part) for size, part in parts if size]
     share = math.fsum(weight * part.share for weight, part in weighted)
     below = math.hypot(*(weight * (part.share - part.low) for weight, part in weighted))
     above = math.hypot(*(weight * (part.high - part.share) for weight, part in weighted))
-    return _Mixture(share=share, low=max(0.0, share - below), high=min(1.0, share + above))
+    return {"share": share, "low": max(0.0, share - below), "high": min(1.0, share + above)}
 
 
 def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: float = 0.95) -> int:
@@ -134,26 +126,9 @@ def pairs_for_difference(
     return math.ceil(root**2 / difference**2 - 1e-9)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _CrossLayer:
-    """Effects of a fault in a kernel on the kernel and on the mission.
-
-    Attributes:
-        corruption: share of faults that cause an SDC of the kernel.
-        failure: share of faults that fail the mission.
-        failure_given_corruption: failure / corruption, with the ends of the failure's interval over
-            the corruption's point estimate; None if the estimate would be above 1 (crashes and
-            hangs fail missions too) or no output was corrupted.
-    """
-
-    corruption: Share
-    failure: Share
-    failure_given_corruption: tuple[float, float, float] | None
-
-
 def cross_layer(
     corrupted: int, kernel_faults: int, failed: int, mission_faults: int, confidence: float = 0.95
-) -> _CrossLayer:
+) -> dict[str, Any]:
     """The probability that a mission fails, given an SDC of a kernel.
 
     Both campaigns must sample the same population: the same kernel, level and sampling rule.
@@ -161,15 +136,25 @@ def cross_layer(
     Args:
         corrupted, kernel_faults: SDCs and injected faults of the isolated kernel (`mavfi kernels`).
         failed, mission_faults: failures beyond the golden ones and applied faults of missions.
+
+    Returns:
+        `corruption`, `failure`: shares of faults that corrupt the kernel, and that fail the
+        mission. `failure_given_corruption`: the second over the first, with the ends of the
+        failure's interval over the corruption's point estimate; None if the estimate would be above
+        1 (crashes and hangs fail missions too) or no output was corrupted.
     """
     corruption = rate(corrupted, kernel_faults, confidence)
     failure = rate(failed, mission_faults, confidence)
-    given = None
+    ends = None
     if corrupted and failure.share <= corruption.share:
-        ends = (failure.share, failure.low, failure.high)
-        point, low, high = (min(1.0, each / corruption.share) for each in ends)
-        given = point, low, high
-    return _CrossLayer(corruption=corruption, failure=failure, failure_given_corruption=given)
+        ends = tuple(
+            min(1.0, each / corruption.share) for each in (failure.share, failure.low, failure.high)
+        )
+    return {
+        "corruption": asdict(corruption),
+        "failure": asdict(failure),
+        "failure_given_corruption": ends,
+    }
 
 
 def failures_per_hour(upsets_per_hour: float, failure: Share) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import both_succeed, chosen, flags, known, numbers, paired, ratio
+from mavfi_cli.analysis.flights import both_succeed, changed, chosen, flags, known, numbers, paired
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import Interval, interval
@@ -136,7 +136,7 @@ def _over(
         for name in names:
             model = row[MODEL[name]] / rows[over][MODEL[name]]
             before, after = sides[0].measured(name, first), sides[1].measured(name, second)
-            found = ratio(range(len(before)), before.tolist(), after.tolist())
+            found = changed(range(len(before)), before.tolist(), after.tolist())
             told |= _beside(f"{name}{suffix}", "_ratio", model, found)
             told[f"pairs{suffix}"] = found.count
     return told

@@ -12,11 +12,12 @@ import numpy as np
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.spec.platform import PlatformProfile
-from mavfi_cli.vpm.calibrate import Calibrated, calibrated
 from mavfi_cli.vpm.model import (
     DETECTORS,
+    GRAVITY_MPS2,
     KNEE_SHARE,
     REFERENCE,
+    SCHEMES,
     TABLE_V,
     ModelInputs,
     Scheme,
@@ -116,7 +117,7 @@ def setting_of(vehicle: ModelVehicle, choices: Choices) -> ModelInputs:
 
 
 def _setting(
-    vehicle: ModelVehicle, choices: Choices, found: Calibrated | None
+    vehicle: ModelVehicle, choices: Choices, found: _Calibrated | None
 ) -> tuple[ModelInputs, list[dict[str, Any]]]:
     """Collect the model's inputs, and list them with their sources."""
     full = found.vehicle if found else vehicle
@@ -163,7 +164,7 @@ def _setting(
 
 
 def _notes(
-    vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: Calibrated | None
+    vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: _Calibrated | None
 ) -> list[str]:
     """Name what did not change with the computer, although a user may think so."""
     notes, board = [], setting.board.name
@@ -182,7 +183,7 @@ def _notes(
     return notes
 
 
-def _other_calibration(vehicle: ModelVehicle, board: Board, found: Calibrated) -> str:
+def _other_calibration(vehicle: ModelVehicle, board: Board, found: _Calibrated) -> str:
     unit = _FREE_UNITS[found.parameter]
     told = (
         f"{found.parameter} = {found.value:.4g} {unit} is calibrated with board {found.board.name}"
@@ -249,7 +250,7 @@ def _row(setting: ModelInputs, scheme: Scheme, reference: SchemePerformance) -> 
     }
 
 
-def _calibrations(vehicle: ModelVehicle, found: Calibrated | None) -> list[dict[str, Any]]:
+def _calibrations(vehicle: ModelVehicle, found: _Calibrated | None) -> list[dict[str, Any]]:
     """The paper's figure, with the calibration's board and with a heavier one."""
     if found is None:
         return []
@@ -352,3 +353,95 @@ def _answers(
 def _point(setting: ModelInputs, schemes: tuple[Scheme, ...], value: float) -> dict[str, Any]:
     velocity, ratio = _answers(setting, schemes)
     return {"value": value, "velocity_mps": velocity, "tmr_flight_time_ratio": ratio}
+
+
+# Calibration: the one free number of a vehicle from one published ratio of flight times --------
+
+_SPAN = 1.0e4  # ratio of the largest to the smallest tried value
+_STEPS = 200  # halvings of the interval; far below a float's resolution
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Calibrated:
+    """A vehicle with its calibrated number, and the resulting ratios of flight times."""
+
+    vehicle: ModelVehicle
+    board: Board
+    parameter: str
+    value: float  # in the unit of the parameter
+    published_ratio: float
+    tmr_ratio: float  # flight time with TMR over that with detection and recovery
+    dmr_ratio: float  # a prediction, not fitted
+
+
+def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated:
+    """Find the vehicle's free number that gives its published ratio.
+
+    The ratio falls as the free number grows, so bisection finds it.
+
+    Args:
+        board: the board of the redundant computers; None: the calibration's own.
+
+    Raises:
+        ConfigError: no value gives the ratio; says which ratios can be reached.
+        UnknownName: the calibration's board does not exist.
+    """
+    plan = vehicle.calibration
+    assert plan is not None
+    board = board or load_board(plan.board)
+    known = {scheme.name: scheme for scheme in SCHEMES}
+
+    def setting(value: float) -> ModelInputs:
+        """The vehicle with a trial value of the parameter."""
+        pull_n, compute_s = vehicle.rotor_pull_n, vehicle.response_s
+        if plan.parameter == "rotor_pull_n":
+            pull_n = value
+        else:
+            compute_s = value
+        full = replace(vehicle, calibration=None, rotor_pull_n=pull_n, response_s=compute_s)
+        assert pull_n is not None  # the vehicle has the number that is not calibrated
+        assert compute_s is not None
+        return ModelInputs(
+            vehicle=full, board=board, pull_n=pull_n, range_m=full.range_m,
+            compute_s=compute_s, distance_m=1.0,
+        )  # fmt: skip
+
+    def ratio(value: float, scheme: str) -> float:
+        """Flight time of a scheme over the reference's; infinite if one of them cannot fly."""
+        fast = setting(value).velocity_mps(named(SCHEMES, REFERENCE))
+        slow = setting(value).velocity_mps(known[scheme])
+        return math.inf if fast is None or slow is None else fast / slow
+
+    low = 1.0 / vehicle.sensor_hz
+    if plan.parameter == "rotor_pull_n":
+        three_kg = vehicle.mass_kg + known["tmr"].copies * board.total_kg
+        low = three_kg * GRAVITY_MPS2 / math.cos(vehicle.tilt_rad)
+    value = _halving(lambda trial: ratio(trial, "tmr"), plan.tmr_time_ratio, low, low * _SPAN)
+    if value is None:
+        ends = f"{ratio(low * _SPAN, 'tmr'):.3f} to {ratio(low, 'tmr'):.3f}"
+        raise ConfigError(
+            f"no {plan.parameter} gives {vehicle.name!r} a ratio of {plan.tmr_time_ratio:g}; "
+            f"it can be {ends}",
+            key="calibration.tmr_time_ratio",
+        )
+    return _Calibrated(
+        vehicle=setting(value).vehicle,
+        board=board,
+        parameter=plan.parameter,
+        value=value,
+        published_ratio=plan.tmr_time_ratio,
+        tmr_ratio=ratio(value, "tmr"),
+        dmr_ratio=ratio(value, "dmr"),
+    )
+
+
+def _halving(
+    falling: Callable[[float], float], target: float, low: float, high: float
+) -> float | None:
+    """The argument at which a falling function equals `target`; None outside its range."""
+    if not falling(high) <= target <= falling(low):
+        return None
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if falling(middle) > target else (low, middle)
+    return high

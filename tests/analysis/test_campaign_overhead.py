@@ -12,7 +12,7 @@ from mavfi_cli.analysis.groups import groups
 from mavfi_cli.analysis.overhead import flight_overheads
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.cli.campaign import campaign as command
-from mavfi_cli.report.tables.campaign import overhead_lines
+from mavfi_cli.report.tables.campaign import campaign_lines
 
 KERNELS = {
     "point_cloud": {"invocations": 10, "busy_s": 0.1},
@@ -94,12 +94,12 @@ def test_the_detector_need_not_be_a_label(book):
     (row,) = named(flight_overheads(book.ledger, groups(book.ledger)))
     assert row.labels == {"setting": "golden", "detector": "l2"}
     assert math.isnan(row.check_host_s.low)  # one flight has no interval
-    assert re.split("  +", overhead_lines([row])[3])[-2:] == ["10.00", "0.0500"]
+    assert re.split("  +", campaign_lines({"overhead": [row]})[3])[-2:] == ["10.00", "0.0500"]
 
 
 def test_the_tables_say_what_the_host_measured_and_what_was_simulated(filled):
     found = named(flight_overheads(filled.ledger, groups(filled.ledger)))
-    told = overhead_lines(found, 0.9)
+    told = campaign_lines({"overhead": found, "confidence": 0.9})
     assert told[1:3] == [
         "detection: checks, host time", "in all settings that have it: world=dense",
     ]  # fmt: skip
@@ -123,13 +123,18 @@ def overheads_of_one_in(count, book):
         alarms = ("control",) if seed == 0 else ()
         book.add(labels, 100 + seed, 200.0, record=watched("aad", 0.004, alarms, kernels))
     found = named(flight_overheads(book.ledger, groups(book.ledger)))
-    return "\n".join(line for line in overhead_lines(found) if line.startswith("rare "))
+    return "\n".join(
+        line for line in campaign_lines({"overhead": found}) if line.startswith("rare ")
+    )
 
 
 def test_a_campaign_without_detectors_says_so(book):
     book.add({"setting": "golden"}, 1, 20.0, injected=Injected.GOLDEN)
     found = named(flight_overheads(book.ledger, groups(book.ledger)))
-    assert (found, overhead_lines(found)) == ([], ["", "overhead: no flight with a detector"])
+    assert (found, campaign_lines({"overhead": found})) == (
+        [],
+        ["", "overhead: no flight with a detector"],
+    )
 
 
 def test_the_command_shows_it_where_it_is_asked_for(filled):

@@ -15,7 +15,7 @@ from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel
-from mavfi_cli.report.tables.campaign import failure_lines, quality_lines, summary_lines
+from mavfi_cli.report.tables.campaign import campaign_lines
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -45,7 +45,7 @@ def test_faults_that_did_nothing_are_counted_apart(book):
     assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
     assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
     assert cell.metrics["flight_time_s"].count == 2
-    told = summary_lines(summarise(book.ledger))
+    told = campaign_lines(summarise(book.ledger))
     row = told[1]
     assert "  2/3  " in row
     assert "  83.3 %  " in row  # of all six, as the paper counts
@@ -102,7 +102,7 @@ def test_the_worst_case_is_no_missions_own_length(book):
     (faulty,) = named(against_golden(groups(book.ledger)))
     assert faulty.over_own.increase == 0.0
     assert faulty.over_mean.golden == 20.0
-    told = summary_lines(summarise(book.ledger))
+    told = campaign_lines(summarise(book.ledger))
     assert told[-2].endswith("  worst over own golden")
     assert told[-1].endswith("  +0.0 %")
 
@@ -126,7 +126,7 @@ def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
     assert (saved.over_mean.golden, saved.over_mean.golden_worst) == (20.0, 30.0)
     assert (saved.over_mean.faulty_worst, saved.over_mean.protected_worst) == (33.0, 30.0)
     assert saved.over_mean.recovered_share == pytest.approx(3.0 / 13.0)
-    told = [re.split("  +", line)[-1] for line in summary_lines(summarise(book.ledger))]
+    told = [re.split("  +", line)[-1] for line in campaign_lines(summarise(book.ledger))]
     assert told[-5:-3] == ["worst over own golden", "+100.0 %, recovered 70.0 points, 70.0 %"]
     assert told[-2:] == ["worst over mean golden", "+65.0 %, recovered 15.0 points, 23.1 %"]
 
@@ -137,12 +137,12 @@ def test_a_group_without_what_it_is_gathered_by_is_named(book):
     assert names == ["golden", "stage=control"]
     assert named(summarise(book.ledger, ["detector"])).cells[0].name == "no detector"
     assert named(summarise(book.ledger, ["setting", "stage"])).cells[0].name == "setting=golden"
-    assert summary_lines(summarise(book.ledger, ["stage"]))[1].startswith("golden ")
+    assert campaign_lines(summarise(book.ledger, ["stage"]))[1].startswith("golden ")
 
 
 def test_means_are_called_means(book):
     fill(book)
-    text = "\n".join(summary_lines(summarise(book.ledger)))
+    text = "\n".join(campaign_lines(summarise(book.ledger)))
     assert "mean time  mean distance  mean energy  mean replans" in text
 
 
@@ -155,8 +155,8 @@ def test_no_line_is_wider_than_a_screen_and_common_labels_are_told_once(book):
             labels = {"setting": "D&R(G)", "detector": "gad", "stage": "control", **common}
             book.add(labels, seed, 21.0, outcome="collision" if seed else "success")
     found = groups(book.ledger)
-    told = summary_lines(summarise(book.ledger))
-    told += quality_lines(qualities(found))
+    told = campaign_lines(summarise(book.ledger))
+    told += campaign_lines({"quality": qualities(found)})
     assert max(map(len, told)) <= 100
     assert told[0] == (
         "in all settings that have it: detector=gad level=instruction stage=control together=true"
@@ -170,7 +170,7 @@ def test_no_line_is_wider_than_a_screen_and_common_labels_are_told_once(book):
 def test_a_label_that_alone_tells_settings_apart_has_a_column(book):
     book.add({"setting": "FI"}, 1, 20.0)
     book.add({"setting": "FI", "field": "sign"}, 1, 21.0)
-    told = summary_lines(summarise(book.ledger))
+    told = campaign_lines(summarise(book.ledger))
     assert told[0] == "in all settings that have it: setting=FI"
     assert [line.split()[0] for line in told[1:4]] == ["field", "1/1", "sign"]
 
@@ -221,7 +221,7 @@ def test_a_faulty_mission_pairs_with_no_golden_flight_of_another_seed(book):
 def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
     fill(book)
     summary = summarise(book.ledger)
-    text = "\n".join(summary_lines(summary))
+    text = "\n".join(campaign_lines(summary))
     assert "in all settings that have it: detector=gad stage=control" in text
     assert "7/10" in text
     assert "collision 3" in text
@@ -231,7 +231,7 @@ def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
 
 def test_a_campaign_that_has_just_begun_has_a_table(book):
     book.ledger.plan([PlannedMission(config=MissionConfig(), labels={})])
-    assert "all missions" in "\n".join(summary_lines(summarise(book.ledger)))
+    assert "all missions" in "\n".join(campaign_lines(summarise(book.ledger)))
 
 
 def test_quality_has_intervals_and_extremes_of_every_metric(book):
@@ -245,7 +245,7 @@ def test_quality_has_intervals_and_extremes_of_every_metric(book):
     assert faulty.mean.value == pytest.approx(30.0 + 1 / 7)
     assert 30.0 <= faulty.mean.low < faulty.mean.value < faulty.mean.high <= 31.0
     assert faulty.difference.value == pytest.approx(10.0 + 1 / 7)
-    text = "\n".join(quality_lines(found))
+    text = "\n".join(campaign_lines({"quality": found}))
     assert "+10.14" in text
     assert "replans" in text
 
@@ -254,7 +254,7 @@ def test_quality_without_a_success_is_no_number(book):
     book.add(FI, 1, 30.0, outcome="collision")
     found = named(qualities(groups(book.ledger)))
     assert all(math.isnan(each.most) for each in found)
-    assert quality_lines(found)[3].split()[-5:] == ["0", "-", "-", "-", "-"]
+    assert campaign_lines({"quality": found})[3].split()[-5:] == ["0", "-", "-", "-", "-"]
 
 
 def test_failures_are_of_missions_that_succeed_without_the_fault(book):
@@ -273,7 +273,9 @@ def test_failures_are_of_missions_that_succeed_without_the_fault(book):
     assert faulty.per_hour == pytest.approx((6 / 11, 2 * faulty.failure.low,
                                              2 * faulty.failure.high))  # fmt: skip
     assert faulty.layers is None
-    assert "3 of 11 faults fail the mission, 27.3 %" in "\n".join(failure_lines([faulty]))
+    assert "3 of 11 faults fail the mission, 27.3 %" in "\n".join(
+        campaign_lines({"failures": [faulty]})
+    )
 
 
 def native(book, seeds, **fault):
@@ -304,7 +306,7 @@ def test_failure_given_a_kernels_corruption(book, tmp_path):
     assert row.kernel == "octomap"
     assert row.layers.corruption.share == 0.8
     assert row.layers.failure_given_corruption[0] == pytest.approx(0.5 / 0.8)
-    assert "failure given corruption 0.625 (" in "\n".join(failure_lines([row]))
+    assert "failure given corruption 0.625 (" in "\n".join(campaign_lines({"failures": [row]}))
 
 
 def test_kernels_that_other_faults_struck_are_refused(book, tmp_path):

@@ -8,15 +8,14 @@ import pytest
 
 from mavfi_cli.analysis.flights import (
     both_succeed,
+    changed,
     chosen,
-    difference,
     flags,
     known,
     numbers,
     paired,
-    ratio,
-    success_test,
 )
+from mavfi_cli.stats.paired import mcnemar
 
 
 def flown(*ends, seeds=None):
@@ -52,26 +51,26 @@ def test_columns_tell_what_is_missing():
 
 
 def test_a_ratio_is_the_geometric_mean_and_turns_round():
-    found = ratio(range(2), [10.0, 20.0], [20.0, 80.0])
+    found = changed(range(2), [10.0, 20.0], [20.0, 80.0])
     assert found.count == 2
     assert found.value == pytest.approx(math.sqrt(2.0 * 4.0))
     assert 2.0 - 1e-9 <= found.low <= found.value <= found.high <= 4.0 + 1e-9
-    back = ratio(range(2), [20.0, 80.0], [10.0, 20.0])
+    back = changed(range(2), [20.0, 80.0], [10.0, 20.0])
     assert back.value == pytest.approx(1.0 / found.value)
 
 
 def test_several_pairs_of_one_mission_are_one_value():
-    assert ratio([1, 1, 2], [1.0, 1.0, 1.0], [2.0, 8.0, 4.0]).count == 2
-    assert difference([1, 1, 2], [0.0, 0.0, 0.0], [2.0, 4.0, 5.0]).value == 4.0
+    assert changed([1, 1, 2], [1.0, 1.0, 1.0], [2.0, 8.0, 4.0]).count == 2
+    assert changed([1, 1, 2], [0.0, 0.0, 0.0], [2.0, 4.0, 5.0], ratio=False).value == 4.0
 
 
 def test_what_is_no_positive_number_is_left_out_of_a_ratio():
-    assert ratio(range(3), [0.0, 1.0, math.nan], [1.0, 3.0, 1.0]).value == pytest.approx(3.0)
-    assert difference(range(2), [0.0, math.nan], [1.0, 3.0]).value == 1.0
+    assert changed(range(3), [0.0, 1.0, math.nan], [1.0, 3.0, 1.0]).value == pytest.approx(3.0)
+    assert changed(range(2), [0.0, math.nan], [1.0, 3.0], ratio=False).value == 1.0
 
 
 def test_nothing_to_compare_is_no_number():
-    found = ratio([], [], [])
+    found = changed([], [], [])
     assert found.count == 0
     assert math.isnan(found.value)
 
@@ -80,7 +79,7 @@ def test_the_interval_holds_the_ratio_that_was_put_in():
     rng = np.random.default_rng(3)
     first = rng.uniform(10.0, 30.0, 40)
     second = 1.3 * first * np.exp(rng.normal(0.0, 0.05, 40))
-    found = ratio(range(40), first.tolist(), second.tolist())
+    found = changed(range(40), first.tolist(), second.tolist())
     assert found.low < 1.3 < found.high
     assert found.high - found.low < 0.1
 
@@ -88,6 +87,6 @@ def test_the_interval_holds_the_ratio_that_was_put_in():
 def test_success_of_pairs():
     first = flown("success", "success", "collision", "success")
     second = flown("timeout", "success", "timeout", "timeout")
-    test = success_test(first, second)
+    test = mcnemar(*(flags(each, "succeeded") for each in (first, second)))
     assert (test.both, test.only_first, test.neither) == (1, 2, 1)
     assert both_succeed(first, second).tolist() == [False, True, False, False]

@@ -14,7 +14,6 @@ from mavfi_cli.campaigns.missions import (
     changes_of,
     golden_of,
     injected_of,
-    pair_of,
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -61,8 +60,12 @@ def test_a_mission_comes_back_as_it_was(tmp_path, config):
 
 @pytest.mark.parametrize("config", CONFIGS[2:])
 def test_a_pair_is_named_by_its_golden_flight(config):
-    assert pair_of(config) == pair_of(golden_of(config)) == pair_of(MissionConfig())
-    assert pair_of(MissionConfig(seed=4)) != pair_of(config)
+    flown, golden, bare, other = (
+        PlannedMission(config=each).pair
+        for each in (config, golden_of(config), MissionConfig(), MissionConfig(seed=4))
+    )
+    assert flown == golden == bare
+    assert other != flown
 
 
 def test_what_has_no_row_is_missing(tmp_path):

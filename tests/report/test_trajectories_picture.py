@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.report.drawing import DETECTORS, write_svg
-from mavfi_cli.report.trajectories import Panel, draw_trajectories, lines
+from mavfi_cli.report.top_view import Panel, draw_trajectories, lines
 
 SVG = "{http://www.w3.org/2000/svg}"
 FAULT = {"kind": "fault", "stamp_s": 9.0, "text": "", "position_enu_m": [3.0, 1.0, 5.0]}

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from mavfi_cli.analysis.groups import INACTIVE, METRICS
-from mavfi_cli.campaigns.missions import label_text
+from mavfi_cli.campaigns.missions import label_text, label_value, ordered
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
-from mavfi_cli.report.tables.columns import number, percent, spread
-from mavfi_cli.report.tables.settings import SettingColumns
+from mavfi_cli.report.tables.columns import blocks, number, percent, spread
 from mavfi_cli.stats.paired import McNemar
 
 Row = Mapping[str, Any]
+_FORMATS = (".parquet", ".csv")  # of an export
 _STAGES = tuple(stage.value for stage in Stage)
 _TITLES = {
     "flight_time_s": ("flight time, s", 1.0),
@@ -24,12 +31,99 @@ _TITLES = {
 }
 
 
+def campaign_lines(told: Row) -> list[str]:
+    """The parts that the plain values of a campaign have.
+
+    Args:
+        told: `analysis.summary.summarise`, and any of `quality` of `qualities`, `overhead` of
+            `flight_overheads`, `failures` of `failures`.
+    """
+    confidence, lines = told.get("confidence", 0.95), []
+    if "cells" in told:
+        lines += _summary(told)
+    if "quality" in told:
+        lines += _quality(told["quality"], confidence)
+    if "overhead" in told:
+        lines += _overhead(told["overhead"], confidence)
+    if "failures" in told:
+        lines += ["", "injected faults that fail missions which succeed without:"]
+        for each in told["failures"]:
+            lines += [f"  {each['name']}", *(f"    {part}" for part in _parts(each))]
+    return lines
+
+
+# Settings as rows: a column per distinguishing label; common labels are printed once ------------
+
+
+@dataclass(frozen=True, slots=True)
+class _SettingColumns:
+    """Columns and common labels of some settings.
+
+    Attributes:
+        keys: the labels that have a column, in order.
+        common: other labels, which have one value in all settings that have them.
+    """
+
+    keys: tuple[str, ...]
+    common: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, settings: Sequence[Mapping[str, Any]]) -> _SettingColumns:
+        """The columns of settings, from their labels. They differ without the common ones.
+
+        A single setting has no columns, because its name is enough.
+        """
+        if len(settings) == 1:
+            return cls((), {})
+        keys = ordered({key for labels in settings for key in labels})
+        common: dict[str, Any] = {}
+        for key in reversed(keys):
+            values = {label_value(labels[key]): labels[key] for labels in settings if key in labels}
+            left = [each for each in keys if each not in common and each != key]
+            apart = {tuple(_cells(labels, left)) for labels in settings}
+            if len(values) == 1 and len(apart) == len(settings):
+                (common[key],) = values.values()
+        return cls(tuple(key for key in keys if key not in common), common)
+
+    def told(self) -> list[str]:
+        """The line of common labels above a table; no line if there are none."""
+        return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
+
+    def table(
+        self, head: Sequence[str], rows: Sequence[tuple[Mapping[str, Any], str, Sequence[str]]]
+    ) -> list[str]:
+        """One line per setting, in several tables if the screen is too narrow.
+
+        Args:
+            head: head of the cells.
+            rows: labels, name and cells of each setting.
+        """
+        labels = [self._labels(labels, name) for labels, name, _ in rows]
+        heads = list(self.keys) or ["setting"]
+        told = [[*own, *cells] for own, (_, _, cells) in zip(labels, rows, strict=True)]
+        return blocks([[*heads, *head], *told], len(heads))
+
+    def _labels(self, labels: Mapping[str, Any], name: str) -> list[str]:
+        """The cells of a setting's labels; the first empty one has the rest of its name."""
+        if not self.keys:
+            return [name]
+        cells = _cells(labels, self.keys)
+        beyond = name.removeprefix(label_text(labels)).strip()
+        if beyond and "" in cells:
+            cells[cells.index("")] = beyond
+        return cells
+
+
+def _cells(labels: Mapping[str, Any], keys: Sequence[str]) -> list[str]:
+    return [label_value(labels[key]) if key in labels else "" for key in keys]
+
+
 # Settings and comparisons ---------------------------------------------------------------------
 
 
-def summary_lines(summary: Row) -> list[str]:
+def _summary(summary: Row) -> list[str]:
     """The settings and the comparisons."""
-    settings = SettingColumns.of([cell["labels"] for cell in summary["cells"]])
+    settings = _SettingColumns.of([cell["labels"] for cell in summary["cells"]])
     fates = [(cell["labels"], cell["name"], _fate_cells(cell)) for cell in summary["cells"]]
     means = [(cell["labels"], cell["name"], _mean_cells(cell)) for cell in summary["cells"]]
     otherwise = ["ended otherwise"] if any(cells[-1] for _, _, cells in fates) else []
@@ -72,7 +166,7 @@ def _mean_cells(cell: Row) -> list[str]:
     return [number(means[name]["value"], ".1f", scale, unit) for name, scale, unit in units]
 
 
-def _comparison_table(settings: SettingColumns, found: Sequence[Row]) -> list[str]:
+def _comparison_table(settings: _SettingColumns, found: Sequence[Row]) -> list[str]:
     """One line per comparison, without empty columns."""
     head = ["pairs", "success, points", "p", "time, s", "worst over own golden",
             "worst over mean golden"]  # fmt: skip
@@ -111,11 +205,12 @@ def _worst(worst: Row) -> str:
 # Quality of flight ----------------------------------------------------------------------------
 
 
-def quality_lines(found: Sequence[Row], confidence: float = 0.95) -> list[str]:
+def _quality(found: Sequence[Row], confidence: float) -> list[str]:
     """One table per metric."""
     if not found:
         return []
-    settings = SettingColumns.of([each["labels"] for each in found if each["metric"] == METRICS[0]])
+    first = [each["labels"] for each in found if each["metric"] == METRICS[0]]
+    settings = _SettingColumns.of(first)
     head = ["flights", f"mean ({_sure(confidence)})", "least", "median", "most", "to golden"]
     told = []
     for metric, (title, scale) in _TITLES.items():
@@ -141,11 +236,11 @@ def _quality_cells(each: Row, scale: float) -> list[str]:
 # Overhead -------------------------------------------------------------------------------------
 
 
-def overhead_lines(found: Sequence[Row], confidence: float = 0.95) -> list[str]:
+def _overhead(found: Sequence[Row], confidence: float) -> list[str]:
     """A table of detection, measured on the host, and a table of recovery, simulated."""
     if not found:
         return ["", "overhead: no flight with a detector"]
-    settings = SettingColumns.of([each["labels"] for each in found])
+    settings = _SettingColumns.of([each["labels"] for each in found])
     sure = f"({_sure(confidence)})"
     named = [(each, (each["labels"], label_text(each["labels"]))) for each in found]
     return [
@@ -191,13 +286,6 @@ def _percent(share: Row, *, ends: bool = True) -> str:
 # Failures -------------------------------------------------------------------------------------
 
 
-def failure_lines(rows: Sequence[Row]) -> list[str]:
-    """One setting, with a line for each number."""
-    return [
-        line for each in rows for line in (f"  {each['name']}", *(f"    {p}" for p in _parts(each)))
-    ]
-
-
 def _parts(each: Row) -> list[str]:
     failure, layers = each["failure"], each["layers"]
     parts = [f"{failure['count']} of {failure['total']} faults fail the mission, {_share(failure)}"]
@@ -216,3 +304,41 @@ def _parts(each: Row) -> list[str]:
 def _share(share: Row) -> str:
     ends = f"({100 * share['low']:.1f} to {100 * share['high']:.1f})"
     return f"{percent(share['share'])} {ends}"
+
+
+# Export ---------------------------------------------------------------------------------------
+
+
+def write_flights(table: pa.Table, path: Path) -> int:
+    """Write an exported table to a .parquet or .csv file; return the number of rows.
+
+    Raises:
+        ConfigError: the file has another suffix.
+        RecordError: it cannot be written.
+    """
+    if path.suffix not in _FORMATS:
+        raise ConfigError(
+            f"expected a name that ends in {' or '.join(_FORMATS)}, or - for CSV on stdout",
+            path=path,
+        )
+
+    def write(file: Any) -> None:
+        """Write the table in the format of the name."""
+        from pyarrow import csv, parquet
+
+        if path.suffix == ".csv":
+            csv.write_csv(table, file)
+        else:
+            parquet.write_table(table, file, compression="zstd")
+
+    write_atomically(path, write)
+    return int(table.num_rows)
+
+
+def flights_csv(table: pa.Table) -> bytes:
+    """Return an exported table as CSV."""
+    from pyarrow import csv
+
+    text = io.BytesIO()
+    csv.write_csv(table, text)
+    return text.getvalue()
