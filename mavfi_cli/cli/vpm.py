@@ -188,7 +188,8 @@ def _flown(
 ) -> dict[str, Any]:
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.missions_view import missions_view
-    from mavfi_cli.studies.redundancy import WORLDS, RedundancyPlan, fly_and_report
+    from mavfi_cli.studies.flight_plan import WORLDS, RedundancyPlan
+    from mavfi_cli.studies.redundancy import fly_and_report
 
     plan = RedundancyPlan(
         vehicles=vehicles,

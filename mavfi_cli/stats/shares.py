@@ -61,8 +61,6 @@ def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
     return wilson(successes, total, confidence_z=z_of(confidence))
 
 
-
-
 def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
     """`share`, `low` and `high` of a whole from its parts, each weighted by its true size.
 

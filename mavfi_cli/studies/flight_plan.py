@@ -1,4 +1,4 @@
-"""Turn a row of the model into a simulated vehicle, a platform and limits of the mission.
+"""The missions of `mavfi vpm --fly`, and each row of the model as vehicle, platform and limits.
 
 The simulated vehicle and platform are TOML files that a mission names by path. Their names contain
 a digest of their contents, so that equal names mean equal flights.
@@ -7,11 +7,12 @@ a digest of their contents, so that equal names mean equal flights.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mavfi_cli.analysis.overhead import TIMES
+from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_text
@@ -19,8 +20,12 @@ from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import DEFAULT
+from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS
 from mavfi_cli.vpm.model import DETECTORS, ModelInputs, Scheme, outcome, safe_velocity_mps
+from mavfi_cli.vpm.report import Choices
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
+WORLDS = ("sparse", "dense")
 # Parts of the model that the simulation omits; printed with every report of flights.
 NOT_SCALED = (
     "size, propellers and drag are those of the simulated vehicle; boards weigh, but have no "
@@ -56,6 +61,56 @@ class FlightPlan:
     rotors_w: float
     boards_w: float
     cut: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RedundancyPlan:
+    """Plan of the flights of all vehicles and schemes.
+
+    Attributes:
+        missions: number per scheme and world.
+        folder: folder of flights and pictures; recorded missions are not flown again.
+        models: folder of the detectors' models; None takes the shipped ones.
+        train: flights of each training world to which detectors are fitted for each vehicle; 0
+            fits none.
+        stack: stack of all flights.
+    """
+
+    vehicles: Sequence[ModelVehicle]
+    choices: Choices
+    worlds: tuple[str, ...] = WORLDS
+    missions: int
+    first_seed: int
+    folder: Path
+    models: Path | None = None
+    train: int = 0
+    stack: str = DEFAULT
+
+    @property
+    def models_told(self) -> str:
+        """Origin of the detectors' models."""
+        if self.train:
+            return (
+                f"fitted for each vehicle to {self.train} error-free flights in each of "
+                f"{', '.join(TRAINING_WORLDS)} at its safe velocity"
+            )
+        if self.models is not None:
+            return f"of {self.models}"
+        return "the shipped ones, fitted to flights of the Solo at 3 m/s"
+
+    def list_of(self, flown: Mapping[tuple[str, str], FlightPlan]) -> list[PlannedMission]:
+        """The list mission by mission, so that pairs are complete if it is cut off."""
+        seeds = range(self.first_seed, self.first_seed + self.missions)
+        return [
+            PlannedMission(
+                config=replace(plan.mission, world=world, seed=seed),
+                labels={"group": vehicle, "arm": scheme, "world": world},
+                pair=f"{world}/{seed}",
+            )
+            for seed in seeds
+            for world in self.worlds
+            for (vehicle, scheme), plan in flown.items()
+        ]
 
 
 def flight_plan(

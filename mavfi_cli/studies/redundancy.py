@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from mavfi_cli.analysis.flights import chosen, errors, flown
 from mavfi_cli.analysis.overhead import compute_overheads
 from mavfi_cli.campaigns.begin import ask_vehicle, check_names
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.campaigns.specification import Keep
@@ -20,69 +20,17 @@ from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.studies.beside_model import BASE, Beside, Key, side_by_side
-from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan, write_files
+from mavfi_cli.studies.flight_plan import FlightPlan, RedundancyPlan, flight_plan, write_files
 from mavfi_cli.studies.flying import fly, require_named
 from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS
 from mavfi_cli.studies.train import TrainingPlan, train
 from mavfi_cli.vpm.model import DETECTORS, Scheme, schemes_with
-from mavfi_cli.vpm.report import CHAINS, Choices, report, setting_of
+from mavfi_cli.vpm.report import CHAINS, report, setting_of
 from mavfi_cli.vpm.vehicle import ModelVehicle
 
-WORLDS = ("sparse", "dense")
 FLOWN, TRAINING, FLIGHTS = "flown", "training", "flights"  # folders
 PLATFORM = "x86"  # platform whose latencies are scaled by default
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RedundancyPlan:
-    """Plan of the flights of all vehicles and schemes.
-
-    Attributes:
-        missions: number per scheme and world.
-        folder: folder of flights and pictures; recorded missions are not flown again.
-        models: folder of the detectors' models; None takes the shipped ones.
-        train: flights of each training world to which detectors are fitted for each vehicle; 0
-            fits none.
-        stack: stack of all flights.
-    """
-
-    vehicles: Sequence[ModelVehicle]
-    choices: Choices
-    worlds: tuple[str, ...] = WORLDS
-    missions: int
-    first_seed: int
-    folder: Path
-    models: Path | None = None
-    train: int = 0
-    stack: str = DEFAULT
-
-    @property
-    def models_told(self) -> str:
-        """Origin of the detectors' models."""
-        if self.train:
-            return (
-                f"fitted for each vehicle to {self.train} error-free flights in each of "
-                f"{', '.join(TRAINING_WORLDS)} at its safe velocity"
-            )
-        if self.models is not None:
-            return f"of {self.models}"
-        return "the shipped ones, fitted to flights of the Solo at 3 m/s"
-
-    def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
-        """The list mission by mission, so that pairs are complete if it is cut off."""
-        seeds = range(self.first_seed, self.first_seed + self.missions)
-        return [
-            PlannedMission(
-                config=replace(plan.mission, world=world, seed=seed),
-                labels={"group": vehicle, "arm": scheme, "world": world},
-                pair=f"{world}/{seed}",
-            )
-            for seed in seeds
-            for world in self.worlds
-            for (vehicle, scheme), plan in flown.items()
-        ]
 
 
 def _plans_of(
