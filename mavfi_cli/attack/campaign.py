@@ -1,7 +1,8 @@
 """Runs many faults on each of several targets: golden run, profile, fault list, runs.
 
 Fault number i of a target depends on the seed, the target's own stream and i only. So the results
-depend neither on the number of workers nor on the other targets. A worker process keeps a target
+depend neither on the number of workers nor on the other targets. A target with several inputs runs
+on each equally often: fault i strikes input i modulo their number. A worker process keeps a target
 open and runs its faults in order.
 """
 
@@ -25,7 +26,7 @@ import numpy as np
 from mavfi_cli.attack.attacker import Attacker, RunResult, golden_run
 from mavfi_cli.attack.journal import Journal
 from mavfi_cli.attack.profile import steps_told
-from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, TargetProfile
+from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, TargetProfile, places_of
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer import record
@@ -68,16 +69,41 @@ Stage = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PreparedInput:
+    """One input of a target before its first fault."""
+
+    golden: Golden
+    profile: TargetProfile | None  # None for time rules
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TargetRuns:
-    """All runs of one target, in order of their numbers, with the profile they were drawn from."""
+    """All runs of one target, in order of their numbers, with the profiles they were drawn from."""
 
     target: AttackTarget
     context: Mapping[str, Any]  # entries of every record about the target
-    golden: Golden
-    profile: TargetProfile | None  # None for time rules
+    inputs: tuple[PreparedInput, ...]
     records: tuple[Record, ...] = ()
     prepare_s: float
     wall_s: float = 0.0
+
+    @property
+    def golden(self) -> Golden:
+        """The golden run of the first input."""
+        return self.inputs[0].golden
+
+    @property
+    def profile(self) -> TargetProfile | None:
+        """The profile of the first input."""
+        return self.inputs[0].profile
+
+    def input_of(self, run: int) -> int:
+        """The input that the fault of this number strikes."""
+        return run % len(self.inputs)
+
+    def records_of(self, number: int) -> tuple[Record, ...]:
+        """The runs on one input."""
+        return self.records[number :: len(self.inputs)]
 
 
 def run_campaign(
@@ -124,8 +150,9 @@ def _attack(
     with one_processor():
         prepared, place = _prepare(plan, target, stage)
     stage(f"drawing {plan.runs} faults")
-    bench = _Bench(plan=plan, target=prepared.target, golden=prepared.golden)
-    workers.take(bench, Attacker(place=place, golden=prepared.golden))
+    golden = tuple(each.golden for each in prepared.inputs)
+    bench = _Bench(plan=plan, target=prepared.target, golden=golden)
+    workers.take(bench, place)
     planned = _draw(plan, bench, prepared)
     done: dict[int, Record] = {}
     if journal is not None:
@@ -148,18 +175,24 @@ def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns
         place = target.open()
         undo.callback(place.close)
         stage("golden runs")
-        golden, profile = golden_run(place), None
+        golden = tuple(golden_run(each) for each in places_of(place))
+        rng = _Bench(plan=plan, target=target, golden=golden).generator("profile")
+        profiles: list[TargetProfile | None] = [None] * len(golden)
         if plan.strategy().rule is Rule.INSTRUCTION:
             stage("profile")
-            rng = _Bench(plan=plan, target=target, golden=golden).generator("profile")
-            profile = place.profile(rng, windows=plan.windows, watch=steps_told(stage))
+            profiles = [
+                each.profile(rng, windows=plan.windows, watch=steps_told(stage))
+                for each in places_of(place)
+            ]
         undo.pop_all()
     stream = {"kernel": target.stream[0]} if target.stream else {}
     prepared = TargetRuns(
         target=place.target,
         context=stream | place.context(),
-        golden=golden,
-        profile=profile,
+        inputs=tuple(
+            PreparedInput(golden=run, profile=profile)
+            for run, profile in zip(golden, profiles, strict=True)
+        ),
         prepare_s=time.perf_counter() - begun,
     )
     return prepared, place
@@ -167,9 +200,13 @@ def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns
 
 def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
     """Make the records of all faults before they run; time rules draw at the stop."""
-    chosen, profile, records = plan.strategy(), prepared.profile, []
+    chosen, records = plan.strategy(), []
     for index in range(plan.runs):
+        number = prepared.input_of(index)
+        profile = prepared.inputs[number].profile
         what = {"run": index, "seed": plan.seed, "sampling": chosen.name, **prepared.context}
+        if len(prepared.inputs) > 1:
+            what["input"] = number
         if profile is None:
             records.append({"version": record.VERSION, "state": "planned", "trigger": []} | what)
             continue
@@ -235,7 +272,12 @@ class _Bench:
 
     plan: Plan
     target: AttackTarget
-    golden: Golden
+    golden: tuple[Golden, ...]  # of each input
+
+    def attackers(self, place: JudgedPlace) -> tuple[Attacker, ...]:
+        """One attacker for each input of the target, open at a place."""
+        pairs = zip(places_of(place), self.golden, strict=True)
+        return tuple(Attacker(place=each, golden=golden) for each, golden in pairs)
 
     def generator(self, *what: str | int) -> np.random.Generator:
         """The target's own random numbers; those of fault number i depend on i only."""
@@ -246,33 +288,33 @@ class _Open:
     """The one target that a worker process keeps open between chunks."""
 
     stream: tuple[str, ...] | None = None
-    attacker: Attacker | None = None
+    attackers: tuple[Attacker, ...] = ()
 
     @classmethod
-    def of(cls, bench: _Bench) -> Attacker:
-        """The attacker of a bench: the open one, or a new one in its place."""
-        if cls.attacker is None or cls.stream != bench.target.stream:
-            cls.keep(bench, Attacker(place=bench.target.open(), golden=bench.golden))
-        assert cls.attacker is not None
-        return cls.attacker
+    def of(cls, bench: _Bench) -> tuple[Attacker, ...]:
+        """The attackers of a bench: the open ones, or new ones in their place."""
+        if not cls.attackers or cls.stream != bench.target.stream:
+            cls.keep(bench, bench.target.open())
+        return cls.attackers
 
     @classmethod
-    def keep(cls, bench: _Bench, attacker: Attacker) -> None:
-        """Keep an attacker open for later chunks, and close the previous one."""
+    def keep(cls, bench: _Bench, place: JudgedPlace) -> None:
+        """Keep a place open for later chunks, and close the previous one."""
         cls.close()
-        cls.attacker, cls.stream = attacker, bench.target.stream
+        cls.attackers, cls.stream = bench.attackers(place), bench.target.stream
 
     @classmethod
     def close(cls) -> None:
-        if cls.attacker is not None:
-            cls.attacker.place.close()
-            cls.attacker = None
+        if cls.attackers:
+            cls.attackers[0].place.close()
+            cls.attackers = ()
 
 
 def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     bench, tasks = job
-    attacker, results = _Open.of(bench), []
+    attackers, results = _Open.of(bench), []
     for index, fault in tasks:
+        attacker = attackers[index % len(attackers)]
         if fault is not None:
             results.append((index, attacker.run(fault)))
         else:
@@ -308,12 +350,12 @@ class _AttackWorkers:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def take(self, bench: _Bench, attacker: Attacker) -> None:
-        """Keep an attacker prepared in this process, or close it if no worker here needs it."""
+    def take(self, bench: _Bench, place: JudgedPlace) -> None:
+        """Keep a place that was opened in this process, or close it if no worker here needs it."""
         if self._pool is None:
-            _Open.keep(bench, attacker)
+            _Open.keep(bench, place)
         else:
-            attacker.place.close()
+            place.close()
 
     def run(self, bench: _Bench, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
         """The results in the order of the tasks.

@@ -66,15 +66,17 @@ def share_of(hits: Sequence[bool], of: Sequence[bool], struck: Struck | None = N
 
 
 def shares_to_json(found: Mapping[RunOutcome, Share]) -> dict[str, dict[str, Any]]:
-    """The result of `shares` as plain values; a share of nothing is null."""
+    """The result of `shares` as plain values."""
+    return {outcome.value: share_to_json(share) for outcome, share in found.items()}
+
+
+def share_to_json(share: Share) -> dict[str, Any]:
+    """A share as plain values; a share of nothing is null."""
     return {
-        outcome.value: {
-            "count": share.count,
-            "of": share.total,
-            "share": None if math.isnan(share.share) else share.share,
-            "wilson95": [share.low, share.high],
-        }
-        for outcome, share in found.items()
+        "count": share.count,
+        "of": share.total,
+        "share": None if math.isnan(share.share) else share.share,
+        "wilson95": [share.low, share.high],
     }
 
 

@@ -60,10 +60,10 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
         tolerance = float(plan["tolerance"])
         target = KernelTarget(kernel=kernel, inputs=folder / INPUTS, tolerance=tolerance)
         with one_processor(), closing(target.open()) as place:
-            attacker = Attacker(place=place, golden=golden_run(place))
+            attackers = [Attacker(place=each, golden=golden_run(each)) for each in place.inputs]
             for entry in records[: runs or None]:
                 record.require_same_build(entry, place.layout.image)
-                yield _replay(attacker, entry)
+                yield _replay(attackers[entry.get("input", 0)], entry)
     if not found:
         raise RecordError(f"{folder}: no runs that can be repeated")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -242,6 +242,12 @@ class JudgedPlace(AttackPlace, Protocol):
         """Judge the last run; `ended` is None if it exceeded its limit."""
 
 
+def places_of(place: JudgedPlace) -> Sequence[JudgedPlace]:
+    """The places of a target's inputs, if it names them in `inputs`; most have one, their own."""
+    found: Sequence[JudgedPlace] = getattr(place, "inputs", (place,))
+    return found
+
+
 class AttackTarget(Protocol):
     """A target as plain values."""
 
@@ -270,12 +276,16 @@ class Difference:
         absolute: the same in `unit`, or inf.
         unit: unit of `absolute`.
         text: the difference in words.
+        noticeable: whether it is beyond what the taker of the output tolerates.
+        parts: what the difference consists of, by name.
     """
 
     relative: float
     absolute: float
     unit: str = ""
     text: str = ""
+    noticeable: bool = True
+    parts: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Entries of a record; a size that is not a number is null."""
@@ -285,6 +295,8 @@ class Difference:
             "absolute": self.absolute if finite else None,
             "unit": self.unit,
             "text": self.text,
+            "noticeable": self.noticeable,
+            "parts": dict(self.parts),
         }
 
 

@@ -110,6 +110,10 @@ class OccupancyMap:
             payload=octree.encode(self._ended_in[self._occupied]),
         )
 
+    def tree(self) -> bytes:
+        """Return the whole tree in OctoMap's `.ot` format: every node with its log-odds value."""
+        return bytes(self._tree.write())
+
     def _usable(self, points: FloatArray) -> FloatArray:
         height = points[:, 2]
         kept = (height >= self._params.z_min_m) & (height <= self._params.z_max_m)

@@ -1,11 +1,12 @@
-"""Inputs of isolated kernels, recorded in a golden run that is flown once."""
+"""Inputs of isolated kernels, recorded in golden runs."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from mavfi_cli.attack.kernels.inputs import (
     INPUTS,
@@ -14,7 +15,8 @@ from mavfi_cli.attack.kernels.inputs import (
     load_inputs,
     save_inputs,
 )
-from mavfi_cli.autonomy import tracking
+from mavfi_cli.autonomy import collision, tracking
+from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, RecordError, TargetError
@@ -24,51 +26,101 @@ from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.mission import MissionConfig
 
+_Any = TypeVar("_Any")
+INPUTS_A_KERNEL = 5
+_FORESEEN = 2  # of the five checked trajectories, if the flight has so many with a collision
+_FLIGHTS = 20  # the most flights from which planning problems are taken
 
-def record_inputs(config: MissionConfig) -> KernelInputs:
-    """Fly the mission without a fault and return its kernels' inputs near the middle of the flight.
+
+def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
+    """Fly the mission without a fault and return inputs of all kernels, spread over the flight.
+
+    If it does not have enough planning problems, missions with the next seeds supply the rest.
 
     Raises:
-        TargetError: The flight did not reach its goal, or never had to plan round an obstacle.
+        TargetError: A flight did not reach its goal, or there are too few inputs of a kernel.
         MavfiError: The mission could not begin.
     """
-    recorder = Recorder()
-    with tempfile.TemporaryDirectory(prefix="mavfi-golden-") as scratch:
-        flight = record_of(fly_golden(config, Path(scratch), recorder))
-    if not flight.succeeded:
-        raise TargetError("golden flight", f"ended with {flight.outcome}: {flight.reason}")
-    return _middle(flight_name(config), config, recorder)
-
-
-def _middle(name: str, config: MissionConfig, recorder: Recorder) -> KernelInputs:
+    name, recorder = flight_name(config), _flown(config)
     given = {
         node: [value for value, _ in recorder.orders.get(node, [])]
         for node in ("point_cloud", "octomap", "control")
     }
     frames, clouds, ticks = given.values()
-    if min(len(frames), len(clouds), len(ticks)) < 4:
+    if min(len(frames), len(clouds), len(ticks)) < 2 * INPUTS_A_KERNEL:
         raise TargetError(name, "is too short to record kernels")
-    cloud = len(clouds) // 2
-    checks = recorder.orders.get("collision_check")
-    if not checks:
-        raise TargetError(name, "never checked a trajectory")
-    check, stamp_s = checks[len(checks) // 2]
-    state, inputs, params = _tracked(config, ticks)
-    return KernelInputs(
-        flight=name,
-        frame=frames[len(frames) // 2],
-        mapped=tuple(clouds[:cloud]),
-        cloud=clouds[cloud],
-        check=replace(check, stamp_s=stamp_s, front_enu_m=None),
-        task=_hard_task(name, config, recorder),
-        tracking_state=state,
-        tracking=inputs,
-        tracking_params=params,
+    params = tracking.TrackingParams(v_max_mps=config.v_max_mps, a_max_mps2=config.a_max_mps2)
+    kernels = zip(
+        _spread(frames),
+        _spread(range(len(clouds))),
+        _checks(name, recorder),
+        _problems(config, recorder),
+        _tracked(ticks, params),
+        strict=True,
+    )
+    return tuple(
+        KernelInputs(
+            flight=name,
+            frame=frame,
+            mapped=tuple(clouds[:cloud]),
+            cloud=clouds[cloud],
+            check=check,
+            task=task,
+            tracking_state=state,
+            tracking=inputs,
+            tracking_params=params,
+        )
+        for frame, cloud, check, task, (state, inputs) in kernels
     )
 
 
-def _hard_task(name: str, config: MissionConfig, recorder: Recorder) -> PlanningTask:
-    """Return the middle one of the requests that a straight line does not answer."""
+def _flown(config: MissionConfig) -> Recorder:
+    recorder = Recorder()
+    with tempfile.TemporaryDirectory(prefix="mavfi-golden-") as scratch:
+        flight = record_of(fly_golden(config, Path(scratch), recorder))
+    if not flight.succeeded:
+        problem = f"ended with {flight.outcome}: {flight.reason}"
+        raise TargetError(flight_name(config), problem)
+    return recorder
+
+
+def _spread(of: Sequence[_Any], number: int = INPUTS_A_KERNEL) -> list[_Any]:
+    """Members at equal distances; the middle one is among them if the number is odd."""
+    return [of[(2 * k + 1) * len(of) // (2 * number)] for k in range(number)]
+
+
+def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
+    """Return checked trajectories, some of them with a collision if there are any."""
+    checks = [
+        replace(check, stamp_s=stamp_s, front_enu_m=None)
+        for check, stamp_s in recorder.orders.get("collision_check", [])
+        if check.trajectory is not None
+    ]
+    foreseen = [check for check in checks if _foresees(check)]
+    free = [check for check in checks if not _foresees(check)]
+    some = min(_FORESEEN, len(foreseen))
+    if len(free) < INPUTS_A_KERNEL - some:
+        raise TargetError(name, "checked too few trajectories")
+    return _spread(free, INPUTS_A_KERNEL - some) + _spread(foreseen, some)
+
+
+def _foresees(check: CollisionInputs) -> bool:
+    _, report = collision.step(collision.CollisionState(), check, collision.CollisionParams())
+    return report.collision
+
+
+def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
+    found = _hard_tasks(config, recorder)
+    for seed in range(config.seed + 1, config.seed + _FLIGHTS):
+        if len(found) >= INPUTS_A_KERNEL:
+            return _spread(found)
+        another = replace(config, seed=seed)
+        found += _hard_tasks(another, _flown(another))
+    raise TargetError(flight_name(config), "has too few plans round an obstacle, as the next seeds")
+
+
+def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
+    """Return the requests that a straight line does not answer."""
     assert recorder.briefing is not None
     hard = []
     for (request, snapshot), _ in recorder.orders["planner"]:
@@ -86,25 +138,23 @@ def _hard_task(name: str, config: MissionConfig, recorder: Recorder) -> Planning
             if grid.segment_free(task.start_enu_m, task.goal_enu_m):
                 continue
             hard.append(task)
-    if not hard:
-        raise TargetError(name, "never had to plan round an obstacle")
-    return hard[len(hard) // 2]
+    return hard
 
 
 def _tracked(
-    config: MissionConfig, ticks: list[ControlInput]
-) -> tuple[tracking.TrackingState, tracking.TrackingInputs, tracking.TrackingParams]:
-    """Return state, input and parameters of the controller at the middle tick with a path."""
-    params = tracking.TrackingParams(v_max_mps=config.v_max_mps, a_max_mps2=config.a_max_mps2)
+    ticks: list[ControlInput], params: tracking.TrackingParams
+) -> list[tuple[tracking.TrackingState, tracking.TrackingInputs]]:
+    """Return states and inputs of the controller at ticks with a path."""
     following = [index for index, tick in enumerate(ticks) if tick.inputs.trajectory is not None]
     if not following:
         raise TargetError("golden flight", "never followed a trajectory")
     first = ticks[0]
     state = tracking.TrackingState(yaw_rad=first.yaw_rad, stamp_s=first.inputs.stamp_s)
-    chosen = following[len(following) // 2]
-    for tick in ticks[:chosen]:
+    chosen, found = _spread(following), []
+    for index, tick in enumerate(ticks[: chosen[-1] + 1]):
+        found += [(state, tick.inputs)] * chosen.count(index)
         state, _ = tracking.step(state, tick.inputs, params)
-    return state, ticks[chosen].inputs, params
+    return found
 
 
 def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
@@ -118,7 +168,7 @@ def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
     """
     path = folder / INPUTS
     if path.is_file():
-        known, sha256 = load_inputs(path)
+        (known, *_), sha256 = load_inputs(path)
         if known.flight != flight_name(config):
             raise ConfigError(f"holds inputs of a {known.flight}", path=path)
         return {"inputs": path, "inputs_sha256": sha256, "flight": known.flight}
@@ -128,7 +178,7 @@ def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise RecordError(f"{folder}: {error.strerror}") from None
     sha256 = save_inputs(path, inputs)
-    return {"inputs": path, "inputs_sha256": sha256, "flight": inputs.flight}
+    return {"inputs": path, "inputs_sha256": sha256, "flight": flight_name(config)}
 
 
 def flight_name(config: MissionConfig) -> str:

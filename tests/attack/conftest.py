@@ -42,13 +42,13 @@ def kernel_inputs(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def attack(tracing, kernel_inputs):
     """Function that runs a campaign on those inputs."""
-    inputs, sha256 = load_inputs(kernel_inputs)
+    (first, *_), sha256 = load_inputs(kernel_inputs)
 
     def run(*kernels, runs=10, jobs=1, folder=None, seed=5, tolerance=0.0, **changes):
         plan = Plan(runs=runs, seed=seed, **changes)
         targets = [
             KernelTarget(
-                kernel=kernel, inputs=kernel_inputs, inputs_sha256=sha256, flight=inputs.flight,
+                kernel=kernel, inputs=kernel_inputs, inputs_sha256=sha256, flight=first.flight,
                 tolerance=tolerance,
             )
             for kernel in kernels

@@ -4,152 +4,37 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import io
 import math
 import sys
-import tokenize
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mavfi_cli.attack.kernels.inputs import KernelInputs
+from mavfi_cli.attack.kernels.outputs import (
+    A_TICK_S,
+    HALF_A_VOXEL_M,
+    SMALL,
+    Numbers,
+    Output,
+    checks,
+    maps,
+    numbers,
+    paths,
+)
 from mavfi_cli.attack.kernels.scope import KernelScope, compiled_region, kernel_scope
 from mavfi_cli.attack.target import Difference
 from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, tracking
 from mavfi_cli.autonomy.grid import segment_free
-from mavfi_cli.autonomy.octree import occupied_leaves
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
+from mavfi_cli.autonomy.trajectory import waypoint_index
 from mavfi_cli.core.errors import TargetError, UnknownName
 
-Output = dict[str, NDArray[np.generic]]
-
-# Errors that numpy raises for an array with a broken header, beside ValueError.
-_DAMAGE = (
-    OSError, EOFError, SyntaxError, MemoryError, TypeError, OverflowError, SystemError,
-    tokenize.TokenError,
-)  # fmt: skip
-
-
-Compare = Callable[[Output, Output], Difference]
-
-
-def pack(output: Output) -> bytes:
-    """Pack the arrays in the order of the dictionary; equal outputs give equal bytes."""
-    buffer = io.BytesIO()
-    for name, array in output.items():
-        np.save(buffer, np.array(name))
-        np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
-
-
-def unpack(data: bytes) -> Output:
-    """Read what `pack` wrote.
-
-    Raises:
-        ValueError: the bytes are something else.
-    """
-    buffer, output = io.BytesIO(data), {}
-    try:
-        while buffer.tell() < len(data):
-            name = np.load(buffer, allow_pickle=False)
-            output[str(name)] = np.load(buffer, allow_pickle=False)
-    except _DAMAGE as error:
-        raise ValueError(f"damaged output: {error}") from None
-    return output
-
-
-def numbers(golden: Output, output: Output) -> Difference:
-    """Largest difference of a number, relative to the golden one, or absolute if that is 0."""
-    changed, largest, relative = 0, 0.0, 0.0
-    for name, expected in golden.items():
-        got = output.get(name)
-        if got is None or got.shape != expected.shape:
-            shape = "missing" if got is None else f"{got.shape} instead of {expected.shape}"
-            return _incomparable(f"{name}: {shape}")
-        differs = ~((got == expected) | (_nan(got) & _nan(expected)))
-        if not differs.any():
-            continue
-        changed += int(differs.sum())
-        a = expected[differs].astype(np.float64)
-        with np.errstate(over="ignore", invalid="ignore"):
-            gaps = np.abs(got[differs].astype(np.float64) - a)
-            shares = gaps / np.where(a == 0.0, 1.0, np.abs(a))
-        if not np.isfinite(gaps).all():
-            return _incomparable(f"{name}: not a number")
-        largest, relative = max(largest, float(gaps.max())), max(relative, float(shares.max()))
-    text = f"{changed} of {sum(array.size for array in golden.values())} numbers"
-    return Difference(relative=relative, absolute=largest, text=text)
-
-
-def _nan(array: NDArray[np.generic]) -> NDArray[np.bool_]:
-    if not np.issubdtype(array.dtype, np.floating):
-        return np.zeros(array.shape, np.bool_)
-    return np.isnan(array.astype(np.float64))
-
-
-def voxels(golden: Output, output: Output) -> Difference:
-    """Number of voxels occupied in only one map, relative to those of the golden map.
-
-    If the same voxels are occupied, the difference is in the number of the tree's nodes.
-    """
-    ours, theirs = _occupied(golden), _occupied(output)
-    count = len(ours ^ theirs)
-    if not count:
-        nodes, other = int(golden["nodes"]), int(output["nodes"])
-        gap = abs(other - nodes)
-        text = f"{other - nodes:+d} nodes"
-        return Difference(relative=gap / nodes, absolute=float(gap), unit="nodes", text=text)
-    text = f"{len(ours - theirs)} voxels missing, {len(theirs - ours)} added"
-    return Difference(
-        relative=count / max(1, len(ours)), absolute=float(count), unit="voxels", text=text
-    )
-
-
-def _occupied(output: Output) -> set[tuple[int, int, int]]:
-    found: set[tuple[int, int, int]] = set()
-    for x, y, z, size in occupied_leaves(output["payload"].tobytes()).tolist():
-        if size > 64:  # a corrupted stream: one huge cube stands for itself
-            found.add((x, y, z))
-            continue
-        found.update(
-            (x + i, y + j, z + k) for i in range(size) for j in range(size) for k in range(size)
-        )
-    return found
-
-
-def paths(golden: Output, output: Output) -> Difference:
-    """Difference of a planned path in length and in the position of its ends, m."""
-    ours, theirs = golden["path_enu_m"], output["path_enu_m"]
-    if bool(golden["found"]) != bool(output["found"]):
-        return _incomparable("a path" if output["found"] else "no path")
-    if not len(ours) or not len(theirs) or not np.isfinite(theirs.astype(np.float64)).all():
-        return _incomparable("another failure" if not len(theirs) else "not a number")
-    length, other = _length(ours), _length(theirs)
-    ends = max(
-        math.dist(ours[0].tolist(), theirs[0].tolist()),
-        math.dist(ours[-1].tolist(), theirs[-1].tolist()),
-    )
-    gap = abs(other - length)
-    text = f"{other - length:+.3f} m long, ends {ends:.3f} m off, {len(theirs)} vertices"
-    return Difference(
-        relative=max(gap, ends) / (length or 1.0), absolute=max(gap, ends), unit="m", text=text
-    )
-
-
-def _length(path: NDArray[np.generic]) -> float:
-    steps = np.diff(path.astype(np.float64), axis=0)
-    return float(np.linalg.norm(steps, axis=1).sum())
-
-
-def _incomparable(text: str) -> Difference:
-    return Difference(relative=math.inf, absolute=math.inf, text=text)
-
-
 Call = Callable[[], Output]
+_POSES = 5  # from which the collision check looks ahead
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,6 +46,7 @@ class Kernel:
         title: as tables print it.
         prepare: function from the inputs to a call; everything before the kernel itself runs here.
         compare: function that returns the size of the difference of two outputs.
+        tolerance: which differences `compare` does not call noticeable, in words.
         repeatable: true if the call leaves no state behind, so that calling it warms it up.
         too_long: true if the kernel is too long to be stepped whole; windows are sampled.
         inner: compiled functions at which windows begin, beside those of its scope.
@@ -170,7 +56,8 @@ class Kernel:
     name: str
     title: str
     prepare: Callable[[KernelInputs], Call]
-    compare: Compare = numbers
+    compare: Callable[[Numbers, Numbers], Difference] = numbers
+    tolerance: str = f"numbers within {SMALL:g} of their size"
     repeatable: bool = True
     too_long: bool = False
     inner: tuple[Any, ...] = ()
@@ -200,24 +87,36 @@ def _octomap(inputs: KernelInputs) -> Call:
         world.insert(cloud)
 
     def call() -> Output:
-        """Insert one more cloud into the map; return its serialised tree and number of nodes."""
+        """Insert one more cloud into the map; return the planner's map and the whole tree."""
         world.insert(inputs.cloud)
         payload = np.frombuffer(world.snapshot().payload, np.uint8)
-        return {"payload": payload, "nodes": np.array(world.nodes)}
+        return {"payload": payload, "tree": lambda: np.frombuffer(world.tree(), np.uint8)}
 
     return call
 
 
 def _collision_check(inputs: KernelInputs) -> Call:
-    params = collision.CollisionParams()
+    params, check = collision.CollisionParams(), inputs.check
+    trajectory = check.trajectory
+    assert trajectory is not None
+    poses = np.linspace(check.time_s, trajectory.duration_s, _POSES, endpoint=False)
 
     def call() -> Output:
-        """Check the rest of a trajectory once."""
-        _, report = collision.step(collision.CollisionState(), inputs.check, params)
+        """Check the rest of a trajectory from several poses on it."""
+        state, reports = collision.CollisionState(), []
+        for time_s in poses.tolist():
+            state, report = collision.step(state, replace(check, time_s=time_s), params)
+            reports.append(report)
+        times_s = [each.time_to_collision_s for each in reports]
+        blocked = [
+            waypoint_index(trajectory, pose + time_s) if math.isfinite(time_s) else -1
+            for pose, time_s in zip(poses.tolist(), times_s, strict=True)
+        ]
         return {
-            "collision": np.array(report.collision),
-            "time_to_collision_s": np.array(report.time_to_collision_s),
-            "future_collision_seq": np.array(report.future_collision_seq),
+            "collision": np.array([each.collision for each in reports]),
+            "time_to_collision_s": np.array(times_s),
+            "blocked_waypoint": np.array(blocked),
+            "future_collision_seq": np.array([each.future_collision_seq for each in reports]),
         }
 
     return call
@@ -257,6 +156,17 @@ def _control(inputs: KernelInputs) -> Call:
     return call
 
 
+def _planning(name: str, title: str, **others: Any) -> Kernel:
+    return Kernel(
+        name=name,
+        title=title,
+        prepare=_planner(name),
+        compare=paths,
+        tolerance=f"a path within {HALF_A_VOXEL_M:g} m, in length too",
+        **others,
+    )
+
+
 KERNELS = {
     kernel.name: kernel
     for kernel in (
@@ -265,25 +175,22 @@ KERNELS = {
             name="octomap",
             title="OctoMap",
             prepare=_octomap,
-            compare=voxels,
+            compare=maps,
+            tolerance="the same voxels are occupied",
             repeatable=False,
             too_long=True,
         ),
         Kernel(
-            name="collision_check", title="Collision check", prepare=_collision_check, too_long=True
-        ),
-        Kernel(name="rrt", title="RRT", prepare=_planner("rrt"), compare=paths),
-        Kernel(
-            name="rrtconnect", title="RRTConnect", prepare=_planner("rrtconnect"), compare=paths
-        ),
-        Kernel(
-            name="rrtstar",
-            title="RRT*",
-            prepare=_planner("rrtstar"),
-            compare=paths,
+            name="collision_check",
+            title="Collision check",
+            prepare=_collision_check,
+            compare=checks,
+            tolerance=f"the same collisions, within {A_TICK_S:g} s",
             too_long=True,
-            inner=(segment_free,),
         ),
+        _planning("rrt", "RRT"),
+        _planning("rrtconnect", "RRTConnect"),
+        _planning("rrtstar", "RRT*", too_long=True, inner=(segment_free,)),
         Kernel(name="control", title="PID", prepare=_control),
     )
 }

@@ -1,11 +1,13 @@
-"""Inputs of the kernels, from one moment in the middle of a golden run."""
+"""Inputs of the kernels, from several moments of a golden run."""
 
 from __future__ import annotations
 
 import hashlib
 import pickle
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
@@ -31,7 +33,7 @@ class PlanningTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelInputs:
-    """Inputs and states of all kernels, each from one invocation of the golden run."""
+    """One input of each kernel with its state, each from one invocation of a golden run."""
 
     flight: str  # name of the flight, in words
     frame: DepthFrame
@@ -44,18 +46,18 @@ class KernelInputs:
     tracking_params: TrackingParams
 
 
-def save_inputs(path: Path, inputs: KernelInputs) -> str:
+def save_inputs(path: Path, inputs: Sequence[KernelInputs]) -> str:
     """Write the inputs; return the SHA-256 of the file.
 
     Raises:
         RecordError: the file could not be written.
     """
-    data = pickle.dumps(inputs, protocol=_PROTOCOL)
+    data = pickle.dumps(tuple(inputs), protocol=_PROTOCOL)
     write_atomically(path, lambda file: file.write(data))
     return hashlib.sha256(data).hexdigest()
 
 
-def load_inputs(path: Path) -> tuple[KernelInputs, str]:
+def load_inputs(path: Path) -> tuple[tuple[KernelInputs, ...], str]:
     """Read inputs that `save_inputs` wrote, and the SHA-256 of the file.
 
     The file is a pickle: load only what you wrote yourself.
@@ -71,13 +73,14 @@ def load_inputs(path: Path) -> tuple[KernelInputs, str]:
     return inputs, hashlib.sha256(data).hexdigest()
 
 
-def inputs_of_bytes(data: bytes) -> KernelInputs:
+def inputs_of_bytes(data: bytes) -> tuple[KernelInputs, ...]:
     """Read the inputs from the bytes of such a file.
 
     Raises:
         pickle.UnpicklingError: the bytes are something else.
     """
-    inputs = pickle.loads(data)
-    if not isinstance(inputs, KernelInputs):
+    inputs: Any = pickle.loads(data)
+    known = isinstance(inputs, tuple) and all(isinstance(each, KernelInputs) for each in inputs)
+    if not (known and inputs):
         raise pickle.UnpicklingError(f"a {type(inputs).__name__}")
-    return inputs
+    return tuple(inputs)

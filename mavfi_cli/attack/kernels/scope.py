@@ -48,6 +48,7 @@ _OCTOMAP_INNER = (
     "RKN8octomath7Vector3ES7_RNS_6KeyRayE",
     "_ZN7octomap19OccupancyOcTreeBaseINS_10OcTreeNodeEE10updateNodeERKNS_9OcTreeKeyEfb",
 )
+_OCTOMAP_WRITE = "_ZNK7octomap14AbstractOcTree5writeERSo"
 _FCL_COLLIDE = (
     "_ZN3fcl7collideIdEEmPKNS_15CollisionObjectIT_EES5_RKNS_16CollisionRequestIS2_EE"
     "RNS_15CollisionResultIS2_EE"
@@ -73,6 +74,8 @@ class KernelScope:
         inner: functions of the kernel. If it executes too many instructions to profile them all,
             invocations of these functions are sampled. For a planner node, windows that begin at
             them are sampled, and the first function is the search.
+        end: if it is there, nothing is attacked from its first execution on: only the output is
+            written then.
     """
 
     kernel: str
@@ -80,6 +83,7 @@ class KernelScope:
     objects: tuple[str, ...]
     regions: Mapping[str, Region | Part]
     inner: tuple[Location, ...] = ()
+    end: Location | None = None
 
 
 def kernel_scope(kernel: str) -> KernelScope:
@@ -181,6 +185,7 @@ def _octomap() -> KernelScope:
         objects=(library,),
         regions={},
         inner=inner,
+        end=image.function(_OCTOMAP_WRITE, [library]),
     )
 
 

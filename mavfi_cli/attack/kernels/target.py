@@ -7,6 +7,7 @@ afterwards, and judges it in terms of what the kernel computes.
 from __future__ import annotations
 
 import contextlib
+import copy
 import hashlib
 import math
 import os
@@ -18,11 +19,11 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.catalogue import unpack
+from mavfi_cli.attack.kernels.outputs import unpack
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.kernels.template import ASK_SCOPE, GO, PID_BYTES, RAISED, RUN, TIMES
 from mavfi_cli.attack.outcome import RunOutcome
-from mavfi_cli.attack.profile import profile_run
+from mavfi_cli.attack.profile import ENOUGH, profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import (
     Difference,
@@ -58,7 +59,7 @@ class KernelTarget:
 
     Attributes:
         kernel: name of one of ours, or the file of a user's kernel.
-        inputs: file with the inputs of one flight; `flight` names that flight in words.
+        inputs: file with inputs of one flight; `flight` names that flight in words.
         tolerance: relative error of an output that still counts as benign.
         layout: layout of an earlier template, because finding it takes seconds.
     """
@@ -106,7 +107,12 @@ class _CallOutput:
 
 
 class KernelPlace:
-    """Runs one kernel in forks of one template; use it only in the thread that made it."""
+    """Runs one kernel in forks of one template; use it only in the thread that made it.
+
+    Attributes:
+        inputs: one place for each input of the kernel, all of the same template, which belongs to
+            the first.
+    """
 
     kind = "kernel"
 
@@ -124,10 +130,15 @@ class KernelPlace:
             undo.callback(os.close, self._output)
             self._template = ServedProcess(_PROGRAM, output=self._output)
             undo.callback(self._template.kill)
-            self._template.begin((target.kernel, inputs), self.name)
+            count = self._template.begin((target.kernel, inputs), self.name)
             self.layout = self._look_up(target.layout)
             self._closing = undo.pop_all()
         self.target = replace(target, layout=self.layout)
+        self._number = 0
+        self.inputs = [self]
+        while len(self.inputs) < count:
+            self.inputs.append(copy.copy(self))
+            self.inputs[-1]._number = len(self.inputs) - 1
 
     def _look_up(self, known: _Layout | None) -> _Layout:
         """Find the memory layout; reuse the known one if it is the same."""
@@ -151,7 +162,7 @@ class KernelPlace:
         """
         control = self._template.connection
         os.ftruncate(self._output, 0)
-        control.send(RUN)
+        control.send(RUN + bytes([self._number]))
         told = control.recv(PID_BYTES)
         if len(told) < PID_BYTES:
             raise FaultError(f"the process that loads {self.name} has died")
@@ -177,13 +188,23 @@ class KernelPlace:
     ) -> TargetProfile:
         """Step a golden run of the kernel, or a sample of it if it is too long.
 
+        The inputs share the windows, because each is a part of the campaign only.
+
         Raises:
             TargetError: the kernel never enters its native code.
             WindowTooLong: too many instructions.
         """
-        scope, limit = self.layout.scope, self.limits.profile_steps
-        markers = (scope.inner or (scope.entry,)) if self._kernel.too_long else ()
-        return profile_run(self, rng, markers=markers, windows=windows, limit=limit, watch=watch)
+        scope = self.layout.scope
+        return profile_run(
+            self,
+            rng,
+            markers=(scope.inner or (scope.entry,)) if self._kernel.too_long else (),
+            end=scope.end,
+            windows=max(4, windows // len(self.inputs)),
+            enough=ENOUGH // 2,
+            limit=self.limits.profile_steps,
+            watch=watch,
+        )
 
     def fault_free(self) -> Golden:
         """Run once without a fault.

@@ -1,11 +1,11 @@
 """A warm process with one kernel and its inputs loaded, which forks itself for every run.
 
-The first message is the kernel's name and its inputs. Later requests are single bytes on the same
-socket. The answer to `ASK_SCOPE` is the kernel's scope. For every `RUN` a child is forked: it sends
-its process id (4 bytes), waits for `GO`, calls the kernel once, writes its output to standard
-output, a file, and ends. The next request must not come before the child has ended. The file holds
-CPU seconds and duration of the call (two float64), then the packed output, or the error's text if
-the exit code is `RAISED`.
+The first message is the kernel's name and its inputs; the answer is their number. Later requests
+are bytes on the same socket. The answer to `ASK_SCOPE` is the kernel's scope. For every `RUN` and
+the number of an input, a child is forked: it sends its process id (4 bytes), waits for `GO`, calls
+the kernel once, writes its output to standard output, a file, and ends. The next request must not
+come before the child has ended. The file holds CPU seconds and duration of the call (two float64),
+then the packed output, or the error's text if the exit code is `RAISED`.
 
 Every run starts from the same memory: garbage collection is off, and nothing is kept here from one
 fork to the next.
@@ -22,11 +22,13 @@ import struct
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.catalogue import Call, pack
+from mavfi_cli.attack.kernels.catalogue import Call
 from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
+from mavfi_cli.attack.kernels.outputs import pack
 from mavfi_cli.attack.served import channel, newest_cache_ns
 from mavfi_cli.core.processes import fork, receive, send
 
@@ -44,22 +46,23 @@ def main() -> None:
     connection = channel()
     name, inputs = receive(connection)
     kernel = catalogue.find(name)
-    call = kernel.prepare(inputs_of_bytes(inputs))
-    for _ in range(2 if kernel.repeatable else 0):
+    calls = [kernel.prepare(each) for each in inputs_of_bytes(inputs)]
+    for call in calls * (2 if kernel.repeatable else 0):
         pack(call())
     _limit()
-    send(connection, (None, newest_cache_ns()))
+    send(connection, (len(calls), newest_cache_ns()))
     sys.dont_write_bytecode = True  # the second run must not find what the first has compiled
     gc.collect()
     gc.freeze()
     gc.disable()
     while request := connection.recv(1):
         if request == ASK_SCOPE:
-            status = _in_child(lambda: _tell_scope(connection, kernel, call))
+            status = _in_child(lambda: _tell_scope(connection, kernel, calls[0]))
             if status:
                 _give_up(f"fails without a fault (wait status {status})")
         elif request == RUN:  # not the GO of a child that was killed before reading it
-            _in_child(lambda: _run(connection, call))
+            call = calls[connection.recv(1)[0]]
+            _in_child(partial(_run, connection, call))
 
 
 def _give_up(why: str) -> None:
@@ -97,10 +100,12 @@ def _run(connection: socket.socket, call: Call) -> int:
         return 0
     cpu_s, wall_s, code = time.process_time(), time.perf_counter(), 0
     try:
-        data = pack(call())
+        output = call()
+        times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
+        data = pack(output)
     except Exception as error:  # any error of the corrupted kernel is a result
+        times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
         data, code = f"{type(error).__name__}: {error}".encode(), RAISED
-    times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
     os.pwrite(OUTPUT, times + data, 0)
     return code
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,20 +12,25 @@ from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.outcome import (
     RunOutcome,
     Struck,
+    Window,
     counted,
+    share_of,
+    share_to_json,
     shares,
     shares_to_json,
     signal_name,
 )
 from mavfi_cli.report.tables.columns import blocks, csv_text
+from mavfi_cli.stats.shares import Share
 
-SCHEMA = 1
+SCHEMA = 2
 _OF_EVERY_RUN = (
     "object offset symbol instruction k site role operand bits before after activation "
     "not_injected_reason stop_s run_s output_sha256"
 )
 KERNEL_COLUMNS = (
-    "kernel run outcome signal error relative absolute unit text within_tolerance " + _OF_EVERY_RUN
+    "kernel run input outcome signal error relative absolute unit text noticeable "
+    "within_tolerance " + _OF_EVERY_RUN
 ).split()
 PROGRAM_COLUMNS = f"run outcome signal exit_code magnitude {_OF_EVERY_RUN}".split()
 _SHOWN = tuple(RunOutcome)
@@ -32,12 +38,8 @@ _SHOWN = tuple(RunOutcome)
 
 def _counts(runs: TargetRuns) -> dict[str, Any]:
     """The counts of one target."""
-    records, profile = runs.records, runs.profile
-    struck = None
-    if profile is not None:
-        windows = [profile.window_of(entry) for entry in records]
-        struck = Struck(windows=windows, sampled=profile.sampled)
-    found = shares((RunOutcome(entry["outcome"]) for entry in records), struck)
+    records = runs.records
+    found = shares((RunOutcome(entry["outcome"]) for entry in records), _struck(runs))
     return {
         "outcomes": shares_to_json(found),
         "crashes": counted(_crash(entry) for entry in _with(records, RunOutcome.CRASH)),
@@ -46,6 +48,23 @@ def _counts(runs: TargetRuns) -> dict[str, Any]:
         ),
         "activation": counted(entry["activation"]["activation"] for entry in records),
     }
+
+
+def _struck(runs: TargetRuns) -> Struck:
+    """The sampled windows that the runs hit, over all inputs."""
+    windows: list[Window | None] = []
+    for run, entry in enumerate(runs.records):
+        number = runs.input_of(run)
+        profile = runs.inputs[number].profile
+        window = None if profile is None else profile.window_of(entry)
+        windows.append(window and ((number, window[0]), window[1]))
+    sampled = {
+        (number, stratum): count
+        for number, each in enumerate(runs.inputs)
+        if each.profile is not None
+        for stratum, count in each.profile.sampled.items()
+    }
+    return Struck(windows=windows, sampled=sampled)
 
 
 def _with(records: Iterable[Record], outcome: RunOutcome) -> Iterator[Record]:
@@ -81,34 +100,73 @@ def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
 
 
 def _kernel(runs: TargetRuns) -> dict[str, Any]:
-    target, records, profile = runs.target, runs.records, runs.profile
+    target, records = runs.target, runs.records
     assert isinstance(target, KernelTarget)
+    kernel = catalogue.find(target.kernel)
     sizes = [entry["magnitude"]["relative"] for entry in _with(records, RunOutcome.SDC)]
     finite = sorted(size for size in sizes if size is not None)
     run_s = sum(entry["run_s"] for entry in records)
     return {
         "kernel": target.name,
-        "title": catalogue.find(target.kernel).title,
+        "title": kernel.title,
         "runs": len(records),
-        "population": "moments of one call" if profile is None else profile.in_words(),
-        "complete": None if profile is None else profile.complete,
-        "instructions": None if profile is None else profile.instructions.total,
         "scope": runs.context["scope"],
-        "golden": {
-            "sha256": runs.golden.sha256,
-            "cpu_s": runs.golden.cpu_s,
-            "wall_s": runs.golden.wall_s,
-        },
+        "inputs": [_input(runs, number) for number in range(len(runs.inputs))],
         **_counts(runs),
         "sdc_relative": {
             "median": finite[len(finite) // 2] if finite else None,
             "largest": finite[-1] if finite else None,
             "incomparable": len(sizes) - len(finite),
         },
+        "sdc_noticeable": {"tolerance": kernel.tolerance, **share_to_json(_noticeable(runs))},
+        "sdc_parts": _parts(records),
         "within_tolerance": sum(bool(entry["within_tolerance"]) for entry in records),
         "prepare_s": runs.prepare_s,
         "wall_s": runs.wall_s,
         "injections_per_core_hour": 3600.0 * len(records) / run_s if run_s else None,
+    }
+
+
+def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
+    """One input of a kernel: how much of its run was profiled, and what became of its runs."""
+    records, profile = runs.records_of(number), runs.inputs[number].profile
+    golden = runs.inputs[number].golden
+    length = None if profile is None else profile.instructions
+    return {
+        "population": "moments of one call" if profile is None else profile.in_words(),
+        "complete": None if profile is None else profile.complete,
+        "instructions": None if length is None else length.total,
+        "instructions95": None if length is None else [length.low, _finite(length.high)],
+        "golden": {"sha256": golden.sha256, "cpu_s": golden.cpu_s, "wall_s": golden.wall_s},
+        "outcomes": counted(entry["outcome"] for entry in records),
+    }
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+def _noticeable(runs: TargetRuns) -> Share:
+    """The share of injected runs with a silent corruption beyond the kernel's own tolerance."""
+    sdc, injected = RunOutcome.SDC.value, RunOutcome.NOT_INJECTED.value
+    noticed = [e["outcome"] == sdc and e["magnitude"]["noticeable"] for e in runs.records]
+    return share_of(noticed, [e["outcome"] != injected for e in runs.records], _struck(runs))
+
+
+def _parts(records: Sequence[Record]) -> dict[str, Any]:
+    """For each part of silent corruptions: in how many runs there is one, and its size."""
+    found: dict[str, list[float]] = {}
+    for entry in _with(records, RunOutcome.SDC):
+        for name, size in entry["magnitude"]["parts"].items():
+            found.setdefault(name, [])
+            found[name] += [abs(size)] if size else []
+    return {
+        name: {
+            "runs": len(sizes),
+            "median": sorted(sizes)[len(sizes) // 2] if sizes else None,
+            "largest": max(sizes, default=None),
+        }
+        for name, sizes in found.items()
     }
 
 
@@ -125,7 +183,7 @@ def table(summary: Mapping[str, Any]) -> str:
         f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
         "95 % Wilson interval,"
     )
-    lines.append("widened by the likeness of faults in a window where windows are sampled")
+    lines.append("widened by the spread between windows where windows are sampled")
     lines.append(f"inputs: {summary['plan']['flight']}; tolerance {summary['plan']['tolerance']:g}")
     for kernel in summary["kernels"]:
         lines += _notes(kernel)
@@ -140,16 +198,24 @@ def _cell(row: Mapping[str, Any]) -> str:
 
 
 def _notes(kernel: Mapping[str, Any]) -> list[str]:
-    lines = [
-        f"{kernel['title']}: {kernel['population']}; scope {', '.join(kernel['scope'])}",
-        *_count_lines(kernel, "  "),
-    ]
-    sdc = kernel["sdc_relative"]
+    lines = [f"{kernel['title']}: scope {', '.join(kernel['scope'])}"]
+    lines += [f"  input {n}: {each['population']}" for n, each in enumerate(kernel["inputs"])]
+    lines += _count_lines(kernel, "  ")
+    sdc, noticeable = kernel["sdc_relative"], kernel["sdc_noticeable"]
     if sdc["median"] is not None:
         lines.append(
             f"  SDC, relative size: median {sdc['median']:.2g}, largest {sdc['largest']:.2g}; "
             f"{sdc['incomparable']} of another shape or not a number"
         )
+    if kernel["outcomes"][RunOutcome.SDC.value]["count"]:
+        lines.append(f"  SDC beyond {noticeable['tolerance']}: {_cell(noticeable)}")
+    if kernel["sdc_parts"]:
+        parts = ", ".join(
+            f"{name} in {part['runs']}"
+            + (f" (median {part['median']:.2g})" if part["runs"] else "")
+            for name, part in kernel["sdc_parts"].items()
+        )
+        lines.append(f"  SDC by part: {parts}")
     return lines
 
 

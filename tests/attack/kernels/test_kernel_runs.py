@@ -9,8 +9,8 @@ import pytest
 
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels import target as kernel_target
-from mavfi_cli.attack.kernels.catalogue import pack
 from mavfi_cli.attack.kernels.inputs import load_inputs
+from mavfi_cli.attack.kernels.outputs import pack
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.target import digest
@@ -44,8 +44,20 @@ def test_the_number_of_workers_changes_nothing(attack, control_campaign):
 
 def test_the_golden_run_is_the_kernel_itself(control_campaign, kernel_inputs):
     _, (runs,) = control_campaign
-    call = catalogue.find("control").prepare(load_inputs(kernel_inputs)[0])
-    assert runs.golden.sha256 == digest(pack(call()))
+    inputs, _ = load_inputs(kernel_inputs)
+    calls = [catalogue.find("control").prepare(each) for each in inputs]
+    golden = [digest(pack(call())) for call in calls]
+    assert [each.golden.sha256 for each in runs.inputs] == golden
+    assert len(set(golden)) == 5
+
+
+def test_every_input_is_struck_equally_often(control_campaign):
+    plan, (runs,) = control_campaign
+    assert [entry["input"] for entry in runs.records] == [0, 1, 2, 3, 4] * 6
+    (kernel,) = summarise(plan, [runs])["kernels"]
+    assert [sum(each["outcomes"].values()) for each in kernel["inputs"]] == [6] * 5
+    golden = {each["golden"]["sha256"] for each in kernel["inputs"]}
+    assert {e["output_sha256"] for e in runs.records if e["outcome"] == "benign"} <= golden
 
 
 def test_a_fault_depends_on_its_number_only(attack, control_campaign):
@@ -151,29 +163,31 @@ def test_time_rules_say_what_they_missed(attack):
     for entry in runs.records:
         assert (entry["outcome"] == "not_injected") == bool(entry["not_injected_reason"])
     (kernel,) = summarise(plan, [runs])["kernels"]
-    assert kernel["complete"] is None
+    assert {each["complete"] for each in kernel["inputs"]} == {None}
 
 
 def test_the_planner_is_attacked_in_its_own_library(attack):
     _, (runs,) = attack("rrtconnect", runs=10)
     assert {entry["object"] for entry in runs.records} <= {"libompl.so", "numba:segment_free"}
-    assert runs.profile.complete
+    assert all(each.profile.complete for each in runs.inputs)
 
 
 def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
     monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
     (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
     plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
-    start, pilot, windows = runs.profile.strata
-    assert start.marker is None
-    assert (len(pilot.segments), pilot.complete) == (1, True)
-    assert (len(windows.segments), windows.complete) == (3, False)
-    hit = {runs.profile.window_of(entry) for entry in runs.records} - {None}
-    assert hit <= {(2, segment.start[0].count) for segment in windows.segments}
-    assert len(hit) > 1
     (kernel,) = summarise(plan, [runs])["kernels"]
-    count = 1 + windows.windows_in_run
-    assert f"by sample: the beginning, 4 of {count} windows from collide" in kernel["population"]
+    for number, each in enumerate(runs.inputs):
+        start, pilot, windows = each.profile.strata
+        assert start.marker is None
+        assert (len(pilot.segments), pilot.complete) == (2, True)
+        assert (len(windows.segments), windows.complete) == (4, False)
+        hit = {each.profile.window_of(entry) for entry in runs.records_of(number)} - {None}
+        assert hit <= {(2, segment.start[0].count) for segment in windows.segments}
+        told, count = kernel["inputs"][number], 2 + windows.windows_in_run
+        assert f"by sample: the beginning, 6 of {count} windows from collide" in told["population"]
+        low, high = told["instructions95"]
+        assert each.profile.executed <= low < told["instructions"] < high
     assert all(not replay.differs for replay in replay_runs(tmp_path))
 
 
@@ -190,7 +204,7 @@ def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
         assert 0.0 <= low <= row["share"] <= high <= 1.0
     text = table(summary)
     assert "sampling: instruction-uniform" in text
-    assert "PID: all" in text
+    assert "input 4: all" in text
     rows = list(csv.reader(io.StringIO(runs_csv(KERNEL_COLUMNS, campaign))))
     assert rows[0] == KERNEL_COLUMNS
     assert len(rows) == 31
