@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -88,9 +88,7 @@ def struck(golden: pa.Table, counted: pa.Table) -> _Struck:
     )
 
 
-def cost_row(
-    platform: str, setting: str, found: _Struck, faults: _Struck, *, protected: bool
-) -> dict[str, Any]:
+def cost_row(found: _Struck, faults: _Struck, *, protected: bool) -> dict[str, Any]:
     """The cost of a setting's faults on a platform.
 
     Args:
@@ -106,8 +104,6 @@ def cost_row(
     worst, bare = found.largest("over_own"), faults.largest("over_own")
     flight, count = found.worst, len(cost_s)
     return {
-        "platform": platform,
-        "setting": setting,
         "pairs": found.costs.num_rows,
         "lost": found.lost,
         "cost_s": {
@@ -125,9 +121,7 @@ def cost_row(
     }
 
 
-def cost_difference(
-    platform: str, reference: str, setting: str, first: _Struck, second: _Struck
-) -> dict[str, Any]:
+def cost_difference(first: _Struck, second: _Struck) -> dict[str, Any]:
     """The additional cost of the same faults compared with the reference platform.
 
     Returns:
@@ -143,9 +137,6 @@ def cost_difference(
     first_own, second_own = _by_mission(there, "over_own"), _by_mission(here, "over_own")
     count = len(extra)
     return {
-        "platform": platform,
-        "reference": reference,
-        "setting": setting,
         "pairs": here.num_rows,
         "differ": int(np.count_nonzero(np.nan_to_num(extra))),
         "extra_s": _over(count, lambda drawn: _mean(extra[drawn])),
@@ -157,13 +148,7 @@ def cost_difference(
 
 
 def _worst_row(
-    platform: str,
-    setting: str,
-    golden: pa.Table,
-    faulty: pa.Table,
-    flights: pa.Table,
-    *,
-    protected: bool,
+    golden: pa.Table, faulty: pa.Table, flights: pa.Table, *, protected: bool
 ) -> dict[str, Any]:
     """The longest successful flight of a setting, and its ratio to the mean golden one.
 
@@ -177,8 +162,6 @@ def _worst_row(
     found = worst_case(golden_s, times_s)
     case = worst_case(golden_s, faulty_s, times_s if protected else ())
     return {
-        "platform": platform,
-        "setting": setting,
         "flights": len(times_s),
         "golden_mean_s": found.golden,
         "worst_s": found.faulty_worst,
@@ -297,45 +280,46 @@ def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table
         (platform, setting): struck(won[platform, GOLDEN], counted[platform, setting])
         for platform, setting in itertools.product(platforms, faulty)
     }
+
+    def rows(places: Iterable[tuple[str, str]], row: Callable[..., dict[str, Any]]) -> list[Any]:
+        return [{"platform": p, "setting": s, **row(p, s)} for p, s in places]
+
+    def against_first(
+        among: Sequence[str], row: Callable[..., dict[str, Any]], of: Any
+    ) -> list[Any]:
+        return rows(
+            itertools.product(others, among),
+            lambda p, s: {"reference": first, **row(of[first, s], of[p, s])},
+        )
+
     return {
         "confidence": CONFIDENCE,
-        "settings": [
-            _setting(platform, setting, every[platform, setting], counted[platform, setting])
-            for setting, platform in itertools.product(settings, platforms)
-        ],
-        "ratios": [
-            _ratio(platform, first, setting, counted[first, setting], counted[platform, setting])
-            for platform, setting in itertools.product(others, settings)
-        ],
-        "costs": [
-            cost_row(*place, found[place], found[place[0], NONE], protected=place[1] != NONE)
-            for place in itertools.product(platforms, faulty)
-        ],
-        "cost_differences": [
-            cost_difference(
-                platform, first, setting, found[first, setting], found[platform, setting]
-            )
-            for platform, setting in itertools.product(others, faulty)
-        ],
-        "worst": [
-            _worst_row(
-                *place, won[place[0], GOLDEN], won[place[0], NONE], won[place],
-                protected=place[1] not in (GOLDEN, NONE),
-            )
-            for place in itertools.product(platforms, settings)
-        ],
+        "settings": rows(
+            ((platform, setting) for setting in settings for platform in platforms),
+            lambda *place: _setting(every[place], counted[place]),
+        ),
+        "ratios": against_first(settings, _ratio, counted),
+        "costs": rows(
+            itertools.product(platforms, faulty),
+            lambda p, s: cost_row(found[p, s], found[p, NONE], protected=s != NONE),
+        ),
+        "cost_differences": against_first(faulty, cost_difference, found),
+        "worst": rows(
+            itertools.product(platforms, settings),
+            lambda p, s: _worst_row(
+                won[p, GOLDEN], won[p, NONE], won[p, s], protected=s not in (GOLDEN, NONE)
+            ),
+        ),
         "flights": flights.to_pylist(),
-    }  # fmt: skip
+    }
 
 
 # One platform and setting ---------------------------------------------------------------------
 
 
-def _setting(platform: str, setting: str, every: pa.Table, counted: pa.Table) -> dict[str, Any]:
+def _setting(every: pa.Table, counted: pa.Table) -> dict[str, Any]:
     ends = pc.value_counts(counted["outcome"]).to_pylist()
     return {
-        "platform": platform,
-        "setting": setting,
         "flown": every.num_rows,
         "counted": counted.num_rows,
         "outcomes": dict(sorted((each["values"], each["counts"]) for each in ends)),
@@ -364,15 +348,10 @@ def _spread(values: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -
 # Two platforms --------------------------------------------------------------------------------
 
 
-def _ratio(
-    platform: str, reference: str, setting: str, first: pa.Table, second: pa.Table
-) -> dict[str, Any]:
+def _ratio(first: pa.Table, second: pa.Table) -> dict[str, Any]:
     pairs = paired(first, second, MISSION)
     test = mcnemar(*(flags(each, "succeeded") for each in pairs))
     return {
-        "platform": platform,
-        "reference": reference,
-        "setting": setting,
         "pairs": test.pairs,
         "both_succeed": test.both,
         "success": {**asdict(test), "difference": test.difference},

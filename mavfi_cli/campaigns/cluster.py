@@ -75,7 +75,7 @@ class Cluster(Workers):
         """Send a mission to the cluster."""
         self._submitted += 1
         future = self._client.submit(
-            fly, number, changes, limit_s, self._keep.value, self._task, self._versions,
+            _fly, number, changes, limit_s, self._keep.value, self._task, self._versions,
             key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0,
         )  # fmt: skip
         self._futures[number] = (future, out)
@@ -158,7 +158,7 @@ def _worker_versions() -> dict[str, str]:
     return installed_versions()
 
 
-def fly(
+def _fly(
     number: int,
     changes: Mapping[str, Any],
     limit_s: float,

@@ -19,7 +19,7 @@ _VEHICLES, _BOARDS = (Path(__file__).parent / name for name in ("vehicles", "boa
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class _Calibration:
     """One unpublished number, set so that the model gives one published ratio."""
 
     parameter: str  # one of CALIBRATED
@@ -51,7 +51,7 @@ class ModelVehicle:
     flies_as: str = ""  # the simulated vehicle that stands in for it; empty: one of its size
     description: str = ""
     sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
-    calibration: Calibration | None = None
+    calibration: _Calibration | None = None
 
     def __post_init__(self) -> None:
         for key in (
