@@ -24,7 +24,7 @@ from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.stats.bootstrap import Interval, interval, interval_of_rows, median
-from mavfi_cli.stats.paired import McNemar, holm, mcnemar, worst_over_own
+from mavfi_cli.stats.paired import OWN, McNemar, holm, mcnemar, worst_case
 from mavfi_cli.stats.roc import curves
 from mavfi_cli.stats.shares import Share, mixture, rate
 
@@ -274,7 +274,7 @@ def _worst(pairs: pa.Table) -> dict[str, Any]:
         worst = [np.maximum(each[rows].max(axis=-1), 0.0) for each in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])
 
-    worst = worst_over_own((1.0 + faulty).tolist(), (1.0 + protected).tolist())
+    worst = worst_case(OWN, (1.0 + faulty).tolist(), (1.0 + protected).tolist())
     return {
         "faulty": worst.increase,
         "protected": worst.protected_worst - 1.0,

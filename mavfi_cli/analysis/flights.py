@@ -164,11 +164,6 @@ def paired(first: pa.Table, second: pa.Table, on: Sequence[str]) -> tuple[pa.Tab
     return first.take(places["first"]), second.take(places["second"])
 
 
-def both_succeed(first: pa.Table, second: pa.Table) -> BoolArray:
-    """Whether both flights of a pair reached the goal, (n,)."""
-    return flags(first, "succeeded") & flags(second, "succeeded")
-
-
 def changed(
     missions: Iterable[Hashable],
     first: Iterable[float],

@@ -22,7 +22,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import (
-    both_succeed,
     changed,
     chosen,
     flags,
@@ -35,7 +34,7 @@ from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, mean, median
-from mavfi_cli.stats.paired import mcnemar, sign_flips, worst_case, worst_over_own
+from mavfi_cli.stats.paired import OWN, mcnemar, sign_flips, worst_case
 from mavfi_cli.stats.shares import rate
 
 LATE = 0.95  # quantile given with the worst case, which has no interval
@@ -113,7 +112,7 @@ def cost_row(found: _Struck, faults: _Struck, *, protected: bool) -> dict[str, A
         "over_own": {
             "p95": _over(count, lambda drawn: _late(over_own[drawn])),
             "largest": worst,
-            "recovered_share": worst_over_own([bare], [worst]).recovered_share
+            "recovered_share": worst_case(OWN, [bare], [worst]).recovered_share
             if protected
             else math.nan,
         },
@@ -362,7 +361,7 @@ def _ratio(first: pa.Table, second: pa.Table) -> dict[str, Any]:
 def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> dict[str, Any]:
     """Geometric mean ratio with its interval, or mean difference for values that may be zero."""
     if not quantity.any_end:
-        both = pa.array(both_succeed(first, second))
+        both = pa.array(flags(first, "succeeded") & flags(second, "succeeded"))
         first, second = first.filter(both), second.filter(both)
     before, after = (numbers(each, quantity.name).tolist() for each in (first, second))
     found = changed(

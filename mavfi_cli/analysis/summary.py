@@ -22,7 +22,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import interval
-from mavfi_cli.stats.paired import WorstCase, holm, mcnemar, worst_case, worst_over_own
+from mavfi_cli.stats.paired import OWN, WorstCase, holm, mcnemar, worst_case
 from mavfi_cli.stats.shares import rate
 
 
@@ -65,7 +65,7 @@ class _Match:
         golden_s = reference[used][once]
         pairs = list(zip(times, shown, strict=True))
         return (
-            worst_over_own(*((each[both] / reference[both]).tolist() for each, both in pairs)),
+            worst_case(OWN, *((each[both] / reference[both]).tolist() for each, both in pairs)),
             worst_case(golden_s.tolist(), *(each[both].tolist() for each, both in pairs)),
         )
 

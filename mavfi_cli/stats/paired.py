@@ -19,6 +19,7 @@ BoolArray = NDArray[np.bool_]
 _EXACT = 16  # all signs are tried up to this many differences
 _FLIPS = 9999  # number of random sign patterns for more
 _CHUNK = 4_000_000  # numbers drawn at once
+OWN = (1.0,)  # golden values over their own, for `worst_case` whatever the missions' lengths
 _SLACK = 1e-9  # relative to the largest sum; equal sums differ by rounding
 
 
@@ -150,7 +151,8 @@ def worst_case(
 
     Args:
         golden, faulty, protected: flight times, or energies, of the successful missions of each
-            setting. Without protected missions, the recovery is NaN.
+            setting. Without protected missions, the recovery is NaN. Where each value is over that
+            of the same mission's golden flight, `golden` is OWN.
     """
     if not golden or not faulty:
         nan = math.nan
@@ -172,13 +174,3 @@ def worst_case(
         recovered=recovered,
         recovered_share=recovered / increase if beyond else math.nan,
     )
-
-
-def worst_over_own(faulty: Sequence[float], protected: Sequence[float] = ()) -> WorstCase:
-    """The worst case relative to own golden flights, independent of the missions' lengths.
-
-    Args:
-        faulty, protected: of each successful flight, its value over that of the successful golden
-            flight of the same mission.
-    """
-    return worst_case([1.0], faulty, protected)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import both_succeed, changed, chosen, flags, known, numbers, paired
+from mavfi_cli.analysis.flights import changed, chosen, flags, known, numbers, paired
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import Interval, interval
@@ -131,7 +131,7 @@ def _over(
         if any(isinstance(side.plan, str) for side in sides):
             continue
         pairs = paired(sides[0].flights, sides[1].flights, PLACE)
-        both = pa.array(both_succeed(*pairs))
+        both = pa.array(np.logical_and(*(flags(each, "succeeded") for each in pairs)))
         first, second = (pair.filter(both).sort_by([*_BY_PLACE]) for pair in pairs)
         for name in names:
             model = row[MODEL[name]] / rows[over][MODEL[name]]

@@ -7,7 +7,6 @@ import pyarrow as pa
 import pytest
 
 from mavfi_cli.analysis.flights import (
-    both_succeed,
     changed,
     chosen,
     flags,
@@ -89,4 +88,3 @@ def test_success_of_pairs():
     second = flown("timeout", "success", "timeout", "timeout")
     test = mcnemar(*(flags(each, "succeeded") for each in (first, second)))
     assert (test.both, test.only_first, test.neither) == (1, 2, 1)
-    assert both_succeed(first, second).tolist() == [False, True, False, False]

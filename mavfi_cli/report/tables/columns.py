@@ -100,11 +100,6 @@ def percent(share: float, shape: str = ".1f") -> str:
     return number(share, shape, 100.0, " %")
 
 
-def fraction(share: Row) -> str:
-    """A count and its total."""
-    return f"{share['count']}/{share['total']}" if share["total"] else "-"
-
-
 def rate(share: Row, digits: int = 1) -> str:
     """A share as per cent, with its interval."""
     if math.isnan(share["share"]):

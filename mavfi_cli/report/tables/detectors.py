@@ -13,7 +13,6 @@ from mavfi_cli.analysis.detectors import ALL
 from mavfi_cli.report.tables.columns import (
     columns,
     csv_text,
-    fraction,
     number,
     percent,
     rate,
@@ -73,26 +72,26 @@ def _head(evaluation: Row) -> list[str]:
     return lines
 
 
+def _watched(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if row["detector"] != NONE]
+
+
 def _error_free_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
     yield ["", "flights", "alarms an hour", "with an alarm", "missions lost", "longer (median), %"]
-    for row in rows:
-        if row["detector"] == NONE:
-            continue
+    for row in _watched(rows):
         yield [
             row["detector"],
             f"{row['flights']}",
             spread(row["alarms_per_hour"], 1),
             _share(row["with_alarm"]),
-            fraction(row["lost"]) + (f", {row['gained']} won" if row["gained"] else ""),
+            _fraction(row["lost"]) + (f", {row['gained']} won" if row["gained"] else ""),
             spread(row["lengthening"], 2, 100.0),
         ]
 
 
 def _detection_rows(rows: Sequence[Row], curves: Row) -> Iterator[list[str]]:
     yield ["", "harmful", "all active", "by chance", "ticks (95th)", "ROC area"]
-    for row in rows:
-        if row["detector"] == NONE:
-            continue
+    for row in _watched(rows):
         found = curves[row["detector"]]
         yield [
             row["detector"],
@@ -117,7 +116,7 @@ def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
             rate(row["unprotected"] if bare else row["protected"]),
             "" if bare else _share(row["recovered"]),
             "" if bare else _share(row["undone"]),
-            "" if bare else fraction(row["added"]),
+            "" if bare else _fraction(row["added"]),
             _worst_cell(row),
         ]
 
@@ -175,8 +174,12 @@ def _comparison_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
         yield [f"{row['first']} against {row['second']}", *told]
 
 
+def _fraction(share: Row) -> str:
+    return f"{share['count']}/{share['total']}" if share["total"] else "-"
+
+
 def _share(share: Row) -> str:
-    return f"{fraction(share)}: {rate(share, 0)}" if share["total"] else "-"
+    return f"{_fraction(share)}: {rate(share, 0)}" if share["total"] else "-"
 
 
 def detector_csv(*pairs: pa.Table) -> str:
