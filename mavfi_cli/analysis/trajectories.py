@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from mavfi_cli.analysis.groups import TREATMENT, untreated
@@ -107,30 +107,16 @@ def _panels(flown: Sequence[MissionResult]) -> list[dict[str, Any]]:
     if not struck:
         return [_panel("", golden)]
     faults = [those[0].mission.labels for those in struck.values()]
-    shared = _common(faults if len(faults) > 1 else [each.mission.labels for each in flown])
-    return [
-        _panel(
-            label_text(
-                {
-                    name: value
-                    for name, value in those[0].mission.labels.items()
-                    if name not in TREATMENT and name not in shared
-                }
-            ),
-            golden + those,
-        )
-        for those in struck.values()
+    labels = faults if len(faults) > 1 else [each.mission.labels for each in flown]
+    shared = set.intersection(*(set(each.items()) for each in labels))
+    hidden = {*TREATMENT, *(name for name, _ in shared)}
+    titles = [
+        label_text({name: value for name, value in each.items() if name not in hidden})
+        for each in faults
     ]
-
-
-def _common(labels: Sequence[Mapping[str, Any]]) -> set[str]:
-    """The labels with equal values in all missions."""
-    first, *others = labels
-    return {
-        name
-        for name, value in first.items()
-        if all(name in each and each[name] == value for each in others)
-    }
+    return [
+        _panel(title, golden + those) for title, those in zip(titles, struck.values(), strict=True)
+    ]
 
 
 def _panel(title: str, flown: Sequence[MissionResult]) -> dict[str, Any]:

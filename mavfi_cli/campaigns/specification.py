@@ -421,16 +421,12 @@ def _between_settings(stored: Spec, asked: Spec) -> Iterator[str]:
         for phrase in _phrases(_of_setting(there), _of_setting(here)):
             factor, _, rest = phrase.partition(" ")
             yield f"{factor}{name} {rest}"
-    yield from _phrases(_listed(stored.axes), _listed(asked.axes))
+    yield from _phrases(stored.axes, asked.axes)
 
 
 def _of_setting(setting: Setting) -> _Choices:
     own = () if setting.repetitions is None else (setting.repetitions,)
-    return {**_listed(setting.axes), "repetitions": own}
-
-
-def _listed(axes: Axes) -> _Choices:
-    return {name: list(values) for name, values in axes.items()}
+    return {**setting.axes, "repetitions": own}
 
 
 def _told(values: Sequence[Any]) -> str:

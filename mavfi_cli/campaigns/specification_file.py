@@ -157,12 +157,12 @@ def to_toml(spec: Spec) -> str:
         }
     )
     lines += _table("[mission]", spec.fixed)
-    lines += _table("[factors]", _lists(spec.axes))
+    lines += _table("[factors]", spec.axes)
     for setting in spec.settings:
         own: dict[str, Any] = {"name": setting.name} if setting.name else {}
         if setting.repetitions is not None:
             own["repetitions"] = setting.repetitions
-        lines += ["", "[[setting]]", *_pairs({**own, **_lists(setting.axes)})]
+        lines += ["", "[[setting]]", *_pairs({**own, **setting.axes})]
     if spec.stop is not None:
         lines += _table("[stop]", asdict(spec.stop))
     if spec.fixed_world is not None:
@@ -170,7 +170,8 @@ def to_toml(spec: Spec) -> str:
         inner = {key: rule.pop(key) for key in ("world_seed", "flown")}
         lines += _table("[fixed_world]", rule)
         for key, values in inner.items():
-            lines += _table(f"[fixed_world.{key}]", _quoted(values))
+            quoted = {json.dumps(each, ensure_ascii=False): values[each] for each in values}
+            lines += _table(f"[fixed_world.{key}]", quoted)  # worlds may not be bare keys of TOML
     return "\n".join(lines) + "\n"
 
 
@@ -178,19 +179,9 @@ def _table(head: str, values: Mapping[str, Any]) -> list[str]:
     return ["", head, *_pairs(values)] if values else []
 
 
-def _quoted(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Quote the keys, because names of worlds may not be bare keys of TOML."""
-    return {json.dumps(key, ensure_ascii=False): value for key, value in values.items()}
-
-
 def _pairs(values: Mapping[str, Any]) -> list[str]:
     # Strings, numbers, booleans and arrays are written in TOML as in JSON.
     return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()]
-
-
-def _lists(axes: Axes) -> dict[str, Any]:
-    """Each factor as the list of its values; a list-valued factor as a list of lists."""
-    return {name: list(values) for name, values in axes.items()}
 
 
 _ODD = re.compile(r"[^\w.+=-]+")  # not in a folder's name
