@@ -22,13 +22,6 @@ SEARCH = "world-search"  # the folder
 _AT_ONCE = 4  # candidates that are flown at the same time
 
 
-class _Notes(Spectator):
-    """Passes on notes only, because the progress of a search is not that of the campaign."""
-
-    def __init__(self, spectator: Spectator) -> None:
-        self.on_note = spectator.on_note  # type: ignore[method-assign]
-
-
 def with_worlds(
     spec: Spec,
     missions: Sequence[PlannedMission],
@@ -113,5 +106,7 @@ def _replans(
         for config in configs
     ]
     quiet = replace(options, keep=Keep.NONE)
-    with run_campaign(planned, folder, quiet, _Notes(spectator), append=True) as ledger:
+    notes = Spectator()  # without progress: that of a search is not the campaign's
+    notes.on_note = spectator.on_note  # type: ignore[method-assign]
+    with run_campaign(planned, folder, quiet, notes, append=True) as ledger:
         return {each.mission.config: fields_of(each.result)["replans"] for each in ledger.results()}
