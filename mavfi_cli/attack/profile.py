@@ -3,15 +3,16 @@
 A run that is not too long is stepped completely. A longer one is cut into windows that together are
 the whole run. Each execution of a *marker*, such as a function's entry, begins a window.
 It ends in front of the next execution of any marker, or with the run. The code before the first
-marker is a window too. The windows of one marker are a stratum. Some windows of each stratum are
-drawn uniformly and stepped, so every executed instruction in scope is as likely to be in the sample
-as all others of its stratum.
+marker is a window too. The windows of one marker are a stratum. Some windows of each stratum, each
+with the same chance, are drawn and stepped, so every executed instruction in scope is as likely to
+be in the sample as all others of its stratum.
 
 A few windows are stepped first: the *pilot*. Its lengths decide how many of the other windows are
 stepped, as many as fit into `ENOUGH` instructions. A sample whose size depends on its own lengths
 would be biased, so the pilot is a stratum of its own, which is complete, and only the other windows
-estimate the rest. A stratum is drawn in proportion to its windows times their mean length, and an
-instruction uniformly from its stepped windows.
+estimate the rest. They are drawn at equal distances from a random start. A stratum is drawn in
+proportion to its windows times their mean length, and an instruction uniformly from its stepped
+windows.
 """
 
 from __future__ import annotations
@@ -80,15 +81,17 @@ def profile_run(
     strata = [_Stepper(place, None, ends, limit, watch).step(_FIRST, 1)]
     for marker in markers:
         stepper = _Stepper(place, marker, ends, limit, watch)
-        order = rng.permutation(stepper.count()) + 1
-        pilot, others = np.split(order, [max(1, windows // 2)])
-        if not len(order):
+        pilot, others = np.split(rng.permutation(stepper.count()) + 1, [max(1, windows // 2)])
+        if not len(pilot):
             continue
         known = stepper.step(pilot, len(pilot))
         fit = enough * len(pilot) // max(1, known.executed) - len(pilot)
         strata.append(known)
         if len(others):
-            strata.append(stepper.step(others[: max(windows, fit)], len(others)))
+            number = min(len(others), max(windows, fit))
+            # At equal distances from a random start: windows change with the progress of a run.
+            places = (rng.random() + np.arange(number)) * len(others) / number
+            strata.append(stepper.step(np.sort(others)[places.astype(int)], len(others)))
     strata = [stratum for stratum in strata if stratum.executed]
     if not strata:
         raise TargetError(place.name, _NOTHING)

@@ -23,7 +23,7 @@ from mavfi_cli.attack.kernels.outputs import unpack
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.kernels.template import ASK_SCOPE, GO, PID_BYTES, RAISED, RUN, TIMES
 from mavfi_cli.attack.outcome import RunOutcome
-from mavfi_cli.attack.profile import ENOUGH, profile_run
+from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import (
     Difference,
@@ -201,7 +201,6 @@ class KernelPlace:
             markers=(scope.inner or (scope.entry,)) if self._kernel.too_long else (),
             end=scope.end,
             windows=max(4, windows // len(self.inputs)),
-            enough=ENOUGH // 2,
             limit=self.limits.profile_steps,
             watch=watch,
         )

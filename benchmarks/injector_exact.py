@@ -1,0 +1,222 @@
+"""Is the injector exact? Predicted outputs, chi-square of drawn instructions, planned bits.
+
+    python benchmarks/injector_exact.py [--faults 2000] [--draws 20000] [--kernel NAME ...]
+
+1. A program that computes with a register in each of 500 rounds: the fault strikes the register at
+   a drawn execution, and the output is predicted in Python. Every prediction must be met.
+2. For each kernel that is profiled whole: the executions of every instruction are counted again, by
+   hardware breakpoints that run freely (no single-stepping). Chi-square of the drawn instructions
+   against these counts; the p-values must look uniform.
+3. For each kernel that is profiled by windows: the executions of some instructions are counted in
+   the same way, and lie in the 95 % interval of the estimate as often as it says.
+4. In runs of each kernel: the register after the flip differs from the one before in exactly the
+   planned bits, read back from the stopped process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import shutil
+import subprocess
+import tempfile
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from mavfi_cli.attack.attacker import Attacker, golden_run
+from mavfi_cli.attack.campaign import Plan, one_processor, run_campaign
+from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
+from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.attack.target import TargetProfile
+from mavfi_cli.fi.tracer.arch import decode
+from mavfi_cli.fi.tracer.fault import (
+    CountedStop,
+    FaultModel,
+    InstructionFault,
+    Role,
+    Site,
+    explicit_corruption,
+)
+from mavfi_cli.fi.tracer.sampling import strategy
+from mavfi_cli.fi.tracer.spawn import Program
+from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.stats.clusters import estimated_total
+
+ROUNDS, FACTOR, WORD = 500, 6364136223846793005, 1 << 64
+SOURCE = f"""
+#include <stdio.h>
+__attribute__((noinline)) unsigned long take(unsigned long x) {{
+    unsigned long r;
+    __asm__ volatile("mov %1, %%r10; mov %%r10, %0" : "=r"(r) : "r"(x) : "r10");
+    return r;
+}}
+int main(void) {{
+    unsigned long sum = 1;
+    for (unsigned long i = 0; i < {ROUNDS}; i++) sum = {FACTOR}ul * sum + take(i);
+    printf("%lu\\n", sum);
+    return 0;
+}}
+"""
+MOST_HITS = 20_000  # of an instruction whose executions are counted one by one
+
+
+def predicted(execution: int, bit: int) -> str:
+    """What the program prints if the bit is flipped in one round, from 1."""
+    total = 1
+    for number in range(ROUNDS):
+        taken = number ^ (1 << bit) if number + 1 == execution else number
+        total = (FACTOR * total + taken) % WORD
+    return f"{total}\n"
+
+
+def exact_stops(faults: int, rng: np.random.Generator) -> tuple[int, int]:
+    """Strike drawn executions of one instruction; return how many predictions were met."""
+    compiler = shutil.which("gcc")
+    if compiler is None:
+        raise SystemExit("error: gcc is not installed")
+    with tempfile.TemporaryDirectory() as folder:
+        source, program = Path(folder) / "taken.c", Path(folder) / "taken"
+        source.write_text(SOURCE)
+        subprocess.run([compiler, "-O1", "-o", str(program), str(source)], check=True)
+        command = Program.of([str(program)])
+        target = ProgramTarget(command=command, comparison=OutputComparison(), function="take")
+        with one_processor(), closing(Workplace(target)) as place:
+            attacker = Attacker(place=place, golden=golden_run(place))
+            fault = taken_fault(place.profile(rng, windows=1))
+            met = 0
+            for _ in range(faults):
+                execution, bit = int(rng.integers(1, ROUNDS + 1)), int(rng.integers(64))
+                result = attacker.run(fault(execution, bit))
+                expected = hashlib.sha256(predicted(execution, bit).encode()).hexdigest()
+                met += result.verdict.output_sha256 == expected
+    return met, faults
+
+
+def taken_fault(profile: TargetProfile):
+    """Function from execution and bit to a fault in the register that `take` sets."""
+    (segment,) = profile.strata[0].segments
+    for address in map(int, segment.trace):
+        instruction = decode(profile.code_at(address), address)
+        if instruction.text.startswith("mov r10,"):
+            break
+
+    def fault(execution: int, bit: int) -> InstructionFault:
+        return InstructionFault(
+            trigger=(CountedStop(profile.image.locate(address), execution),),
+            execution=execution,
+            instruction=instruction.text,
+            instruction_bytes=instruction.raw,
+            corruption=explicit_corruption("r10", bit, Role.DESTINATION),
+        )
+
+    return fault
+
+
+def counted(place: KernelPlace, address: int) -> int:
+    """Executions of an instruction in one undisturbed run, before its end is written."""
+    tracee = place.start()
+    try:
+        return tracee.count_to_end(address)
+    finally:
+        tracee.kill()
+
+
+def chi_square(
+    place: KernelPlace, profile: TargetProfile, draws: int, rng: np.random.Generator
+) -> str:
+    """Chi-square of drawn instructions against the counts of a run that was not stepped."""
+    addresses = sorted({int(each) for each in profile.strata[0].segments[0].trace})
+    counts = np.array([counted(place, address) for address in addresses])
+    plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
+    drawn = Counter(profile.image.address(profile.draw(plan, rng).target) for _ in range(draws))
+    observed = np.array([drawn[address] for address in addresses], float)
+    expected = counts * draws / counts.sum()
+    enough = expected >= 5.0
+    observed = np.append(observed[enough], observed[~enough].sum())
+    expected = np.append(expected[enough], expected[~enough].sum())
+    observed, expected = observed[expected > 0], expected[expected > 0]
+    value = float(((observed - expected) ** 2 / expected).sum())
+    return (
+        f"{counts.sum()} executions of {len(addresses)} instructions counted, {profile.executed} "
+        f"stepped; {draws} draws: chi-square {value:.0f} with {len(observed) - 1} degrees, "
+        f"p = {chi2.sf(value, len(observed) - 1):.2f}"
+    )
+
+
+def estimates(
+    place: KernelPlace, profile: TargetProfile, number: int, rng: np.random.Generator
+) -> str:
+    """The counts of sampled instructions over their estimates, and how many are in the interval."""
+    traces = [[segment.trace for segment in stratum.segments] for stratum in profile.strata]
+    addresses = np.unique(np.concatenate([trace for some in traces for trace in some]))
+    inside, ratios = 0, []
+    for address in rng.permutation(addresses).tolist():
+        found = estimated_total(
+            [
+                ([float(np.count_nonzero(trace == address)) for trace in some], all_.windows_in_run)
+                for some, all_ in zip(traces, profile.strata, strict=True)
+            ]
+        )
+        if found.low == found.high or found.total > MOST_HITS:
+            continue
+        count = counted(place, address)
+        inside += found.low <= count <= found.high
+        ratios.append(count / found.total)
+        if len(ratios) == number:
+            break
+    return (
+        f"{inside} of {len(ratios)} counts in the 95 % interval of the estimate, count over "
+        f"estimate {np.mean(ratios):.3f}"
+    )
+
+
+def planned_bits(target: KernelTarget, runs: int) -> tuple[int, int]:
+    """In how many of the applied flips exactly the planned bits changed."""
+    (campaign,) = run_campaign(Plan(runs=runs, seed=1), [target])
+    exact = applied = 0
+    for entry in campaign.records:
+        injection = entry["injection"]
+        if injection.get("applied"):
+            changed = int(injection["before"], 16) ^ int(injection["after"], 16)
+            applied += 1
+            exact += changed == sum(1 << bit for bit in entry["corruption"]["bits"])
+    return exact, applied
+
+
+def main() -> None:
+    """Run all of it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--faults", type=int, default=2000)
+    parser.add_argument("--draws", type=int, default=20_000)
+    parser.add_argument("--kernel", action="append", default=[])
+    options = parser.parse_args()
+    rng = np.random.default_rng(1)
+    met, faults = exact_stops(options.faults, rng)
+    print(f"exact stops: {met} of {faults} predicted outputs", flush=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        fed = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))
+        all_exact = all_applied = 0
+        for kernel in catalogue.select(options.kernel):
+            target = KernelTarget(kernel=kernel, **fed)
+            with one_processor(), closing(target.open()) as place:
+                for number, where in enumerate(place.inputs):
+                    profile = where.profile(rng, windows=16)
+                    if profile.complete:
+                        said = chi_square(where, profile, options.draws, rng)
+                    else:
+                        said = estimates(where, profile, 20, rng)
+                    print(f"{kernel}, input {number}: {said}", flush=True)
+            exact, applied = planned_bits(target, options.faults // 7)
+            all_exact, all_applied = all_exact + exact, all_applied + applied
+    print(f"exactly the planned bits: {all_exact} of {all_applied} flips")
+
+
+if __name__ == "__main__":
+    main()
