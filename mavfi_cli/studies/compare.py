@@ -6,7 +6,6 @@ with the whole record.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +30,7 @@ FAULTY = "FI"  # names of settings, as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings
 STAGES = tuple(stage.value for stage in Stage)
 MOST = 100_000  # missions
+SCHEMA = 2  # of compare.json; version 1 listed the costs of faults with the worst cases
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,9 +44,6 @@ class ComparePlan:
         missions: number per platform, setting and target of `inject`.
         seed: root of the faults' seeds.
         field: field of the bits; None draws any bit.
-
-    Raises:
-        ConfigError: there is nothing to fly, or a name appears twice.
     """
 
     platforms: tuple[str, ...] = ("x86", "tx2")
@@ -109,10 +106,6 @@ class ComparePlan:
         )
 
 
-SCHEMA = 2  # version 1 listed the costs of faults with the worst cases
-TIMELINE = "timeline"
-
-
 def compare(
     plan: ComparePlan, folder: Path, options: Options, spectator: Spectator
 ) -> dict[str, Any]:
@@ -122,34 +115,29 @@ def compare(
         Plain values, the contents of `compare.json`.
 
     Raises:
-        UnknownName, VehicleProcessError: a platform, world, state or detector that does not exist.
-        ConfigError: the folder holds another comparison, or other versions flew in it.
-        CampaignStopped, RecordError, Interrupted: as `run_campaign`.
+        ConfigError: the folder holds another comparison.
+        MavfiError: as `begin` and `run_campaign`.
     """
     spec, grows = resumed(plan.spec(), folder, "comparison", repetitions="missions")
     with begin(spec, folder, append=grows) as ledger:
         fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
         table = flights(ledger)
     found = figures(plan.platforms, plan.settings, compared(table))
+    seed = timeline_seed(found["flights"], plan.platforms) or plan.first_seed
     return {
         "schema": SCHEMA,
         "plan": plan.told(),
         "versions": installed_versions(),
         "errors": errors(table, "mission {number}: {reason}"),
         **found,
-        "timeline": _timelines(plan, found["flights"], folder / TIMELINE, options, spectator),
+        "timeline": _timelines(plan, seed, folder / "timeline", options, spectator),
     }
 
 
 def _timelines(
-    plan: ComparePlan,
-    flown: Sequence[Mapping[str, Any]],
-    folder: Path,
-    options: Options,
-    spectator: Spectator,
+    plan: ComparePlan, seed: int, folder: Path, options: Options, spectator: Spectator
 ) -> dict[str, Any]:
     """Kernel invocations of a golden flight, one row per platform that flew."""
-    seed = timeline_seed(flown, plan.platforms) or plan.first_seed
     spectator.on_note(f"the golden flights of seed {seed} again, for the timeline")
     golden = MissionConfig(world=plan.world, stack=plan.stack, seed=seed)
     missions = [

@@ -40,11 +40,7 @@ def _plans_of(
     options: Options,
     spectator: Spectator,
 ) -> Iterator[tuple[Key, FlightPlan | str]]:
-    """Each scheme's plan or the reason for its absence; the first one has one bare board.
-
-    Args:
-        options, spectator: for the flights to which detectors are fitted, if requested.
-    """
+    """Each scheme's plan or the reason for its absence; the first one has one bare board."""
     platform = plan.choices.platform or load_platform(PLATFORM)
     chain_s = CHAINS[plan.choices.chain][0]([k.latency_s for k in platform.kernels.values()])
     setting, models = setting_of(vehicle, plan.choices), plan.models
