@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -280,37 +280,34 @@ def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table
         for platform, setting in itertools.product(platforms, faulty)
     }
 
-    def rows(places: Iterable[tuple[str, str]], row: Callable[..., dict[str, Any]]) -> list[Any]:
-        return [{"platform": p, "setting": s, **row(p, s)} for p, s in places]
-
-    def against_first(
-        among: Sequence[str], row: Callable[..., dict[str, Any]], of: Any
-    ) -> list[Any]:
-        return rows(
-            itertools.product(others, among),
-            lambda p, s: {"reference": first, **row(of[first, s], of[p, s])},
-        )
+    def at(platform: str, setting: str) -> dict[str, Any]:
+        return {"platform": platform, "setting": setting}
 
     return {
         "confidence": CONFIDENCE,
-        "settings": rows(
-            ((platform, setting) for setting in settings for platform in platforms),
-            lambda *place: _setting(every[place], counted[place]),
-        ),
-        "ratios": against_first(settings, _ratio, counted),
-        "costs": rows(
-            itertools.product(platforms, faulty),
-            lambda p, s: cost_row(found[p, s], found[p, NONE], protected=s != NONE),
-        ),
-        "cost_differences": against_first(faulty, cost_difference, found),
-        "worst": rows(
-            itertools.product(platforms, settings),
-            lambda p, s: _worst_row(
-                won[p, GOLDEN], won[p, NONE], won[p, s], protected=s not in (GOLDEN, NONE)
-            ),
-        ),
+        "settings": [
+            {**at(p, s), **_setting(every[p, s], counted[p, s])}
+            for s, p in itertools.product(settings, platforms)
+        ],
+        "ratios": [
+            {**at(p, s), "reference": first, **_ratio(counted[first, s], counted[p, s])}
+            for p, s in itertools.product(others, settings)
+        ],
+        "costs": [
+            {**at(p, s), **cost_row(found[p, s], found[p, NONE], protected=s != NONE)}
+            for p, s in itertools.product(platforms, faulty)
+        ],
+        "cost_differences": [
+            {**at(p, s), "reference": first, **cost_difference(found[first, s], found[p, s])}
+            for p, s in itertools.product(others, faulty)
+        ],
+        "worst": [
+            {**at(p, s), **_worst_row(won[p, GOLDEN], won[p, NONE], won[p, s],
+                                      protected=s not in (GOLDEN, NONE))}
+            for p, s in itertools.product(platforms, settings)
+        ],
         "flights": flights.to_pylist(),
-    }
+    }  # fmt: skip
 
 
 # One platform and setting ---------------------------------------------------------------------
