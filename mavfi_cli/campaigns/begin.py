@@ -62,7 +62,7 @@ def chosen(
             has the name of a campaign here.
         UnknownName: no preset, file or folder has this name.
     """
-    spec = chosen_spec(what, scale, changes, folder_fits=out is None)
+    spec = chosen_spec(what, scale, changes, out)
     if _is_folder(what):
         return spec, Path(what)
     if out is None:
@@ -71,24 +71,15 @@ def chosen(
 
 
 def chosen_spec(
-    what: str, scale: float | None, changes: Sequence[str] = (), *, folder_fits: bool = True
+    what: str, scale: float | None, changes: Sequence[str] = (), out: Path | None = None
 ) -> Spec:
-    """Find the named specification, as `chosen` does, without its folder.
-
-    Args:
-        what, scale, changes: as for `chosen`.
-        folder_fits: False refuses a campaign's folder, as `scale` and `changes` do.
-
-    Raises:
-        ConfigError: the specification, or the scale, cannot be used.
-        UnknownName: no preset, file or folder has this name.
-    """
+    """Find the named specification, as `chosen` does, without its folder."""
     if not _is_folder(what):
         _require_known(what)
         spec = replaced(load_spec(what), changes)
         return spec if scale is None else spec.scaled(scale)
     with Ledger(Path(what)) as ledger:
-        if scale is not None or changes or not folder_fits:
+        if scale is not None or changes or out is not None:
             raise ConfigError("goes without --scale, --set and --out: it has all", path=Path(what))
         stored = stored_spec(ledger)
     if stored is None:

@@ -28,8 +28,8 @@ _OUTCOMES = {
 }
 
 
-def _number(value: Any, unit: str, digits: int = 1) -> str:
-    return "not known" if value is None else f"{value:.{digits}f} {unit}"
+def _number(value: Any, unit: str, digits: int = 1, per: float = 1.0) -> str:
+    return "not known" if value is None else f"{value / per:.{digits}f} {unit}"
 
 
 def outcome_line(result: dict[str, Any]) -> str:
@@ -113,8 +113,8 @@ def _clearance_and_energy(qof: Section) -> list[str]:
         clearance = f"{_number(qof['min_clearance_m'], 'm', 2)} minimum"
     if qof["energy_regression_j"] is not None or qof["energy_propeller_j"] is not None:
         energy = (
-            f"{_number(_kilo(qof['energy_regression_j']), 'kJ')} (paper's regression), "
-            f"{_number(_kilo(qof['energy_propeller_j']), 'kJ')} (propeller shafts)"
+            f"{_number(qof['energy_regression_j'], 'kJ', per=1e3)} (paper's regression), "
+            f"{_number(qof['energy_propeller_j'], 'kJ', per=1e3)} (propeller shafts)"
         )
     return [f"Clearance   {clearance}", f"Energy      {energy}"]
 
@@ -174,10 +174,6 @@ def _detection_lines(detection: Section, cost: DetectionCost | None) -> list[str
             f"{100.0 * cost.detection_share:.4f} % of the flight time"
         )
     return lines
-
-
-def _kilo(value: float | None) -> float | None:
-    return None if value is None else value / 1e3
 
 
 def event_lines(result: dict[str, Any]) -> list[str]:
