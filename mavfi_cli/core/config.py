@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_origin
 
 import cattrs
 from cattrs import AttributeValidationNote, IterableValidationNote
-from cattrs.gen import make_dict_structure_fn
+from cattrs.gen import make_dict_structure_fn, make_mapping_structure_fn
 
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 
@@ -69,6 +67,19 @@ def shipped_path(kind: str, name_or_path: str, folder: Path) -> Path:
     return path
 
 
+def shipped_base(kind: str, name: object, path: Path, folder: Path) -> str:
+    """Return the `base` of a file if it names another shipped file.
+
+    Raises:
+        ConfigError: It does not. Suggests the nearest name.
+    """
+    known = shipped_names(folder)
+    if name not in known or path == folder / f"{name}.toml":
+        error = UnknownName(kind, str(name), set(known) - {path.stem})
+        raise ConfigError(str(error), path=path, key="base")
+    return str(name)
+
+
 def load_shipped(kind: str, name_or_path: str, folder: Path, cls: type[T]) -> T:
     """Load a shipped `kind` by its name, or a user's own TOML file by its path, as `cls`.
 
@@ -92,12 +103,17 @@ def structure(
     data: Mapping[str, Any], cls: type[T], *, path: Path | None = None, text: str = ""
 ) -> T:
     """Build the dataclass `cls` from a plain mapping under the rules of `load_toml`."""
-    _refuse_unknown(data, cls, path, text, prefix="")
     try:
         return _CONVERTER.structure(data, cls)
-    except cattrs.BaseValidationError as error:
-        key, problem = _first_problem(error, "")
-        raise ConfigError(problem, path=path, line=_line_of(text, key), key=key) from None
+    except cattrs.BaseValidationError as group:
+        key, error = _first_problem(group, "")
+    except _Extra as extra:
+        key, error = "", extra
+    if isinstance(error, _Extra):
+        key = f"{key}.{error.key}".lstrip(".")
+        raise UnknownKey(key, error.known, path=path, line=_line_of(text, key))
+    problem = "is missing" if isinstance(error, KeyError) else str(error)
+    raise ConfigError(problem, path=path, line=_line_of(text, key), key=key)
 
 
 def read_text(path: Path) -> str:
@@ -114,6 +130,14 @@ def read_text(path: Path) -> str:
         raise ConfigError("not a UTF-8 text file", path=path) from None
 
 
+class _Extra(Exception):
+    """A table has a key that its dataclass lacks."""
+
+    def __init__(self, key: str, known: Iterable[str]) -> None:
+        super().__init__(key)
+        self.key, self.known = key, known
+
+
 def _strict(kind: type, *accepted: type) -> Any:
     def hook(value: Any, _cls: Any) -> Any:
         """Raise TypeError for a value of another type and ValueError for one that is not finite."""
@@ -128,91 +152,63 @@ def _strict(kind: type, *accepted: type) -> Any:
     return hook
 
 
+def _shaped(accepted: Any, wanted: str, structured: Any, known: Sequence[str] = ()) -> Any:
+    def hook(value: Any, cls: Any) -> Any:
+        """Raise TypeError for another shape (text is an array of letters), _Extra for its keys."""
+        if not isinstance(value, accepted):
+            raise TypeError(f"expected {wanted}, got {value!r}")
+        if known and (extra := [key for key in value if key not in known]):
+            raise _Extra(extra[0], known)
+        return structured(value, cls)
+
+    return hook
+
+
+def _origin(cls: Any) -> Any:
+    return get_origin(cls)
+
+
 def _converter() -> cattrs.Converter:
     converter = cattrs.Converter()
-    converter.register_structure_hook(float, _strict(float, int))
-    converter.register_structure_hook(int, _strict(int))
-    converter.register_structure_hook(bool, _strict(bool))
-    converter.register_structure_hook(str, _strict(str))
-    converter.register_structure_hook_factory(
-        dataclasses.is_dataclass, lambda cls: make_dict_structure_fn(cls, converter)
+    for kind, *accepted in ((float, int), (int,), (bool,), (str,)):
+        converter.register_structure_hook(kind, _strict(kind, *accepted))
+    arrays: set[Any] = set()  # types of arrays whose hook is being made
+
+    @converter.register_structure_hook_factory(dataclasses.is_dataclass)
+    def table(cls: Any) -> Any:
+        known = [each.name for each in dataclasses.fields(cls)]
+        return _shaped(Mapping, "a table", make_dict_structure_fn(cls, converter), known)
+
+    @converter.register_structure_hook_factory(lambda cls: _origin(cls) is dict)
+    def named(cls: Any) -> Any:
+        return _shaped(Mapping, "a table", make_mapping_structure_fn(cls, converter))
+
+    @converter.register_structure_hook_factory(
+        lambda cls: _origin(cls) in (list, tuple) and cls not in arrays
     )
+    def array(cls: Any) -> Any:
+        arrays.add(cls)
+        structured = converter.get_structure_hook(cls, cache_result=False)
+        arrays.remove(cls)
+        return _shaped((list, tuple), "an array", structured)
+
     return converter
 
 
 _CONVERTER = _converter()
 
 
-def _refuse_unknown(data: Any, cls: Any, path: Path | None, text: str, prefix: str) -> None:
-    """Walk nested dataclass fields; refuse any key that none of them has, and any wrong shape."""
-    hints = _hints(cls)
-    for key, value in data.items():
-        full = f"{prefix}{key}"
-        if key not in hints:
-            raise UnknownKey(full, hints, path=path, line=_line_of(text, full))
-        _refuse_shape(value, hints[key], path, text, full)
-        for nested in _dataclasses_in(hints[key]):
-            for name, item in _items(value, hints[key]):
-                if item is not None:
-                    _refuse_shape(item, nested, path, text, f"{full}.{name}".rstrip("."))
-                    _refuse_unknown(item, nested, path, text, prefix=f"{full}.{name}")
-
-
-@functools.cache
-def _hints(cls: Any) -> Mapping[str, Any]:
-    """Types by field: Python evaluates the texts of annotations each time that it is asked."""
-    return get_type_hints(cls)
-
-
-def _refuse_shape(value: Any, hint: Any, path: Path | None, text: str, key: str) -> None:
-    """Refuse what is no table, or no array, where one belongs: text is an array of letters."""
-    wanted, accepted = _shape(hint)
-    if not isinstance(value, accepted):
-        raise ConfigError(
-            f"expected {wanted}, got {value!r}", path=path, line=_line_of(text, key), key=key
-        )
-
-
-@functools.cache
-def _shape(hint: Any) -> tuple[str, tuple[type, ...]]:
-    """What a type wants, in words, and the types that have this shape."""
-    hints = get_args(hint) if isinstance(hint, UnionType) else (hint,)
-    kinds = [get_origin(each) or each for each in hints if each is not NoneType]
-    none = (NoneType,) if NoneType in hints else ()
-    if all(kind is dict or dataclasses.is_dataclass(kind) for kind in kinds):
-        return "a table", (Mapping, *none)
-    if all(kind in (list, tuple) for kind in kinds):
-        return "an array", (list, tuple, *none)
-    return "", (object,)
-
-
-def _items(value: Any, hint: Any) -> list[tuple[str, Any]]:
-    """Return the tables inside a value, each with its suffix of the key's name."""
-    if isinstance(value, list):
-        return [("", item) for item in value]
-    if get_origin(hint) is dict and isinstance(value, Mapping):
-        return [(f"{name}.", item) for name, item in value.items()]
-    return [("", value)]
-
-
-@functools.cache
-def _dataclasses_in(hint: Any) -> Sequence[Any]:
-    if dataclasses.is_dataclass(hint):
-        return [hint]
-    return [found for arg in get_args(hint) for found in _dataclasses_in(arg)]
-
-
-def _first_problem(error: BaseException, key: str) -> tuple[str, str]:
-    """Return key and message of the innermost first failure of a cattrs error group."""
-    if isinstance(error, BaseExceptionGroup):
-        inner = error.exceptions[0]
-        for note in getattr(inner, "__notes__", []):
-            if isinstance(note, AttributeValidationNote):
-                key = f"{key}.{note.name}" if key else note.name
-            elif isinstance(note, IterableValidationNote):
-                key += f".{note.index}" if isinstance(note.index, str) else f"[{note.index}]"
-        return _first_problem(inner, key)
-    return key, "is missing" if isinstance(error, KeyError) else str(error)
+def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
+    """Return key and innermost first failure of a cattrs error group."""
+    if not isinstance(error, ExceptionGroup):
+        return key, error
+    inner = error.exceptions[0]
+    for note in getattr(inner, "__notes__", []):
+        if isinstance(note, AttributeValidationNote):
+            key = f"{key}.{note.name}" if key else note.name
+        elif isinstance(note, IterableValidationNote):
+            key += f".{note.index}" if isinstance(note.index, str) else f"[{note.index}]"
+    return _first_problem(inner, key)
 
 
 def _line_of(text: str, key: str) -> int | None:
@@ -236,15 +232,7 @@ def _line_of(text: str, key: str) -> int | None:
 
 
 def require_distinct(names: Sequence[str], key: str) -> None:
-    """Reject a list that contains a name twice.
-
-    Args:
-        names: Names to check.
-        key: Configuration key of the list, for the error.
-
-    Raises:
-        ConfigError: A name occurs twice. Names it.
-    """
+    """Raise ConfigError for the setting `key` if a name occurs twice."""
     for place, name in enumerate(names):
         if name in names[:place]:
             raise ConfigError(f"{name} is named twice", key=key)

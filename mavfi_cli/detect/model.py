@@ -1,17 +1,11 @@
-"""Model files: a fitted detector with its provenance in one JSON file.
-
-A file holds the versions of schema and mavfi, digests of the state table and of the preprocessing
-parameters, the flown stack, the detector's kind, its arrays, the ranges of the extended states, and
-the provenance: worlds, seeds, split, versions, threshold, loss curve. Reading is strict: any
-mismatch is an error of one line.
-"""
+"""Model files: a fitted detector with its provenance in one JSON file. Reading is strict."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,31 +17,36 @@ from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import FloatArray, StackMark
-from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.base import detector_names, find_detector
 from mavfi_cli.detect.preprocess import LIMIT, PreprocessParams, states_digest
 from mavfi_cli.detect.watch import EXTENDED, Ranges
 
 SCHEMA = 2
-_KEYS = frozenset(
-    {"schema", "mavfi", "states", "preprocess", "preprocess_digest", "stack", "detector", "arrays",
-     "extended", "provenance"}
-)  # fmt: skip
 SHIPPED = Path(__file__).parent / "models"  # one folder per stack
 DEFAULT_STACK = "mavbench"  # stack of the default models
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """A fitted detector."""
+    """A fitted detector, with the keys of its file."""
 
+    schema: int = SCHEMA
+    mavfi: str = field(default_factory=lambda: version("mavfi"))
     detector: str  # kind: gad, aad, range or l2
-    arrays: Mapping[str, FloatArray]
+    arrays: dict[str, Any]  # arrays of float64, which a file holds as lists
     stack: StackMark  # stack of the flights it was fitted to
     extended: Ranges  # ranges of the extended states in these flights
+    states: str = field(default_factory=states_digest)
     preprocess: PreprocessParams = field(default_factory=PreprocessParams)
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    mavfi: str = field(default_factory=lambda: version("mavfi"))
+    preprocess_digest: str = ""  # empty: that of `preprocess`
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.preprocess_digest:
+            object.__setattr__(self, "preprocess_digest", self.preprocess.digest())
+
+
+_KEYS = frozenset(each.name for each in fields(Model))
 
 
 def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
@@ -68,87 +67,66 @@ def save(path: Path, model: Model) -> None:
         RecordError: The file could not be written.
     """
     for name, array in model.arrays.items():
-        if not np.isfinite(array).all():
-            raise ModelError(f"array {name!r} holds a number that is not finite", path=path)
-    write_json(
-        path,
-        {
-            "schema": SCHEMA,
-            "mavfi": model.mavfi,
-            "states": states_digest(),
-            "preprocess": asdict(model.preprocess),
-            "preprocess_digest": model.preprocess.digest(),
-            "stack": asdict(model.stack),
-            "detector": model.detector,
-            "arrays": dict(model.arrays),
-            "extended": {name: list(limits) for name, limits in model.extended.items()},
-            "provenance": dict(model.provenance),
-        },
-    )
+        _require_finite(path, name, array)
+    write_json(path, asdict(model))
+
+
+def read(path: Path) -> Model:
+    """Read a model file of any kind, made by any version with this schema.
+
+    Raises:
+        ModelError: The file cannot be read, is corrupt, or has another schema.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ModelError(error.strerror or str(error), path=path) from None
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
+        raise ModelError("corrupt model file: not JSON", path=path) from None
+    if not isinstance(data, dict):
+        raise ModelError("corrupt model file: no JSON object", path=path)
+    _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
+    if set(data) != _KEYS:
+        odd = sorted(set(data) ^ _KEYS)
+        raise ModelError(f"corrupt model file: keys {', '.join(odd)}", path=path)
+    try:
+        return structure(data, Model)
+    except ConfigError as error:
+        raise ModelError(f"corrupt model file: {error}", path=path) from None
 
 
 def load(
     path: Path, detector: str, shapes: Mapping[str, tuple[int, ...]], positive: Collection[str] = ()
 ) -> Model:
-    """Read a model of a kind with arrays of the given shapes.
+    """Read a model of a kind with arrays of the given shapes, for any stack.
 
     Args:
         positive: Names of arrays whose numbers must all be above 0.
 
-    Returns:
-        The model of any stack. The caller compares its stack with the mission's.
-
     Raises:
-        ModelError: The file cannot be read or is corrupt; it has another schema, mavfi version,
-            state table, preprocessing or kind; an array is missing, unknown, of another shape, not
-            finite, or out of range.
+        ModelError: As `read`; or the file has another mavfi version, state table, preprocessing or
+            kind; an array is missing, unknown, of another shape, not finite, or out of range.
     """
-    data = _read(path)
-    _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
-    if set(data) != _KEYS:
-        odd = sorted(set(data) ^ _KEYS)
-        raise ModelError(f"corrupt model file: keys {', '.join(odd)}", path=path)
-    _refuse_other(path, "mavfi", data["mavfi"], version("mavfi"))
-    _refuse_other(path, "detector", data["detector"], detector)
-    if data["states"] != states_digest():
+    model = read(path)
+    _refuse_other(path, "mavfi", model.mavfi, version("mavfi"))
+    _refuse_other(path, "detector", model.detector, detector)
+    if model.states != states_digest():
         raise ModelError("made for another table of states; train it anew", path=path)
-    preprocess = _preprocess(path, data)
-    if data["preprocess_digest"] != preprocess.digest():
+    if model.preprocess_digest != model.preprocess.digest():
         raise ModelError("made with another preprocessing; train it anew", path=path)
-    if not isinstance(data["provenance"], dict):
-        raise ModelError("corrupt model file: provenance is no object", path=path)
-    arrays = _arrays(path, data["arrays"], shapes)
+    names = [state.name for state in EXTENDED]
+    if set(model.extended) != set(names):
+        raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
+    for name, (low, high) in model.extended.items():
+        if not -LIMIT <= low <= 0 <= high <= LIMIT:
+            raise ModelError(f"corrupt model file: extended: {name} is no range", path=path)
+    if set(model.arrays) != set(shapes):
+        raise ModelError(f"corrupt model file: arrays must be {', '.join(shapes)}", path=path)
+    arrays = {name: _array(path, name, model.arrays[name], shapes[name]) for name in shapes}
     for name in positive:
         if not (arrays[name] > 0.0).all():
             raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
-    return Model(
-        detector=detector,
-        arrays=arrays,
-        stack=_stack(path, data["stack"]),
-        extended=_ranges(path, data["extended"]),
-        preprocess=preprocess,
-        provenance=data["provenance"],
-        mavfi=data["mavfi"],
-    )
-
-
-def preprocessing(path: Path) -> PreprocessParams:
-    """Read the preprocessing parameters of a model file, for the gate of its detector."""
-    return _preprocess(path, _read(path))
-
-
-def provenance(path: Path) -> dict[str, Any]:
-    """Read provenance and header of a model file of any kind.
-
-    Raises:
-        ModelError: The file cannot be read or has no provenance.
-    """
-    data = _read(path)
-    recorded = data.get("provenance")
-    if not isinstance(recorded, dict):
-        raise ModelError("corrupt model file: provenance is no object", path=path)
-    header = {key: data.get(key) for key in ("mavfi", "detector", "stack")}
-    return {**header, **recorded}
+    return replace(model, arrays=arrays)
 
 
 def checked_threshold(value: float, key: str = "threshold") -> float:
@@ -162,98 +140,46 @@ def checked_threshold(value: float, key: str = "threshold") -> float:
     return float(value)
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ModelError(error.strerror or str(error), path=path) from None
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
-        raise ModelError("corrupt model file: not JSON", path=path) from None
-    if not isinstance(data, dict):
-        raise ModelError("corrupt model file: no JSON object", path=path)
-    return data
-
-
-def _preprocess(path: Path, data: Mapping[str, Any]) -> PreprocessParams:
-    values = data.get("preprocess")
-    if not isinstance(values, dict):
-        raise ModelError("corrupt model file: preprocess is no object", path=path)
-    try:
-        params = structure(values, PreprocessParams)
-    except ConfigError as error:
-        raise ModelError(f"corrupt model file: preprocess: {error}", path=path) from None
-    if set(values) != set(asdict(params)):
-        raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
-    return params
-
-
-def _stack(path: Path, data: object) -> StackMark:
-    if not (
-        isinstance(data, dict)
-        and set(data) == {"name", "digest"}
-        and all(isinstance(value, str) for value in data.values())
-    ):
-        raise ModelError("corrupt model file: stack must be a name and a digest", path=path)
-    return StackMark(**data)
-
-
-def _ranges(path: Path, data: object) -> Ranges:
-    names = [state.name for state in EXTENDED]
-    if not isinstance(data, dict) or set(data) != set(names):
-        raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
-    for name, limits in data.items():
-        whole = isinstance(limits, list) and [type(limit) for limit in limits] == [int, int]
-        if not (whole and -LIMIT <= limits[0] <= 0 <= limits[1] <= LIMIT):
-            raise ModelError(f"corrupt model file: extended: {name} is no range", path=path)
-    return {name: (data[name][0], data[name][1]) for name in names}
-
-
 def _refuse_other(path: Path, what: str, found: object, wanted: object) -> None:
     if found != wanted:
         raise ModelError(f"made for {what} {found!r}, this is {wanted!r}", path=path)
 
 
-def _arrays(
-    path: Path, data: object, shapes: Mapping[str, tuple[int, ...]]
-) -> dict[str, FloatArray]:
-    if not isinstance(data, dict) or set(data) != set(shapes):
-        raise ModelError(f"corrupt model file: arrays must be {', '.join(shapes)}", path=path)
-    arrays = {}
-    for name, shape in shapes.items():
-        try:
-            array: NDArray[np.float64] = np.array(data[name], np.float64)
-        except (TypeError, ValueError):
-            raise ModelError(
-                f"corrupt model file: array {name!r} is no numbers", path=path
-            ) from None
-        if array.shape != shape:
-            raise ModelError(
-                f"array {name!r} has shape {array.shape}, this version needs {shape}", path=path
-            )
-        if not np.isfinite(array).all():
-            raise ModelError(f"array {name!r} holds a number that is not finite", path=path)
-        arrays[name] = array
-    return arrays
+def _require_finite(path: Path, name: str, array: FloatArray) -> None:
+    if not np.isfinite(array).all():
+        raise ModelError(f"array {name!r} holds a number that is not finite", path=path)
+
+
+def _array(path: Path, name: str, data: object, shape: tuple[int, ...]) -> FloatArray:
+    try:
+        array: NDArray[np.float64] = np.array(data, np.float64)
+    except (TypeError, ValueError):
+        raise ModelError(f"corrupt model file: array {name!r} is no numbers", path=path) from None
+    if array.shape != shape:
+        raise ModelError(
+            f"array {name!r} has shape {array.shape}, this version needs {shape}", path=path
+        )
+    _require_finite(path, name, array)
+    return array
 
 
 def listing(models: Path | None = None) -> list[dict[str, Any]]:
-    """A row a model: detector, file, stack, threshold, provenance, and a line about it.
+    """Return one row per model: detector, file, stack, threshold, provenance, and a line about it.
 
-    A detector without a model has one row. One that cannot be used is told with the reason instead
-    of its threshold.
+    A detector without a model has one row. For a model that cannot be used, the line says why.
 
     Args:
-        models: folder of model files `NAME.json`; None takes those that are shipped.
+        models: Folder of model files `NAME.json`; None takes those that are shipped.
     """
     return [_row(name, path) for name in detector_names() for path in _paths(name, models)]
 
 
 def _paths(name: str, models: Path | None) -> list[Path | None]:
-    """The model files of a detector; None stands for none."""
+    """Return the model files of a detector; None stands for none."""
     if models is not None:
         return [models / f"{name}.json"]
-    shipped = [model_file.shipped(name, stack) for stack in model_file.shipped_stacks()]
-    return [path for path in shipped if path.is_file()] or [None]
+    paths = [shipped(name, stack) for stack in shipped_stacks()]
+    return [path for path in paths if path.is_file()] or [None]
 
 
 def _row(name: str, path: Path | None) -> dict[str, Any]:
@@ -267,29 +193,23 @@ def _row(name: str, path: Path | None) -> dict[str, Any]:
     }
     try:
         row["threshold"] = find_detector(name, model=path).threshold
-        if path is not None:
-            row["provenance"] = model_file.provenance(path)
-            row["stack"] = row["provenance"].pop("stack")["name"]
+        if path is None:
+            return {**row, "told": "needs no training"}
+        model = read(path)
     except ModelError as error:
         return {**row, "told": f"cannot be used: {error}"}
-    return {**row, "told": _told(row["provenance"])}
-
-
-def _told(provenance: dict[str, Any] | None) -> str:
-    if provenance is None:
-        return "needs no training"
-    flights = training_flights(provenance)
+    row["provenance"] = {"mavfi": model.mavfi, "detector": model.detector, **model.provenance}
+    row["stack"] = model.stack.name
+    flights = training_flights(model.provenance)
     seeds = sorted({int(end) for f in flights if (end := f.rpartition("/")[2]).isdigit()})
     span = f", seeds {seeds[0]} to {seeds[-1]}" if seeds else ""
-    return (
-        f"{provenance.get('flights', len(flights))} flights in "
-        f"{', '.join(provenance.get('worlds', [])) or 'unknown worlds'}{span}; "
-        f"mavfi {provenance['mavfi']}"
-    )
+    worlds = ", ".join(model.provenance.get("worlds", [])) or "unknown worlds"
+    count = model.provenance.get("flights", len(flights))
+    return {**row, "told": f"{count} flights in {worlds}{span}; mavfi {model.mavfi}"}
 
 
 def training_flights(provenance: Mapping[str, Any]) -> Sequence[str]:
-    """Flights `world/seed` that a model has seen, of all parts of its split."""
+    """Return the flights `world/seed` that a model has seen, of all parts of its split."""
     parts = provenance.get("split", {})
     if not isinstance(parts, Mapping):
         return []

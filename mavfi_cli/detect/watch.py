@@ -10,7 +10,7 @@ effect. After n messages that were not accepted, n + 1 changes may therefore add
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,7 @@ EXTENDED = tuple(
     BY_NAME[name] for name in ("collision", "plan_trajectory_seq", "plan_future_collision_seq")
 )
 # Smallest and largest change of each extended state by name.
-Ranges = Mapping[str, tuple[int, int]]
+Ranges = dict[str, tuple[int, int]]
 _PLACES = {
     kind: [place for place, state in enumerate(EXTENDED) if state.message is kind]
     for kind in (CollisionReport, Trajectory)

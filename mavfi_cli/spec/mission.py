@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from mavfi_cli.autonomy import canonical_planner
@@ -12,7 +12,7 @@ from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.platform import measured_factor
-from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack, with_tolerance
+from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 Vector3 = tuple[float, float, float]
@@ -153,4 +153,5 @@ class MissionConfig:
 
 def stack_of(config: MissionConfig) -> Stack:
     """Return the stack of a mission with its goal tolerance. Raises as `load_stack`."""
-    return with_tolerance(load_stack(config.stack), config.goal_tolerance_m)
+    stack, own_m = load_stack(config.stack), config.goal_tolerance_m
+    return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)

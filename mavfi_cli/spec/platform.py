@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from mavfi_cli.core.config import load_toml, shipped_names, shipped_path
+from mavfi_cli.core.config import load_toml, shipped_base, shipped_names, shipped_path
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 
 MEASURED = "measured"
@@ -62,7 +61,8 @@ class PlatformProfile:
     def __post_init__(self) -> None:
         if self.cores < 1:
             raise ValueError(f"cores must be at least 1, got {self.cores}")
-        _check_kernels(self.kernels)
+        if missing := [f"kernels.{kernel}" for kernel in KERNELS if kernel not in self.kernels]:
+            raise ValueError(f"{', '.join(missing)}: missing, a kernel without a latency")
         check_hardware(self)
 
 
@@ -78,14 +78,13 @@ class _KernelEntry:
     def __post_init__(self) -> None:
         if (self.latency_s is None) is (self.scale is None):
             raise ValueError("needs either latency_s or scale")
-        if self.scale is not None and self.scale <= 0.0:
-            raise ValueError(f"scale must be above zero, got {self.scale:g}")
+        _check_scale(self.scale)
         _check_latency(self.latency_s or 0.0, self.spread or 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlatformFile:
-    """Contents of a platform's TOML file."""
+    """A platform's TOML file: the keys of `PlatformProfile`, with other kernels."""
 
     name: str
     cores: int
@@ -94,15 +93,19 @@ class _PlatformFile:
     scale: float = 1.0  # factor on the base's latencies of kernels without an entry
     description: str = ""
     carried: bool = True
-    power_w: float = 0.0
-    mass_kg: float = 0.0
-    heatsink_kgpw: float = 0.0
-    sources: dict[str, str] = field(default_factory=dict)  # key -> source of its value
+    power_w: float | None = None
+    mass_kg: float | None = None
+    heatsink_kgpw: float | None = None
+    sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_names(self.kernels)
-        if self.scale <= 0.0:
-            raise ValueError(f"scale must be above zero, got {self.scale:g}")
+        for kernel in self.kernels:
+            if kernel not in KERNELS:
+                match = nearest(kernel, KERNELS)
+                hint = f"did you mean {match!r}? " if match else ""
+                known = f"{hint}Known: {', '.join(KERNELS)}"
+                raise ValueError(f"kernels.{kernel}: no such kernel; {known}")
+        _check_scale(self.scale)
         if not self.base and self.scale != 1.0:
             raise ValueError("scale needs a base, the platform whose latencies are scaled")
 
@@ -116,19 +119,9 @@ def _check_latency(latency_s: float, spread: float) -> None:
         raise ValueError(f"spread must be within 0 and 2, got {spread:g}")
 
 
-def _check_names(kernels: Collection[str]) -> None:
-    for kernel in kernels:
-        if kernel not in KERNELS:
-            match = nearest(kernel, KERNELS)
-            hint = f"did you mean {match!r}? " if match else ""
-            raise ValueError(f"kernels.{kernel}: no such kernel; {hint}Known: {', '.join(KERNELS)}")
-
-
-def _check_kernels(kernels: Collection[str]) -> None:
-    _check_names(kernels)
-    missing = [f"kernels.{kernel}" for kernel in KERNELS if kernel not in kernels]
-    if missing:
-        raise ValueError(f"{', '.join(missing)}: missing, a kernel without a latency")
+def _check_scale(scale: float | None) -> None:
+    if scale is not None and scale <= 0.0:
+        raise ValueError(f"scale must be above zero, got {scale:g}")
 
 
 def check_hardware(board: object) -> None:
@@ -157,13 +150,23 @@ def load_platform(name_or_path: str) -> PlatformProfile:
         UnknownName: No shipped platform has this name, and it is not a path to a TOML file.
         ConfigError: The file or the factor cannot be used.
     """
-    factor = measured_factor(name_or_path)
-    if factor is not None:
+    if (factor := measured_factor(name_or_path)) is not None:
         return _measured(factor)
     if not name_or_path.endswith(".toml") and name_or_path not in platform_names():
         raise UnknownName("platform", name_or_path, [*platform_names(), f"{MEASURED}:FACTOR"])
     path = shipped_path("platform", name_or_path, _FOLDER)
-    return _resolved(load_toml(path, _PlatformFile), path)
+    file = load_toml(path, _PlatformFile)
+    base = load_platform(shipped_base("platform", file.base, path, _FOLDER)) if file.base else None
+    about = {
+        "kernels": _kernels(file, base, path),
+        "sources": {**_given(file, path), **file.sources},
+    }
+    values = {each.name: getattr(file, each.name) for each in fields(file) if each.name != "scale"}
+    given = {key: value for key, value in {**values, **about}.items() if value is not None}
+    try:
+        return PlatformProfile(**given)
+    except ValueError as error:
+        raise ConfigError(str(error), path=path) from None
 
 
 def measured_factor(name: str) -> float | None:
@@ -201,51 +204,36 @@ def _measured(factor: float) -> PlatformProfile:
     )
 
 
-def _resolved(file: _PlatformFile, path: Path) -> PlatformProfile:
-    """Build the profile of a file from its own latencies and those of its base."""
-    base: dict[str, KernelLatency] = {}
-    if file.base:
-        if file.base not in platform_names() or path == _FOLDER / f"{file.base}.toml":
-            error = UnknownName("platform", file.base, set(platform_names()) - {path.stem})
-            raise ConfigError(str(error), path=path, key="base")
-        base = load_platform(file.base).kernels
-    named = {each.name for each in fields(_PlatformFile)}
-    shared = {e.name: getattr(file, e.name) for e in fields(PlatformProfile) if e.name in named}
-    try:
-        return PlatformProfile(**{**shared, "kernels": _kernels(file, base, path)})
-    except ValueError as error:
-        raise ConfigError(str(error), path=path) from None
+def _given(file: _PlatformFile, path: Path) -> dict[str, str]:
+    """Return a source for each number that a file gives without one."""
+    named = [key for key in ("cores", *HARDWARE) if getattr(file, key) is not None]
+    if path.parent == _FOLDER:
+        return {}
+    return dict.fromkeys(named, f"set in {path.name}")
 
 
 def _kernels(
-    file: _PlatformFile, base: dict[str, KernelLatency], path: Path
+    file: _PlatformFile, base: PlatformProfile | None, path: Path
 ) -> dict[str, KernelLatency]:
     """Return the latency of each kernel: its own entry, or the base's times the file's factor."""
-    scale_source = _scaled(file.base, file.scale, file.sources.get("scale", ""))
-    kernels = {
-        name: replace(latency, latency_s=latency.latency_s * file.scale, source=scale_source)
-        for name, latency in base.items()
-    }
-    for name, entry in file.kernels.items():
-        if entry.scale is not None and not base:
-            raise ConfigError("scale needs a base", path=path, key=f"kernels.{name}")
-        kernels[name] = _latency(entry, base.get(name), file.base)
+    based = {} if base is None else base.kernels
+    entries = {name: _KernelEntry(scale=file.scale, source=file.sources.get("scale", ""))
+               for name in based}  # fmt: skip
+    kernels = {}
+    for name, entry in {**entries, **file.kernels}.items():
+        under = based.get(name, KernelLatency(latency_s=0.0))
+        latency_s, source = entry.latency_s, entry.source or f"set in {path.name}"
+        if entry.scale is not None:
+            if base is None:
+                raise ConfigError("scale needs a base", path=path, key=f"kernels.{name}")
+            latency_s = entry.scale * under.latency_s
+            source = f"{file.base} x {entry.scale:g}" + (
+                f": {entry.source}" if entry.source else ""
+            )
+        assert latency_s is not None
+        spread = under.spread if entry.spread is None else entry.spread
+        try:
+            kernels[name] = KernelLatency(latency_s=latency_s, spread=spread, source=source)
+        except ValueError as error:
+            raise ConfigError(str(error), path=path) from None
     return kernels
-
-
-def _latency(entry: _KernelEntry, base: KernelLatency | None, base_name: str) -> KernelLatency:
-    spread = entry.spread if entry.spread is not None else (base.spread if base else 0.0)
-    if entry.scale is None or base is None:
-        assert entry.latency_s is not None
-        return KernelLatency(latency_s=entry.latency_s, spread=spread, source=entry.source)
-    return KernelLatency(
-        latency_s=entry.scale * base.latency_s,
-        spread=spread,
-        source=_scaled(base_name, entry.scale, entry.source),
-    )
-
-
-def _scaled(base_name: str, scale: float, source: str) -> str:
-    """Describe the source of a latency that is a multiple of another platform's."""
-    scaled = f"{base_name} x {scale:g}"
-    return f"{scaled}: {source}" if source else scaled

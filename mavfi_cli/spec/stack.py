@@ -12,12 +12,12 @@ import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.config import read_toml, shipped_names, shipped_path, structure
-from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
+from mavfi_cli.core.config import read_toml, shipped_base, shipped_names, shipped_path, structure
+from mavfi_cli.core.errors import ConfigError, UnknownKey
 from mavfi_cli.core.types import StackMark
 from mavfi_cli.spec.platform import KERNELS
 
@@ -201,16 +201,21 @@ def _values(path: Path) -> tuple[dict[str, Any], str]:
     """Return the values of a file and its base, and the file's text."""
     values, text = read_toml(path)
     _require_known(values, path)
-    base = values.get("base", "")
-    if not base:
-        return values, text
-    if base not in stack_names() or path == _FOLDER / f"{base}.toml":
-        error = UnknownName("stack", str(base), set(stack_names()) - {path.stem})
-        raise ConfigError(str(error), path=path, key="base")
-    inherited, _ = _values(_FOLDER / f"{base}.toml")
-    kept = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}
+    own = {} if path.parent == _FOLDER else dict.fromkeys(KEYS, f"set in {path.name}")
     about = {"name": path.stem, "description": ""}
-    sources = {**kept, **values.get("sources", {})}
+    inherited: dict[str, Any] = {}
+    if values.get("base", ""):
+        base = shipped_base("stack", values["base"], path, _FOLDER)
+        inherited, _ = _values(_FOLDER / f"{base}.toml")
+    elif missing := [key for key in KEYS if key not in values]:
+        raise ConfigError(
+            f"{', '.join(missing[:3])}{', ...' if missing[3:] else ''}: missing; "
+            f"base = NAME takes missing values from a stack: {', '.join(stack_names())}",
+            path=path,
+        )
+    kept = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}
+    given = {key: why for key, why in own.items() if key in values}
+    sources = {**kept, **given, **values.get("sources", {})}
     return {**inherited, **about, **values, "sources": sources}, text
 
 
@@ -230,8 +235,3 @@ def _require_known(values: Mapping[str, Any], path: Path | None) -> None:
     for key in values:
         if key not in (*KEYS, *_ABOUT):
             raise UnknownKey(key, (*KEYS, *_ABOUT), path=path)
-
-
-def with_tolerance(stack: Stack, goal_tolerance_m: float | None) -> Stack:
-    """Return the stack with a mission's goal tolerance; None keeps the stack's."""
-    return stack if goal_tolerance_m is None else replace(stack, goal_tolerance_m=goal_tolerance_m)

@@ -82,7 +82,7 @@ def require_held_out(plan: EvaluationPlan) -> None:
     for detector in map(plan.detector_config, plan.protectors):
         detector_of(detector, plan.base.stack)
         path = model_path(detector, plan.base.stack)
-        for flight in () if path is None else training_flights(model_file.provenance(path)):
+        for flight in () if path is None else training_flights(model_file.read(path).provenance):
             seed = flight.rpartition("/")[2]
             if seed.isdigit() and int(seed) in plan.seeds:
                 raise ModelError(

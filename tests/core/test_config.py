@@ -42,7 +42,7 @@ def test_a_good_file(tmp_path):
     ("text", "message"),
     [
         ('name = "x"\nbox = []\nnam = 1', r"file\.toml:3: nam: .*did you mean 'name'"),
-        ('name = "x"\n[[box]]\na = 1\n[[box]]\nq = 2', r"file\.toml:5: box\.q: unknown key"),
+        ('name = "x"\n[[box]]\na = 1\n[[box]]\nq = 2', r"file\.toml:5: box\[1\]\.q: unknown key"),
         ('name = "x"\nbox = []\n[named.one]\nq = 2', r"file\.toml:4: named\.one\.q: unknown"),
     ],
 )
@@ -73,7 +73,7 @@ def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
         ),
         ('name = "x"\nbox = []\n[[named.one]]\na = 1', r"named\.one: expected a table, got \["),
         ('name = "x"\nbox = 3', r"file\.toml:2: box: expected an array, got 3$"),
-        ('name = "x"\nbox = [3]', r"file\.toml:2: box: expected a table, got 3$"),
+        ('name = "x"\nbox = [3]', r"file\.toml:2: box\[0\]: expected a table, got 3$"),
         ('name = "x"\nbox = []\npair = "12"', r"file\.toml:3: pair: expected an array, got '12'$"),
     ],
 )

@@ -131,7 +131,7 @@ def test_a_model_that_is_missing_or_damaged_is_refused(models):
 
 
 def test_all_parts_of_the_split_are_seen(models):
-    flights = training_flights(model_file.provenance(models / "gad.json"))
+    flights = training_flights(model_file.read(models / "gad.json").provenance)
     assert sorted(flights) == ["train-0.05-3/40", "train-0.2-5/41"]
 
 
