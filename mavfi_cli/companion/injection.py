@@ -7,14 +7,23 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mavfi_cli.companion.executor import Executor
-from mavfi_cli.companion.protection import NoProtection, gate_of
+from mavfi_cli.companion.protection import NoProtection
+from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import Message
 from mavfi_cli.core.types import Briefing, Trajectory
-from mavfi_cli.detect.gate import Gate
-from mavfi_cli.fi.source.injector import Follower, MemoryInjector, Reader, SourceInjector, Strike
-from mavfi_cli.fi.source.schedule import Moment, Schedule
+from mavfi_cli.fi.bits import told_apart
+from mavfi_cli.fi.source.injector import (
+    Follower,
+    Injector,
+    Listener,
+    MemoryInjector,
+    Reader,
+    SourceInjector,
+    Strike,
+)
+from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.spec.fault import DETECTOR, PROCESS, FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -39,95 +48,140 @@ class NoInjection:
         """Observe the mission once per control tick and before every report."""
 
     def pass_on(self, message: M, moment: Moment) -> M:
-        """Return the message unchanged."""
+        """Return a message as its receiver gets it."""
         return message
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the trajectory unchanged."""
+        """Return the active trajectory as it is from this tick on."""
         return trajectory
 
     def strike_memory(self, moment: Moment) -> None:
-        """Do nothing."""
+        """Strike the memory of the detector or of a node, once per control tick."""
 
     def begin(self, path: Path) -> None:
-        """Write no record."""
+        """Write the planned fault before the flight."""
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """No node needs a process of its own."""
+        """Give the attacked node a process of its own before the flight."""
 
     def news(self) -> list[str]:
-        """Return no news."""
+        """Return one line per strike since the last call."""
         return []
 
     def finish(self) -> dict[str, Any] | None:
-        """Return no record."""
+        """Write and return the record at the end of the mission."""
         return None
 
 
-class _Killer:
+class _Killer(Injector):
     """Decides when the process of a node is killed, which happens once."""
 
-    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
+    _awaits = "control tick"
+
+    def __init__(self, config: FaultConfig, shortest_flight_s: float, listener: Listener) -> None:
         rng = generator(config.seed, Stream.FAULT, "process")
-        self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
-        self._schedule = Schedule(config.trigger(), config.corruption(), self.drawn_time_s)
-        self.strikes: list[Strike] = []
-        self.watch = self._schedule.watch
+        trigger, corruption = config.trigger(), config.corruption()
+        super().__init__(rng, trigger, corruption, shortest_flight_s, listener)
 
-    @property
-    def count(self) -> int:
-        """Number of kills."""
-        return len(self.strikes)
-
-    @property
-    def missed(self) -> str:
-        """Reason why the fault has not struck."""
-        return self._schedule.missed("control tick")
-
-    def strike(self, moment: Moment) -> Strike | None:
-        """Return the kill if it is due now."""
+    def strike(self, moment: Moment) -> bool:
         if not self._schedule.due(moment):
-            return None
-        self._schedule.acted(moment)
-        strike = Strike(
-            stamp_s=moment.stamp_s, tick=moment.tick, phase=moment.phase, invocation=moment.tick,
-            changes=(),
-        )  # fmt: skip
-        self.strikes.append(strike)
-        return strike
+            return False
+        self._tell(moment, moment.tick, ())
+        return True
 
 
-class _Recorded(NoInjection):
-    """Record of a fault, written before the flight, at the first strike and at the end.
+class SourceInjection(NoInjection):
+    """Injection of one source-level fault, and its record on disk.
 
-    A subclass sets its injector, the attacked stage, the unit of each attacked state by name, and
-    who reads what is corrupted.
+    The record is written before the flight, at the first strike and at the end.
+
+    Args:
+        shortest_flight_s: Interval from which a random trigger is drawn, s.
+        protection: Protection whose detector the fault may corrupt.
+
+    Raises:
+        FaultSpecError: A fault in the detector needs one.
     """
 
-    _injector: SourceInjector | MemoryInjector | _Killer
-    _stage: str
-    _units: dict[str, str]
-    _reader = ""
-
-    def __init__(self, config: FaultConfig) -> None:
+    def __init__(
+        self, config: FaultConfig, shortest_flight_s: float, protection: NoProtection
+    ) -> None:
         super().__init__()
         self._config = config
         self._path: Path | None = None
         self._state = "planned"
         self._news: list[str] = []
         self._strike: Strike | None = None  # the newest
+        self._executor: Executor | None = None
+        self.in_queue = config.strikes_queue
+        self._reader = ""  # who reads at once what is corrupted; empty: the follower finds out
+        self._injector: Injector
+        if config.killed_node is not None:
+            self._injector = _Killer(config, shortest_flight_s, self._on_strike)
+            self._reader = config.killed_node
+            self._stage, self._units = PROCESS, {config.target: ""}
+        elif config.attacks_detector:
+            if protection.gate is None:
+                raise FaultSpecError("a fault in the detector needs one: --detector NAME")
+            memory = MemoryInjector(
+                protection.gate.memory,
+                config.detector_part,
+                trigger=config.trigger(),
+                corruption=config.corruption(),
+                bits=config.exact_bits,
+                seed=config.seed,
+                shortest_flight_s=shortest_flight_s,
+                listener=self._on_strike,
+            )
+            self._injector, self._stage, self._reader = memory, DETECTOR, DETECTOR
+            self._units = {memory.array: "1"}
+        else:
+            fault = config.draw()
+            self._injector = SourceInjector(
+                fault,
+                seed=config.seed,
+                shortest_flight_s=shortest_flight_s,
+                listener=self._on_strike,
+            )
+            self._stage = fault.states[0].stage.value
+            self._units = {state.name: state.unit for state in fault.states}
 
     def watch(self, moment: Moment) -> None:
         """Update the trigger."""
         self._injector.watch(moment)
 
+    def pass_on(self, message: M, moment: Moment) -> M:
+        """Return the message as its receiver gets it, corrupted if the fault strikes."""
+        return self._followed(message, self._injector.pass_on(message, moment))
+
+    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
+        """Return the active trajectory from this tick on, corrupted if the fault strikes."""
+        struck = self._injector.strike_latched(trajectory, moment, index)
+        return self._followed(trajectory, struck)
+
+    def _followed(self, message: M, sent: M) -> M:
+        if sent is not message and self._strike is not None and isinstance(sent, Message):
+            self.follower.struck(sent, self._strike)
+        return sent
+
+    def strike_memory(self, moment: Moment) -> None:
+        """Strike the detector's memory, or kill the node's process, if the fault is due."""
+        if self._injector.strike(moment) and self._executor is not None:
+            self._executor.kill(self._reader)
+
+    def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
+        """Have a node that is killed work in a process of its own."""
+        if self._config.killed_node is not None:
+            self._executor = executor
+            executor.isolate(self._config.killed_node)
+
     def begin(self, path: Path) -> None:
-        """Write the planned fault before the flight."""
+        """Write the planned fault."""
         self._path = path
         write_json(path, self.record())
 
     def news(self) -> list[str]:
-        """Return one line per strike since the last call."""
+        """Return the first strike as text, once."""
         news, self._news = self._news, []
         return news
 
@@ -141,7 +195,7 @@ class _Recorded(NoInjection):
                 write_json(self._path, self.record())
 
     def finish(self) -> dict[str, Any] | None:
-        """Write and return the record at the end of the mission."""
+        """Write and return the record."""
         if self._state == "planned":
             self._state = "not_injected"
         if self._path is not None:
@@ -176,133 +230,12 @@ class _Recorded(NoInjection):
         }
 
     def _activation(self) -> tuple[str, Reader | None]:
-        """Return the activation and the first reader, who reads what is corrupted at once."""
+        if not self._reader:
+            return self.follower.activation.value, self.follower.reader
         if not self._injector.strikes:
             return "not_injected", None
         stamp_s = self._injector.strikes[0].stamp_s
         return "read", Reader(name=self._reader, stamp_s=stamp_s, state=next(iter(self._units)))
-
-
-class SourceInjection(_Recorded):
-    """Injection of one fault into the messages between nodes, or into the active plan.
-
-    Args:
-        config: Configuration of the fault.
-        shortest_flight_s: Interval from which a random trigger is drawn, s.
-    """
-
-    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
-        super().__init__(config)
-        self._injector: SourceInjector = SourceInjector(
-            config.draw(),
-            seed=config.seed,
-            shortest_flight_s=shortest_flight_s,
-            listener=self._on_strike,
-        )
-        states = self._injector.fault.states
-        self._stage = states[0].stage.value
-        self._units = {state.name: state.unit for state in states}
-        self.in_queue = config.strikes_queue
-
-    def pass_on(self, message: M, moment: Moment) -> M:
-        """Return the message as its receiver gets it, corrupted if the fault strikes."""
-        return self._followed(message, self._injector.pass_on(message, moment))
-
-    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active trajectory from this tick on, corrupted if the fault strikes."""
-        struck = self._injector.strike_latched(trajectory, moment, index)
-        return self._followed(trajectory, struck)
-
-    def _followed(self, message: M, sent: M) -> M:
-        if sent is not message and self._strike is not None and isinstance(sent, Message):
-            self.follower.struck(sent, self._strike)
-        return sent
-
-    def _activation(self) -> tuple[str, Reader | None]:
-        return self.follower.activation.value, self.follower.reader
-
-
-class DetectorInjection(_Recorded):
-    """Injection of one fault into the memory of the detector.
-
-    The detector reads all of its memory at its next check, so every fault is activated.
-
-    Args:
-        config: Configuration of the fault. Its target is `detector` or `detector.PART`.
-        shortest_flight_s: Interval from which a random trigger is drawn, s.
-        gate: Gate with the detector's memory.
-    """
-
-    def __init__(self, config: FaultConfig, shortest_flight_s: float, gate: Gate) -> None:
-        super().__init__(config)
-        self._injector: MemoryInjector = MemoryInjector(
-            gate.memory,
-            config.detector_part,
-            trigger=config.trigger(),
-            corruption=config.corruption(),
-            bits=config.exact_bits,
-            seed=config.seed,
-            shortest_flight_s=shortest_flight_s,
-            listener=self._on_strike,
-        )
-        self._stage = self._reader = DETECTOR
-        self._units = {self._injector.array: "1"}
-
-    def strike_memory(self, moment: Moment) -> None:
-        """Strike the detector's memory if the fault is due."""
-        self._injector.strike(moment)
-
-
-class ProcessInjection(_Recorded):
-    """Injection that kills the process of a node once.
-
-    Args:
-        config: Configuration of the fault. Its target is `process.NODE`.
-        shortest_flight_s: Interval from which a random trigger is drawn, s.
-    """
-
-    def __init__(self, config: FaultConfig, shortest_flight_s: float) -> None:
-        super().__init__(config)
-        assert config.killed_node is not None
-        self._node = self._reader = config.killed_node
-        self._injector: _Killer = _Killer(config, shortest_flight_s)
-        self._stage, self._units = PROCESS, {config.target: ""}
-        self._executor: Executor | None = None
-
-    def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """Have the node that is killed work in a process of its own."""
-        self._executor = executor
-        executor.isolate(self._node)
-
-    def strike_memory(self, moment: Moment) -> None:
-        """Kill the process if the trigger fires."""
-        strike = self._injector.strike(moment)
-        if strike is not None:
-            self._on_strike(strike)
-            assert self._executor is not None
-            self._executor.kill(self._node)
-
-
-def injection_of(
-    config: FaultConfig | None, shortest_flight_s: float, protection: NoProtection
-) -> NoInjection:
-    """Create the injection of a source-level fault, or the null object without a fault.
-
-    Args:
-        config: Fault.
-        shortest_flight_s: Interval from which a random trigger is drawn, s.
-        protection: Protection whose detector the fault may corrupt.
-
-    Raises:
-        FaultSpecError: A fault in the detector needs one.
-    """
-    if config is None:
-        return NoInjection()
-    if config.killed_node is not None:
-        return ProcessInjection(config, shortest_flight_s)
-    if config.attacks_detector:
-        return DetectorInjection(config, shortest_flight_s, gate_of(protection))
-    return SourceInjection(config, shortest_flight_s)
 
 
 def strike_text(strike: Strike) -> str:
@@ -310,12 +243,8 @@ def strike_text(strike: Strike) -> str:
     if not strike.changes:
         return "fault: the process is killed"
     changes = [
-        f"{c.state}: {_value(c.before)} -> {_value(c.after)} "
+        f"{c.state}: {' -> '.join(told_apart(c.before, c.after))} "
         f"(bit{'s' if len(c.bits) != 1 else ''} {', '.join(map(str, c.bits)) or 'none'})"
         for c in strike.changes
     ]
     return "fault in " + "; ".join(changes)
-
-
-def _value(value: float | int | bool) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -16,17 +16,27 @@ class LatencyModel:
     """Draws the latency of each invocation from a platform profile.
 
     Each kernel has its own random stream, so the number of calls of one kernel never changes the
-    latencies of another.
+    latencies of another. On a measured platform the latency is the host time of the kernel's newest
+    invocation, times the profile's factor.
+
+    Args:
+        wall: Clock with the host times, for a measured platform.
     """
 
-    def __init__(self, profile: PlatformProfile, root_seed: int) -> None:
-        self._profile = profile
-        self._streams: dict[str, np.random.Generator] = {
-            kernel: generator(root_seed, Stream.LATENCY, kernel) for kernel in KERNELS
-        }
+    def __init__(
+        self, profile: PlatformProfile, root_seed: int, wall: WallClock | None = None
+    ) -> None:
+        self._profile, self._wall = profile, wall
+        self._streams = {kernel: generator(root_seed, Stream.LATENCY, kernel) for kernel in KERNELS}
+        self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
 
     def draw_s(self, kernel: str) -> float:
-        """Return the latency of the next invocation of `kernel`, s."""
+        """Return the latency of the next invocation of a kernel, or of its measured one, s."""
+        if self._profile.measured_factor is not None:
+            assert self._wall is not None
+            host_s = self._wall.newest.get(kernel, 0.0)
+            self._host_s[kernel].append(host_s)
+            return self._profile.measured_factor * host_s
         latency = self._profile.kernels[kernel]
         if latency.spread == 0.0:
             return latency.latency_s
@@ -35,49 +45,20 @@ class LatencyModel:
         )
 
     def summary(self) -> dict[str, Any] | None:
-        """Return None, because nothing was measured."""
-        return None
-
-
-class MeasuredLatency(LatencyModel):
-    """Latencies from the host time of a kernel's newest invocation, times the profile's factor."""
-
-    def __init__(self, profile: PlatformProfile, wall: WallClock) -> None:
-        assert profile.measured_factor is not None
-        self._name, self._factor, self._wall = profile.name, profile.measured_factor, wall
-        self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
-
-    def draw_s(self, kernel: str) -> float:
-        """Return the latency of the newest invocation of `kernel` on the host, s."""
-        host_s = self._wall.newest.get(kernel, 0.0)
-        self._host_s[kernel].append(host_s)
-        return self._factor * host_s
-
-    def summary(self) -> dict[str, Any]:
-        """Return platform, factor, and each kernel's median on the host and in the flight, s."""
+        """Return the factor of a measured platform, and each kernel's medians, s; else None."""
+        factor = self._profile.measured_factor
+        if factor is None:
+            return None
         medians = {kernel: float(np.median(s)) for kernel, s in self._host_s.items() if s}
         return {
-            "platform": self._name,
-            "factor": self._factor,
+            "platform": self._profile.name,
+            "factor": factor,
             "kernels": {
                 kernel: {
                     "host_median_s": median_s,
-                    "latency_median_s": self._factor * median_s,
+                    "latency_median_s": factor * median_s,
                     "invocations": len(self._host_s[kernel]),
                 }
                 for kernel, median_s in medians.items()
             },
         }
-
-
-def latency_model(profile: PlatformProfile, root_seed: int, wall: WallClock) -> LatencyModel:
-    """Create the latency model of a platform.
-
-    Args:
-        profile: Platform.
-        root_seed: Root seed of the mission.
-        wall: Clock with the host times, for a measured platform.
-    """
-    if profile.measured_factor is not None:
-        return MeasuredLatency(profile, wall)
-    return LatencyModel(profile, root_seed)

@@ -26,7 +26,7 @@ from mavfi_cli.autonomy.trajectory import waypoint_index
 from mavfi_cli.companion.executor import Executor, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of
-from mavfi_cli.companion.latency import latency_model
+from mavfi_cli.companion.latency import LatencyModel
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
 from mavfi_cli.companion.recovery import Recovery
 from mavfi_cli.core.states import Message, of_stage
@@ -117,7 +117,7 @@ class Companion:
         self.protection = protection
         self.pilot = Pilot(_pilot_params(config, stack), briefing.goal_enu_m)
         self._recovery = Recovery(protection, self.pilot, self._follower, self._see_again)
-        self._latency = latency_model(platform, config.seed, wall)
+        self._latency = LatencyModel(platform, config.seed, wall)
         self.executor = Executor(
             draw_latency_s=self._latency.draw_s,
             cores=platform.cores,

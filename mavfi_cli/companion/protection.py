@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
@@ -35,18 +34,6 @@ class Response(Enum):
     RECOMPUTE = "recompute"  # withheld; its stage is recomputed
     HOLD = "hold"  # withheld; the vehicle holds and plans anew
     ACCEPT = "accept"  # accepted in spite of the alarm, because recomputation confirmed it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AlarmRecord:
-    """One alarm in the record of the run."""
-
-    stamp_s: float
-    message: str  # report, plan, ahead (active plan before its collision check) or tick
-    stage: str
-    score: float
-    states: tuple[str, ...]
-    response: str
 
 
 @dataclass(slots=True)
@@ -85,32 +72,32 @@ class NoProtection:
     gate: Gate | None = None
 
     def report(self, report: CollisionReport, stamp_s: float) -> Decision:
-        """Passes."""
+        """Judge a collision report on its arrival."""
         return PASSED
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
-        """Passes."""
+        """Judge a plan on its arrival."""
         return PASSED
 
     def lose_plan(self) -> None:
-        """Do nothing."""
+        """Note that the planner has answered without a usable plan."""
 
     def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Decision:
-        """Passes."""
+        """Judge the active plan from the present waypoint on, or a single waypoint."""
         return PASSED
 
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> Decision:
-        """Passes."""
+        """Judge the present waypoint and the command."""
         return PASSED
 
     def news(self) -> list[str]:
-        """Return no news."""
+        """Return the lines to announce since the last call."""
         return []
 
     def summary(self) -> dict[str, Any] | None:
-        """Return no record."""
+        """Return checks, alarms and recoveries as plain values; None without a detector."""
         return None
 
 
@@ -130,11 +117,11 @@ class Protection(NoProtection):
         detector = detector_of(config, stack)
         stages = frozenset(Stage(name) for name in config.protect)
         self.gate: Gate = Gate(detector, stages, watch=watch_of(config, detector))
-        self._threshold = self.gate.threshold
+        self._threshold = detector.threshold
         self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
         self._recoveries = {stage: _Recovery() for stage in Stage}
-        self._alarms: list[AlarmRecord] = []
+        self._alarms: list[dict[str, Any]] = []
         self._news: list[str] = []
         self._told_s: dict[Stage, float] = {}
 
@@ -213,14 +200,14 @@ class Protection(NoProtection):
             self._close(recovery, stamp_s)
         if len(self._alarms) < MAX_LISTED_ALARMS:
             self._alarms.append(
-                AlarmRecord(
-                    stamp_s=round(stamp_s, 9),
-                    message=message,
-                    stage=stage.value,
-                    score=alarm.score,
-                    states=alarm.states,
-                    response=response.value,
-                )
+                {
+                    "stamp_s": round(stamp_s, 9),
+                    "message": message,  # report, plan, ahead (active plan) or tick
+                    "stage": stage.value,
+                    "score": alarm.score,
+                    "states": alarm.states,
+                    "response": response.value,
+                }
             )
         self._tell(alarm, stage, response, stamp_s)
         return Decision(response=response, alarm=alarm)
@@ -266,7 +253,7 @@ class Protection(NoProtection):
             "checks": self._checks,
             "alarm_count": sum(self._responses.values()),
             "responses": self._responses,
-            "alarms": [asdict(alarm) for alarm in self._alarms],
+            "alarms": self._alarms,
             "recoveries": {
                 stage.value: {"count": entry.count, "total_s": round(entry.total_s, 9)}
                 for stage, entry in self._recoveries.items()
@@ -292,19 +279,3 @@ def _warm_up(gate: Gate) -> None:
         gate.judge_plan(plan)
         gate.judge_ahead(plan, 0)
         gate.judge_tick(plan, 0, command)
-
-
-def protection_of(config: DetectorConfig | None, stack: str, wall: WallClock) -> NoProtection:
-    """Create the protection of a mission, or the null object if it has no detector."""
-    return NoProtection() if config is None else Protection(config, stack, wall)
-
-
-def gate_of(protection: NoProtection) -> Gate:
-    """Return the gate of a protection as a fault target.
-
-    Raises:
-        FaultSpecError: There is no gate.
-    """
-    if protection.gate is None:
-        raise FaultSpecError("a fault in the detector needs one: --detector NAME")
-    return protection.gate

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
+from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Trajectory
 from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.fitted import OF_PLANNING, PASSED, FittedDetector
+from mavfi_cli.detect.fitted import OF_CONTROL, OF_PLANNING, PASSED, FittedDetector, TickJudge
 from mavfi_cli.detect.preprocess import (
     CODE,
     COUNT,
@@ -100,7 +100,8 @@ class Gate:
         self._scores = np.empty(0)
         fitted = detector if isinstance(detector, FittedDetector) else None
         self._flat = None if fitted is None else fitted.flat
-        self._tick_judge = None if fitted is None or self._ignored else fitted.tick_judge
+        compiled = None if fitted is None or self._ignored else fitted.tick_judge
+        self._tick_judge: TickJudge = compiled or self._judge_stages
         self._plan_judge = None if fitted is None else fitted.plan_judge
 
     @property
@@ -124,21 +125,18 @@ class Gate:
             self._deltas[:] = 0
             return None
         self._report = report
-        if self._watch is not None and (finding := self._watch.judge(report)) is not None:
-            self._watch.lose(CollisionReport)
+        alarm = self._watched(report, Stage.PERCEPTION)
+        if alarm is None:
+            score = self.detector.score(self._deltas, Stage.PERCEPTION)
+            if not score <= self.detector.threshold:
+                alarm = self._alarm(Stage.PERCEPTION, score, self._deltas)
+        if alarm is None:
+            self.detector.learn(self._deltas, Stage.PERCEPTION)
+            self._pending = not self._per_stage
+        else:
             self._reject(Stage.PERCEPTION)
-            return _watch_alarm(finding, Stage.PERCEPTION)
-        score, threshold = self.detector.score(self._deltas, Stage.PERCEPTION), self.threshold
-        if not score <= threshold:
-            self._reject(Stage.PERCEPTION)
-            if self._watch is not None:
-                self._watch.lose(CollisionReport)
-            return self._alarm(Stage.PERCEPTION, score, threshold, self._deltas)
-        self.detector.learn(self._deltas, Stage.PERCEPTION)
-        if self._watch is not None:
-            self._watch.accept(report)
-        self._pending = not self._per_stage
-        return None
+        self._settle(report, alarm)
+        return alarm
 
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
         """Judge a published plan: all steps from waypoint to waypoint, and the extended states.
@@ -146,18 +144,25 @@ class Gate:
         Only per-stage detectors judge the steps. An alarm of a detector over all stages recomputes
         control, and there is no command to recompute yet; see `judge_ahead`.
         """
-        if self._watch is None or Stage.PLANNING not in self.protect:
-            return self._judge_steps(trajectory, 0) if self._per_stage else None
-        finding = self._watch.judge(trajectory)
-        if finding is not None:
-            alarm: Alarm | None = _watch_alarm(finding, Stage.PLANNING)
-        else:
-            alarm = self._judge_steps(trajectory, 0) if self._per_stage else None
-        if alarm is None:
-            self._watch.accept(trajectory)
-        else:
-            self._watch.lose(Trajectory)
+        alarm = self._watched(trajectory, Stage.PLANNING)
+        if alarm is None and self._per_stage:
+            alarm = self._judge_steps(trajectory, 0)
+        if Stage.PLANNING in self.protect:
+            self._settle(trajectory, alarm)
         return alarm
+
+    def _watched(self, message: CollisionReport | Trajectory, stage: Stage) -> Alarm | None:
+        """Return the alarm of the extended watch about a message that arrives."""
+        if self._watch is None or stage not in self.protect:
+            return None
+        return _watch_alarm(self._watch.judge(message), stage)
+
+    def _settle(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> None:
+        """Tell the extended watch whether a judged message takes effect."""
+        if self._watch is not None and alarm is None:
+            self._watch.accept(message)
+        elif self._watch is not None:
+            self._watch.lose(type(message))
 
     def lose_plan(self) -> None:
         """Note that the planner has failed or its plan is not used."""
@@ -179,10 +184,9 @@ class Gate:
             states that differ from the accepted plan's.
         """
         if self._watch is not None and Stage.PLANNING in self.protect:
-            finding = self._watch.judge_flown(trajectory)
-            if finding is not None:
-                mended = self._watch.mended(trajectory)
-                return _watch_alarm(finding, Stage.PLANNING, mended)
+            found = self._watch.judge_flown(trajectory)
+            if found is not None:
+                return _watch_alarm(found, Stage.PLANNING, self._watch.mended(trajectory))
         return self._judge_steps(trajectory, first)
 
     def _judge_steps(self, trajectory: Trajectory, first: int) -> Alarm | None:
@@ -190,7 +194,7 @@ class Gate:
             return None
         rows = len(trajectory.waypoints)
         scores = self._look(trajectory, first)
-        threshold, steps, changes = self.threshold, self._steps, self._changes
+        threshold, steps, changes = self.detector.threshold, self._steps, self._changes
         bad: tuple[int, float] | None = None
         for number, score in enumerate(scores):
             if score <= threshold:
@@ -226,7 +230,7 @@ class Gate:
 
     def _plan_alarm(self, deltas: Codes, score: float, waypoint: int) -> Alarm:
         stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
-        return self._alarm(stage, score, self.threshold, deltas, waypoint)
+        return self._alarm(stage, score, deltas, waypoint)
 
     def judge_tick(
         self, trajectory: Trajectory | None, index: int, command: Command
@@ -243,60 +247,43 @@ class Gate:
             waypoints, row = trajectory.waypoints, index
             self.fresh = _TICK_AND_WAYPOINT
         self._judged = (trajectory, index)
-        if self._tick_judge is not None:
-            score, verdict = self._tick_judge(
-                self._flat, self._work, waypoints, row,
-                command.velocity_enu_mps, command.yaw_rad, self._pending,
-            )  # fmt: skip
-            self._pending = False
-            if row >= 0 and (verdict == PASSED or (self._per_stage and verdict != OF_PLANNING)):
-                self._trajectory, self._index = trajectory, index
-            return None if verdict == PASSED else self._tick_alarm(score, verdict)
-        take_tick(
-            waypoints, row, command.velocity_enu_mps, command.yaw_rad, self._pending, self._work
-        )
+        score, verdict = self._tick_judge(
+            self._flat, self._work, waypoints, row,
+            command.velocity_enu_mps, command.yaw_rad, self._pending,
+        )  # fmt: skip
         self._pending = False
-        if self._ignored:
-            for span in self._ignored:
-                self._deltas[span] = 0
-        if self._per_stage:
-            return self._judge_stages(row >= 0)
-        score, threshold = self.detector.score(self._deltas, Stage.CONTROL), self.threshold
-        if not score <= threshold:
-            for stage in self.fresh:
-                self._reject(stage)
-            return self._alarm(Stage.CONTROL, score, threshold, self._deltas)
-        self.detector.learn(self._deltas, Stage.CONTROL)
-        if row >= 0:
+        of_control = self._per_stage and verdict == OF_CONTROL
+        if row >= 0 and (verdict == PASSED or of_control):
             self._trajectory, self._index = trajectory, index
-        return None
-
-    def _tick_alarm(self, score: float, verdict: int) -> Alarm:
-        """Return the alarm of a tick that was scored in one compiled call."""
-        of_control = self._per_stage and verdict != OF_PLANNING
+        if verdict == PASSED:
+            return None
         for stage in _TICK if of_control else self.fresh:
             self._reject(stage)
         stage = Stage.PLANNING if verdict == OF_PLANNING else Stage.CONTROL
-        return self._alarm(stage, score, self.threshold, self._deltas)
+        return self._alarm(stage, score, self._deltas)
 
-    def _judge_stages(self, new_waypoint: bool) -> Alarm | None:
-        detector, threshold = self.detector, self.threshold
-        if new_waypoint:
-            if Stage.PLANNING in self.protect:
-                score = detector.score(self._deltas, Stage.PLANNING)
-                if not score <= threshold:
-                    self._reject(Stage.PLANNING)
-                    self._reject(Stage.CONTROL)
-                    return self._alarm(Stage.PLANNING, score, threshold, self._deltas)
-                detector.learn(self._deltas, Stage.PLANNING)
-            self._trajectory, self._index = self._judged
-        if Stage.CONTROL in self.protect:
-            score = detector.score(self._deltas, Stage.CONTROL)
-            if not score <= threshold:
-                self._reject(Stage.CONTROL)
-                return self._alarm(Stage.CONTROL, score, threshold, self._deltas)
-            detector.learn(self._deltas, Stage.CONTROL)
-        return None
+    def _judge_stages(
+        self,
+        _flat: FloatArray | None,
+        work: Codes,
+        waypoints: FloatArray,
+        row: int,
+        velocity_enu_mps: FloatArray,
+        yaw_rad: float,
+        keep_report: bool,
+    ) -> tuple[float, int]:
+        """Judge a tick as `FittedDetector.tick_judge` does, for a detector that has none."""
+        take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
+        for span in self._ignored:
+            self._deltas[span] = 0
+        for stage in self.fresh if self._per_stage else _TICK:
+            if self._per_stage and stage not in self.protect:
+                continue
+            score = self.detector.score(self._deltas, stage)
+            if not score <= self.detector.threshold:
+                return score, OF_PLANNING if stage is Stage.PLANNING else OF_CONTROL
+            self.detector.learn(self._deltas, stage)
+        return 0.0, PASSED
 
     def accept_report(self) -> None:
         """Accept the last judged report in spite of its alarm. It becomes the reference."""
@@ -324,11 +311,6 @@ class Gate:
         if stage is Stage.PLANNING:
             self._trajectory, self._index = None, -1
 
-    @property
-    def threshold(self) -> float:
-        """The detector's present threshold."""
-        return self.detector.threshold
-
     def _reject(self, stage: Stage) -> None:
         first, end = SPANS[stage]
         self._work[REFERENCE, first:end] = self._work[PREVIOUS, first:end]
@@ -338,20 +320,15 @@ class Gate:
         self._work[REFERENCE, first:end] = self._work[CODE, first:end]
 
     def _alarm(
-        self,
-        stage: Stage,
-        score: float,
-        threshold: float,
-        deltas: Codes,
-        waypoint: int | None = None,
+        self, stage: Stage, score: float, deltas: Codes, waypoint: int | None = None
     ) -> Alarm:
-        blamed = self._blame(stage, threshold, deltas)
+        threshold = self.detector.threshold
         return Alarm(
             stage=stage if self._per_stage else Stage.CONTROL,
             detector=self.detector.name,
             score=float(score),
             threshold=float(threshold),
-            states=blamed,
+            states=self._blame(stage, threshold, deltas),
             waypoint=waypoint,
         )
 
@@ -370,12 +347,17 @@ class Gate:
         return tuple(NAMES[place] for place in above or [place for _, place in alone])
 
 
-def _watch_alarm(finding: Finding, stage: Stage, mended: Trajectory | None = None) -> Alarm:
+def _watch_alarm(
+    found: Finding | None, stage: Stage, mended: Trajectory | None = None
+) -> Alarm | None:
+    if found is None:
+        return None
+    distance, states = found
     return Alarm(
         stage=stage,
         detector="extended watch",
-        score=finding.distance,
+        score=distance,
         threshold=MARGIN,
-        states=finding.states,
+        states=states,
         mended=mended,
     )

@@ -11,7 +11,6 @@ effect. After n messages that were not accepted, n + 1 changes may therefore add
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,24 +23,13 @@ EXTENDED = tuple(
 )
 # Smallest and largest change of each extended state by name.
 Ranges = dict[str, tuple[int, int]]
+# Distance of the worst change from its range, in codes, and names of the states, worst first.
+Finding = tuple[float, tuple[str, ...]]
 _PLACES = {
     kind: [place for place, state in enumerate(EXTENDED) if state.message is kind]
     for kind in (CollisionReport, Trajectory)
 }
 _REFERENCE, _LOWEST = 0, 1  # rows of the array; the third is the largest change
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
-    """Extended states of a message with changes outside their ranges.
-
-    Attributes:
-        distance: Distance of the worst change from its range, in codes.
-        states: Names of the states, worst first.
-    """
-
-    distance: float
-    states: tuple[str, ...]
 
 
 class ExtendedWatch:
@@ -108,9 +96,7 @@ class ExtendedWatch:
         if not found:
             return None
         found.sort()
-        return Finding(
-            distance=float(-found[0][0]), states=tuple(EXTENDED[place].name for _, place in found)
-        )
+        return float(-found[0][0]), tuple(EXTENDED[place].name for _, place in found)
 
 
 def changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes:

@@ -17,9 +17,9 @@ import numpy as np
 
 from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
 from mavfi_cli.autonomy.planners.base import Planner
-from mavfi_cli.companion.injection import NoInjection, injection_of
+from mavfi_cli.companion.injection import NoInjection, SourceInjection
 from mavfi_cli.companion.pipeline import Companion
-from mavfi_cli.companion.protection import protection_of
+from mavfi_cli.companion.protection import NoProtection, Protection
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
@@ -116,9 +116,12 @@ class Flight:
         """Set goal and camera mounting, and create the companion."""
         require_flyable(briefing, self._config.takeoff_height_m, self._stack.goal_tolerance_m)
         self._briefing = briefing
-        protection = protection_of(self._config.detector, self._config.stack, self.wall)
-        if self._config.instruction is None:
-            self.injection = injection_of(
+        detector = self._config.detector
+        protection = NoProtection()
+        if detector is not None:
+            protection = Protection(detector, self._config.stack, self.wall)
+        if self._config.fault is not None:
+            self.injection = SourceInjection(
                 self._config.fault, self._shortest_flight_s(briefing), protection
             )
         self.companion = Companion(

@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any
 
+from mavfi_cli.fi.bits import told_apart
 from mavfi_cli.fi.tracer.image import short_name
 from mavfi_cli.mission.record.detection_cost import DetectionCost, detection_cost
 from mavfi_cli.mission.record.measures import FlightRecord, record_of
@@ -273,10 +274,8 @@ def _formatted(change: dict[str, Any], when: str) -> str:
         return {"0x7ff0000000000000": "inf", "0xfff0000000000000": "-inf"}.get(
             pattern, f"nan {pattern}"
         )
-    if not isinstance(value, float):
-        return str(value)
-    short = [f"{change[name]:.6g}" for name in ("before", "after") if change[name] is not None]
-    return repr(value) if len(short) == 2 and short[0] == short[1] else f"{value:.6g}"
+    other = change["after" if when == "before" else "before"]
+    return told_apart(value, *([] if other is None else [other]))[0]
 
 
 def difference_lines(run: Run, golden: Run) -> list[str]:
@@ -287,9 +286,10 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
     if parting is None or first_difference(run, golden, leave_out=fault.get("states", ())) is None:
         why = _no_effect(fault) if fault else "none"
         return [f"Effect      {why}: nothing else ever differs from the golden flight"]
+    sides = ["inf or nan" if v is None else v for v in (parting.this, parting.other)]
     lines = [
         f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
-        f"{_pair(parting.this, parting.other)}",
+        f"{' instead of '.join(told_apart(*sides))}",
         f"            at most {largest_deviation_m(run, golden):.2f} m from the golden vehicle",
     ]
     our_s, their_s = (each.quality_of_flight["flight_time_s"] for each in (ours, theirs))
@@ -308,17 +308,3 @@ def _no_effect(fault: Section) -> str:
         return "none, not injected"
     activation = fault["activation"]["activation"]
     return "masked" if activation == "read" else f"none, {activation.replace('_', ' ')}"
-
-
-def _pair(this: Any, other: Any) -> str:
-    """Format two different values with enough digits to tell them apart."""
-    short = [_value(this), _value(other)]
-    if short[0] == short[1]:
-        short = [repr(this), repr(other)]
-    return " instead of ".join(short)
-
-
-def _value(value: Any) -> str:
-    if value is None:
-        return "inf or nan"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from mavfi_cli.companion.executor import Executor, Node
-from mavfi_cli.companion.latency import latency_model
+from mavfi_cli.companion.latency import LatencyModel
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.record.run_folder import load_run
@@ -47,7 +47,7 @@ def test_it_is_refused_where_it_would_have_to_repeat():
 def test_an_invocation_takes_what_it_took_times_the_factor():
     """With a wall clock that says what each invocation took."""
     wall, took_s = WallClock(), iter([0.010, 0.030, 0.020])
-    model = latency_model(load_platform("measured:4"), 1, wall)
+    model = LatencyModel(load_platform("measured:4"), 1, wall)
 
     def work(value, _start_s):
         return value
@@ -87,7 +87,7 @@ def test_an_invocation_takes_what_it_took_times_the_factor():
 
 
 def test_other_platforms_measure_nothing(short_flight):
-    assert latency_model(load_platform("x86"), 1, WallClock()).summary() is None
+    assert LatencyModel(load_platform("x86"), 1, WallClock()).summary() is None
     result = json.loads(short_flight.result.read_text())
     assert result["measured_platform"] is None
     assert not any(line.startswith("Measured") for line in summary_lines(result))

@@ -62,8 +62,14 @@ class Strike:
 Listener = Callable[[Strike], None]
 
 
-class _Injector:
-    """The schedule and the strikes of one fault.
+class Injector:
+    """The schedule and the strikes of one fault. A subclass strikes messages or a memory.
+
+    Args:
+        rng: draws the time of a random trigger first.
+        shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
+            uniformly over it, so that the trigger always comes.
+        listener: called with every strike before the mission goes on.
 
     Attributes:
         strikes: the strikes, oldest first, at most _MAX_LISTED_STRIKES.
@@ -72,8 +78,17 @@ class _Injector:
 
     _awaits: str  # what the fault waits for, in words
 
-    def __init__(self, schedule: Schedule, listener: Listener) -> None:
-        self._schedule, self._listener = schedule, listener
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        trigger: Trigger,
+        corruption: Corruption,
+        shortest_flight_s: float,
+        listener: Listener,
+    ) -> None:
+        self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
+        self._schedule = Schedule(trigger, corruption, self.drawn_time_s)
+        self._listener = listener
         self.strikes: list[Strike] = []
         self.count = 0
 
@@ -81,12 +96,25 @@ class _Injector:
         """Note the mission's present state, once a control tick and for every report."""
         self._schedule.watch(moment)
 
+    def pass_on(self, message: M, moment: Moment) -> M:
+        """Return a published message as its receiver gets it."""
+        return message
+
+    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
+        """Return the active plan as it is from this tick on; `index` is its present waypoint."""
+        return trajectory
+
+    def strike(self, moment: Moment) -> bool:
+        """Strike a memory if the fault is due, once a control tick; True if it did."""
+        return False
+
     @property
     def missed(self) -> str:
         """The reason if the fault never struck."""
         return self._schedule.missed(self._awaits)
 
     def _tell(self, moment: Moment, invocation: int, changes: Sequence[Change]) -> None:
+        self._schedule.acted(moment)
         strike = Strike(
             stamp_s=moment.stamp_s,
             tick=moment.tick,
@@ -100,14 +128,8 @@ class _Injector:
         self._listener(strike)
 
 
-class SourceInjector(_Injector):
-    """Carries one fault through one mission.
-
-    Args:
-        shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
-            uniformly over it, so that the trigger always comes.
-        listener: called with every strike before its message goes on.
-    """
+class SourceInjector(Injector):
+    """Carries one fault in messages, or in the active plan, through one mission."""
 
     def __init__(
         self, fault: SourceFault, *, seed: int, shortest_flight_s: float, listener: Listener
@@ -115,8 +137,7 @@ class SourceInjector(_Injector):
         self.fault = fault
         self._kind = fault.states[0].message
         self._rng = generator(seed, Stream.FAULT, "strike")
-        self.drawn_time_s = float(self._rng.uniform(0.0, shortest_flight_s))
-        super().__init__(Schedule(fault.trigger, fault.corruption, self.drawn_time_s), listener)
+        super().__init__(self._rng, fault.trigger, fault.corruption, shortest_flight_s, listener)
         self._awaits = _WORDS[self._kind]
         self._invocations = 0
         self._index: int | None = None
@@ -126,12 +147,8 @@ class SourceInjector(_Injector):
         ]
         self._struck: Message | None = None
 
-    def pass_on(self, message: M, moment: Moment, index: int = 0) -> M:
-        """Return the message as its receiver gets it.
-
-        Args:
-            index: for a trajectory, the waypoint that is followed first.
-        """
+    def pass_on(self, message: M, moment: Moment) -> M:
+        """See `Injector`."""
         if type(message) is not self._kind:
             return message
         self._invocations += 1
@@ -139,10 +156,10 @@ class SourceInjector(_Injector):
             return message
         if not self._schedule.due(moment, self._invocations):
             return message
-        return self._strike(message, moment, index)
+        return self._strike(message, moment, 0)
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active plan as it is from this tick on."""
+        """See `Injector`."""
         if self._kind is not Trajectory or not self._strikes_latched():
             return trajectory
         if trajectory is self._struck and self.fault.corruption.persistence is not (
@@ -161,7 +178,6 @@ class SourceInjector(_Injector):
 
     def _strike(self, message: M, moment: Moment, first: int) -> M:
         rows = len(message.waypoints) if isinstance(message, Trajectory) else 1
-        self._schedule.acted(moment)
         if self._index is None or self._index >= rows:
             self._index = int(self._rng.integers(min(first, rows - 1), rows))
         changed: Any = message
@@ -201,7 +217,7 @@ def _change_of(
 Memory = Mapping[str, NDArray[Any]]
 
 
-class MemoryInjector(_Injector):
+class MemoryInjector(Injector):
     """Carries one fault in a memory, an element of one of several arrays, through one mission.
 
     It attacks a detector's memory (thresholds, means, weights): a detector can be hit as well.
@@ -210,7 +226,7 @@ class MemoryInjector(_Injector):
         memory: the arrays, which are changed in place.
         array: the attacked array; None draws one in proportion to its bits.
         trigger: when to strike; an invocation is a control tick.
-        shortest_flight_s: a random time is drawn over this time, s.
+        shortest_flight_s, listener: as for `Injector`.
 
     Attributes:
         array, element: the attacked array, and the index of the element in C order.
@@ -238,7 +254,7 @@ class MemoryInjector(_Injector):
         if array is not None and array not in memory:
             raise UnknownName("part of the detector's memory", array, memory)
         rng = generator(seed, Stream.FAULT, "memory")
-        self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
+        super().__init__(rng, trigger, corruption, shortest_flight_s, listener)
         names = sorted(memory)
         if array is None:
             sizes = np.array([memory[name].nbytes for name in names], dtype=np.float64)
@@ -253,20 +269,19 @@ class MemoryInjector(_Injector):
         elif corruption.effect is Effect.FLIP:
             self._kind.field_bits(corruption.field)
         self._memory = memory
-        super().__init__(Schedule(trigger, corruption, self.drawn_time_s), listener)
         chosen = None if bits is None else tuple(sorted(bits))
         self._pattern = Pattern(corruption, rng, chosen)
 
-    def strike(self, moment: Moment) -> None:
-        """Strike the memory if the fault is due."""
+    def strike(self, moment: Moment) -> bool:
+        """See `Injector`."""
         if not self._schedule.due(moment, moment.tick):
-            return
-        self._schedule.acted(moment)
+            return False
         place = self._memory[self.array]
         before = place.flat[self.element].item()
         change = _change_of(self.array, self.element, before, self._kind, self._pattern)
         place.flat[self.element] = change.after
         self._tell(moment, moment.tick, [change])
+        return True
 
 
 class Activation(Enum):
