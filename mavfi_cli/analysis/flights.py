@@ -25,7 +25,8 @@ from mavfi_cli.campaigns.missions import (
     changes_of,
 )
 from mavfi_cli.core.types import FloatArray, Outcome
-from mavfi_cli.mission.record.measures import QUALITY, STRUCK, measures_of
+from mavfi_cli.mission.record.measures import STRUCK, measures_of
+from mavfi_cli.mission.record.quality import QUALITY
 from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")

@@ -25,8 +25,8 @@ from mavfi_cli.core.types import Stage, Trajectory
 from mavfi_cli.detect.model import read as read_model
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.fi import bits
-from mavfi_cli.mission.record.plan_file import read_plans
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.record.tables import read_plans
 from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
 
 SCORES = "scores.json"

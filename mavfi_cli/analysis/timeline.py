@@ -14,7 +14,7 @@ from mavfi_cli.companion.executor import Invocation
 from mavfi_cli.companion.pipeline import SAME_TICK_S, Reaction
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import Run
-from mavfi_cli.mission.record.timetable import read_timetable
+from mavfi_cli.mission.record.tables import read_timetable
 from mavfi_cli.spec.platform import KERNELS
 
 CHAIN = (

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mavfi_cli.mission.progress import FlightProgress, Watcher
-from mavfi_cli.mission.record.events import Event
+from mavfi_cli.mission.progress import Event, FlightProgress, Watcher
 
 if TYPE_CHECKING:
     from rich.live import Live

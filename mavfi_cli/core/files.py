@@ -69,6 +69,28 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(plain(value), indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
+def write_parquet(path: Path, table: Any) -> None:
+    """Write an Arrow table as Parquet, atomically. Equal tables give equal bytes."""
+    import pyarrow.parquet as pq
+
+    write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
+
+
+def read_parquet(path: Path, what: str) -> Any:
+    """Read an Arrow table.
+
+    Raises:
+        RecordError: The file is missing or damaged; `what` is the word for it.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise RecordError(f"{path}: no {what} can be read ({error})") from None
+
+
 def plain(value: Any) -> Any:
     """Return a JSON-ready copy.
 

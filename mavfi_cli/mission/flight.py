@@ -31,10 +31,9 @@ from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission.briefing import require_flyable
 from mavfi_cli.mission.flight_logger import FlightLogger
-from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record import quality
-from mavfi_cli.mission.record.trace import Trace
-from mavfi_cli.mission.recorder import Recorder
+from mavfi_cli.mission.record.tables import Trace
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import Stack
@@ -77,8 +76,7 @@ class Flight:
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
         self.injection = NoInjection()
-        self._logger = FlightLogger(watcher)
-        self.log = self._logger.log
+        self.logger = FlightLogger(watcher)
         self.trace = Trace()
         self.wall = WallClock()
         self.stamp_s = 0.0
@@ -209,7 +207,7 @@ class Flight:
             return
         self.outcome, self.reason, self.end_s = outcome, reason, self.stamp_s
         text = outcome.value.replace("_", " ") + (f": {reason}" if reason else "")
-        self._note("outcome", text)
+        self.logger.note(self.stamp_s, "outcome", text, self._session.state)
 
     def explain(self, why: str) -> None:
         """Add the failure of the vehicle's process to the reason of a lost link."""
@@ -291,7 +289,7 @@ class Flight:
         if not self._camera_asked and self._nearly_up(state):
             self._camera_asked = True
             self._session.camera.start(1.0 / self._config.camera_rate_hz)
-        self._logger.tell(stamp_s, self._session, companion, self.injection)
+        self.logger.tell(stamp_s, self._session, companion, self.injection)
         return True
 
     def _take_clock(self, stamp_s: float) -> None:
@@ -370,9 +368,6 @@ class Flight:
         elif self.stamp_s - self.takeover_s >= self._config.time_limit_s:
             self.end(Outcome.TIMEOUT, f"{self._config.time_limit_s:g} s")
 
-    def _note(self, kind: str, text: str) -> None:
-        self._logger.note(self.stamp_s, kind, text, self._session.state)
-
     # Record ---------------------------------------------------------------------------------------
 
     @property
@@ -385,8 +380,8 @@ class Flight:
         """Distance from the goal that counts as reached, m: the mission's own, or the stack's."""
         return self._stack.goal_tolerance_m
 
-    def own_quality(self) -> quality.QualityOfFlight:
+    def own_quality(self) -> dict[str, float | None]:
         """Return the part of the quality of flight that the companion can compute."""
         if self.goal_enu_m is None:
-            return quality.QualityOfFlight()
+            return dict.fromkeys(quality.QUALITY)
         return quality.from_states(*self.trace.motion(), self.goal_enu_m)

@@ -9,8 +9,7 @@ import numpy as np
 from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
-from mavfi_cli.mission.progress import FlightProgress, Watcher
-from mavfi_cli.mission.record.events import EventLog
+from mavfi_cli.mission.progress import Event, FlightProgress, Watcher
 
 if TYPE_CHECKING:
     from mavfi_cli.companion.injection import NoInjection
@@ -23,11 +22,11 @@ class FlightLogger:
     """Finds events by comparing each tick with the last.
 
     Attributes:
-        log: All events so far.
+        events: All events so far.
     """
 
     def __init__(self, watcher: Watcher) -> None:
-        self.log = EventLog(watcher)
+        self.events: list[Event] = []
         self._watcher = watcher
         self._phase: Phase | None = None
         self._mode: PilotMode | None = None
@@ -37,8 +36,13 @@ class FlightLogger:
 
     def note(self, stamp_s: float, kind: str, text: str, state: VehicleState | None) -> None:
         """Log an event at the vehicle's position."""
-        place = None if state is None else tuple(round(float(c), 3) for c in state.position_enu_m)
-        self.log.add(round(stamp_s, 3), kind, text, place)  # type: ignore[arg-type]
+        place = None
+        if state is not None:
+            x, y, z = (round(float(c), 3) for c in state.position_enu_m)
+            place = (x, y, z)
+        event = Event(stamp_s=round(stamp_s, 3), kind=kind, text=text, position_enu_m=place)
+        self.events.append(event)
+        self._watcher.on_event(event)
 
     def tell(
         self,

@@ -21,8 +21,8 @@ from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.mission.record.measures import record_of
-from mavfi_cli.mission.recorder import Recorder
 from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.mission import MissionConfig
 

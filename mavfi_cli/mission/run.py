@@ -11,8 +11,8 @@ import platform as host_platform
 import resource
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +20,21 @@ import numpy as np
 
 from mavfi_cli.autonomy import is_compiled, planners, warm_up
 from mavfi_cli.companion.injection import NoInjection
+from mavfi_cli.companion.pipeline import Companion, Reaction
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
-from mavfi_cli.core.files import file_digest
+from mavfi_cli.core.files import file_digest, write_parquet
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.core.versions import installed_versions
+from mavfi_cli.link.images import ImageReceiver
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.flight import Flight
-from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.measures import record_of
-from mavfi_cli.mission.record.plan_file import write_plans
 from mavfi_cli.mission.record.run_folder import CRASH, RunFolder, new_run_folder, stem_of
-from mavfi_cli.mission.record.statistics import mission_statistics, plan_lines
-from mavfi_cli.mission.record.timetable import response_times, timetable_of, write_timetable
-from mavfi_cli.mission.record.trace import write_trace
-from mavfi_cli.mission.recorder import Recorder
-from mavfi_cli.mission.vehicle import OtherEnd, StartVehicle, other_end, start_vehicle
+from mavfi_cli.mission.record.tables import Timetable, write_plans, write_timetable
+from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end, start_vehicle
 from mavfi_cli.spec.mission import MissionConfig, stack_of
 from mavfi_cli.spec.platform import load_platform
 
@@ -58,9 +56,7 @@ def fly_mission(
     Every end of the flight, including a crash of the companion, is a result and is recorded.
 
     Args:
-        config: the mission.
         out: where the run folder goes.
-        watcher: gets progress and events.
         recorder: keeps what the flight asks of its nodes.
         repeat: the record of an instruction-level fault to repeat, instead of drawing one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
@@ -73,16 +69,18 @@ def fly_mission(
     platform, stack = load_platform(config.platform), stack_of(config)
     planner = planners.find(config.planner)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
-    _warm_up(watcher)  # first: else a link is full of stale messages by then
+    if not is_compiled():  # first: else a link is full of stale messages by then
+        watcher.on_note(COMPILING)
+    warm_up()
     with (
         _injection(config, out, repeat, for_debugger, launch) as injection,
         interruptible() as interrupt,
-        other_end(config, launch) as end,
+        other_end(config, launch) as (link, vehicle),
     ):
-        flight = Flight(config, stack, end.link, platform, planner, watcher, interrupt)
+        flight = Flight(config, stack, link, platform, planner, watcher, interrupt)
         if injection is not None:
             flight.injection = injection
-        _begin(flight, config, end, recorder)
+        _begin(flight, config, vehicle, recorder)
         name = stem_of(config.world) if config.link is None else "link"
         folder = new_run_folder(out, f"{name}-{config.seed}")
         flight.injection.begin(folder.fault)
@@ -90,60 +88,63 @@ def fly_mission(
         with flight.isolated_nodes():
             crash = _fly(flight, folder.tlog)
         flight_wall_s = time.perf_counter() - flight_begun_s
-        if failure := end.failure():
+        if vehicle is not None and (failure := vehicle.end()):
             flight.explain(str(failure))
-        truth, referee = _read_truth(end.truth_folder)
         host = {
             "started": started.isoformat(timespec="seconds"),
             "startup_s": round(flight_begun_s - begun_s, 3),
             "flight_wall_s": round(flight_wall_s, 3),
-            **_host(config, flight, end.truth_folder),
+            **_host(config, flight, vehicle),
         }
-        _write(config, flight, folder, host, truth, referee, crash)
+        _write(config, flight, folder, host, *_read_truth(vehicle), crash)
     return folder
 
 
-def _warm_up(watcher: Watcher) -> None:
-    if not is_compiled():
-        watcher.on_note(COMPILING)
-    warm_up()
-
-
-def _begin(flight: Flight, config: MissionConfig, end: OtherEnd, recorder: Recorder | None) -> None:
-    """Up to the first heartbeat, and what the mission is told before it flies.
+def _begin(
+    flight: Flight, config: MissionConfig, vehicle: Vehicle | None, recorder: Recorder | None
+) -> None:
+    """Connect and brief the flight.
 
     Raises:
         MavfiError: why it cannot fly; the vehicle's own reason where it has one.
     """
     try:
-        if end.truth_folder is None:  # before connecting: then the vehicle's clock runs
+        if vehicle is None:  # before connecting: then the vehicle's clock runs
             flight.brief(briefing.of_config(config))
         flight.connect()
-        if end.truth_folder is not None:
-            flight.brief(briefing.of_simulation(end.truth_folder))
+        if vehicle is not None:
+            flight.brief(briefing.of_simulation(vehicle.folder))
         if recorder is not None:
             flight.record(recorder)
     except MavfiError:
-        if failure := end.failure():
+        if vehicle is not None and (failure := vehicle.end()):
             raise failure from None
         raise
 
 
-def _host(config: MissionConfig, flight: Flight, truth_folder: Path | None) -> dict[str, Any]:
-    """What this machine had to do for it: no part of what repeats."""
+def _host(config: MissionConfig, flight: Flight, vehicle: Vehicle | None) -> dict[str, Any]:
+    """Return what this machine did for the flight, which no repetition repeats."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    vehicle = _vehicle_host(truth_folder)
+    told = _left_behind(vehicle, "host.json") or {}
     return {
         "machine": host_platform.machine(),
         "cores": os.cpu_count(),
         "isolated": list(config.isolate),
         "memory_mb": {
             "companion": round(own_mb, 1),
-            "vehicle": round(vehicle.get("memory_mb", 0.0), 1),
+            "vehicle": round(told.get("memory_mb", 0.0), 1),
         },
         "stage_wall_s": _rounded(flight.wall.totals),
-        "vehicle_stage_wall_s": _rounded(vehicle.get("stage_wall_s", {})),
+        "vehicle_stage_wall_s": _rounded(told.get("stage_wall_s", {})),
     }
+
+
+def _left_behind(vehicle: Vehicle | None, name: str) -> dict[str, Any] | None:
+    """Read a JSON file that the vehicle has left; None if it has not."""
+    if vehicle is None or not (vehicle.folder / name).is_file():
+        return None
+    told: dict[str, Any] = json.loads((vehicle.folder / name).read_text())
+    return told
 
 
 @contextlib.contextmanager
@@ -212,21 +213,13 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
     return None
 
 
-def _read_truth(folder: Path | None) -> tuple[quality.Truth | None, dict[str, Any] | None]:
+def _read_truth(vehicle: Vehicle | None) -> tuple[quality.Truth | None, dict[str, Any] | None]:
     """Read the referee's log and report; None for a foreign autopilot or a dead vehicle."""
-    if folder is None or not (folder / "truth.json").is_file():
+    report = _left_behind(vehicle, "truth.json")
+    if vehicle is None or report is None:
         return None, None
-    with np.load(folder / "truth.npz") as data:
-        truth = {name: data[name] for name in data.files}
-    return truth, json.loads((folder / "truth.json").read_text())
-
-
-def _vehicle_host(folder: Path | None) -> dict[str, Any]:
-    """Read the statistics of the vehicle's process: stages, s, and memory, MB."""
-    if folder is None or not (folder / "host.json").is_file():
-        return {}
-    told: dict[str, Any] = json.loads((folder / "host.json").read_text())
-    return told
+    with np.load(vehicle.folder / "truth.npz") as data:
+        return {name: data[name] for name in data.files}, report
 
 
 def _rounded(stages: Mapping[str, float]) -> dict[str, float]:
@@ -256,12 +249,15 @@ def _write(
         "config": replace(config, goal_tolerance_m=flight.goal_tolerance_m).to_dict(),
         "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
         "simulated_s": flight.end_s,
-        "quality_of_flight": qof.to_dict(),
-        **mission_statistics(companion, flight.images),
+        "quality_of_flight": qof,
+        **_statistics(companion, flight.images),
         "measured_platform": companion.measured if companion else None,
         "response_time_s": response_times(companion.reactions if companion else []),
-        "events": flight.log.to_list(),
-        "plans": plan_lines(companion),
+        "events": [asdict(event) for event in flight.logger.events],
+        "plans": [
+            {"stamp_s": plan.stamp_s, "points_enu_m": np.round(plan.waypoints[:, 0:3], 3).tolist()}
+            for plan in (companion.plans if companion else [])
+        ],
         "fault": flight.injection.finish(),
         "detection": companion.protection.summary() if companion else None,
         "goal_enu_m": None if goal is None else goal.tolist(),
@@ -271,10 +267,58 @@ def _write(
         "host": host,
         **({"files": {name: file_digest(name) for name in config.files}} if config.files else {}),
     }
-    write_trace(folder.trace, flight.trace.table(truth))
+    write_parquet(folder.trace, flight.trace.table(truth))
     write_plans(folder.plans, companion.plans if companion else [])
-    write_timetable(folder.kernels, timetable_of(companion))
-    told = [loss.traceback for loss in companion.executor.losses] if companion else []
-    if errors := [text for text in (*told, crash) if text]:
+    timetable, told = Timetable(), [crash]
+    if companion is not None:
+        ran = companion.executor.timetable
+        timetable = Timetable(invocations=ran, reactions=companion.reactions)
+        told = [*(loss.traceback for loss in companion.executor.losses), crash]
+    write_timetable(folder.kernels, timetable)
+    if errors := [text for text in told if text]:
         (folder.path / CRASH).write_text("\n".join(errors))
     folder.write_result(result)
+
+
+def _statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:
+    """Return the counters of pilot, kernels, nodes and camera link; empty without a flight."""
+    if companion is None:
+        return {"pilot": None, "kernels": {}, "nodes": {}, "images": {}}
+    nodes = companion.executor.nodes
+    return {
+        "pilot": asdict(companion.pilot.counters),
+        "kernels": {
+            name: {
+                "invocations": node.invocations,
+                "dropped_inputs": node.dropped,
+                "busy_s": round(node.busy_s, 9),
+            }
+            for name, node in nodes.items()
+        },
+        "nodes": {
+            name: {
+                "crashes": [
+                    {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}
+                    for loss in node.losses
+                    if not loss.hung
+                ],
+                "hangs": sum(loss.hung for loss in node.losses),
+                "restarts": node.restarts,
+            }
+            for name, node in nodes.items()
+        },
+        "images": {"received": images.received, "lost": images.lost},
+    }
+
+
+def response_times(reactions: Sequence[Reaction]) -> dict[str, float | None]:
+    """Return median and 95th percentile of the response time, s."""
+    times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])
+    times = times[np.isfinite(times)]
+    if not len(times):
+        return {"median": None, "p95": None, "count": 0}
+    return {
+        "median": round(float(np.median(times)), 9),
+        "p95": round(float(np.percentile(times, 95.0)), 9),
+        "count": len(times),
+    }

@@ -15,45 +15,35 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.spec.mission import MissionConfig
 
 
-class Vehicle(Protocol):
-    """A simulated vehicle that flies."""
-
-    @property
-    def link(self) -> Transport:
-        """The companion's end of the link."""
-
-    def end(self) -> VehicleProcessError | None:
-        """Close the link and wait until the truth is saved; why the vehicle ended before that."""
-
-
 class VehicleInProcess:
     """The vehicle in this process; it flies while the companion waits for it.
 
     Args:
-        config: the mission.
-        truth_folder: where the vehicle leaves briefing and truth.
+        folder: where the vehicle leaves briefing and truth.
+
+    Attributes:
+        link: the companion's end of the link.
 
     Raises:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
     """
 
-    def __init__(self, config: MissionConfig, truth_folder: Path) -> None:
+    def __init__(self, config: MissionConfig, folder: Path) -> None:
         from sitl.server.main import embedded
 
-        self._vehicle = embedded(_arguments(config), truth_folder)
+        self.folder = folder
+        self._vehicle = embedded(_arguments(config), folder)
         self.link: Transport = self._vehicle.link
 
     def end(self) -> VehicleProcessError | None:
-        """See `Vehicle`.
+        """Close the link and save the truth; return why the vehicle ended before that, if it did.
 
         Raises:
             RecordError: the truth cannot be saved.
@@ -76,20 +66,17 @@ def warm_up() -> None:
 
 
 class VehicleProcess:
-    """`python -m sitl` in lockstep. Closing the socket ends it and saves the referee's truth.
-
-    Args:
-        config: the mission.
-        truth_folder: where the vehicle leaves briefing and truth.
+    """`python -m sitl` in lockstep, as `VehicleInProcess`. Closing the socket ends it.
 
     Raises:
         VehicleProcessError: it cannot be started.
     """
 
-    def __init__(self, config: MissionConfig, truth_folder: Path) -> None:
+    def __init__(self, config: MissionConfig, folder: Path) -> None:
+        self.folder = folder
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        line = [sys.executable, "-m", "sitl", *_arguments(config), "--truth", str(truth_folder)]
+        line = [sys.executable, "-m", "sitl", *_arguments(config), "--truth", str(folder)]
         line += ["--lockstep", "--fd", str(theirs.fileno())]
         if config.realtime:
             line += ["--speed", "1"]
@@ -110,7 +97,7 @@ class VehicleProcess:
         self.link: Transport = open_transport(f"fd:{ours.detach()}")
 
     def end(self, timeout_s: float = 20.0) -> VehicleProcessError | None:
-        """See `Vehicle`; a vehicle that does not end is killed."""
+        """See `VehicleInProcess`; a vehicle that does not end is killed."""
         self.link.close()
         try:
             self._process.wait(timeout_s)
@@ -137,7 +124,7 @@ class VehicleProcess:
 
 
 def _arguments(config: MissionConfig) -> list[str]:
-    """Of `python -m sitl`, but for the link and the folder of the truth."""
+    """Return the arguments of `python -m sitl`, but for the link and the folder of the truth."""
     line = [
         "--world", config.world, "--seed", str(config.seed_of_world), "--vehicle", config.vehicle,
         "--camera-size", f"{config.camera_columns}x{config.camera_rows}",
@@ -149,44 +136,23 @@ def _arguments(config: MissionConfig) -> list[str]:
     return line
 
 
-@dataclass(frozen=True, slots=True)
-class OtherEnd:
-    """What is at the other end of the link: a simulated vehicle of our own, or somebody else's.
-
-    Attributes:
-        link: our end.
-        vehicle: ours; None: somebody else's.
-        truth_folder: where our vehicle leaves briefing and truth.
-    """
-
-    link: Transport
-    vehicle: Vehicle | None = None
-    truth_folder: Path | None = None
-
-    def failure(self) -> MavfiError | None:
-        """End the vehicle; why it ended before that.
-
-        Raises:
-            RecordError: it cannot save its truth.
-        """
-        return None if self.vehicle is None else self.vehicle.end()
-
-
+Vehicle = VehicleInProcess | VehicleProcess
 StartVehicle = Callable[[MissionConfig, Path], Vehicle]
 
 
-def start_vehicle(config: MissionConfig, truth_folder: Path) -> Vehicle:
-    """In this process, but by the wall clock, where companion and vehicle compute side by side."""
+def start_vehicle(config: MissionConfig, folder: Path) -> Vehicle:
+    """Start the vehicle in this process, or beside it where both run by the wall clock."""
     start = VehicleProcess if config.realtime else VehicleInProcess
-    return start(config, truth_folder)
+    return start(config, folder)
 
 
 @contextlib.contextmanager
-def other_end(config: MissionConfig, launch: StartVehicle = start_vehicle) -> Iterator[OtherEnd]:
-    """A foreign autopilot where the mission names one, else a simulated vehicle that starts.
+def other_end(
+    config: MissionConfig, launch: StartVehicle = start_vehicle
+) -> Iterator[tuple[Transport, Vehicle | None]]:
+    """Connect to a mission's foreign autopilot, or else to a simulated vehicle that starts.
 
     Args:
-        config: the mission.
         launch: starts the simulated vehicle.
 
     Raises:
@@ -194,11 +160,11 @@ def other_end(config: MissionConfig, launch: StartVehicle = start_vehicle) -> It
     """
     if config.link is not None:
         with contextlib.closing(open_transport(config.link)) as link:
-            yield OtherEnd(link)
+            yield link, None
         return
     folder = Path(tempfile.mkdtemp(prefix="mavfi-"))
     with contextlib.ExitStack() as leaving:
         leaving.callback(shutil.rmtree, folder, ignore_errors=True)
         vehicle = launch(config, folder)
         leaving.callback(vehicle.end)
-        yield OtherEnd(vehicle.link, vehicle, folder)
+        yield vehicle.link, vehicle

@@ -22,8 +22,8 @@ from mavfi_cli.detect.fit import KINDS, check, fit
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import columns_of, flight_of
 from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.mission.record.plan_file import read_plans
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.record.tables import read_plans
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import load_stack
 

@@ -7,7 +7,7 @@ from mavfi_cli.companion.executor import Invocation
 from mavfi_cli.companion.pipeline import Reaction
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.record.timetable import Timetable, read_timetable, write_timetable
+from mavfi_cli.mission.record.tables import Timetable, read_timetable, write_timetable
 
 
 def ran(node, start_s, end_s):

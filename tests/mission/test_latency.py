@@ -8,7 +8,7 @@ import pytest
 from missions import SOUND_PLATFORM
 
 from mavfi_cli.companion.latency import LatencyModel
-from mavfi_cli.mission.record.timetable import read_timetable
+from mavfi_cli.mission.record.tables import read_timetable
 from mavfi_cli.spec.platform import KERNELS, load_platform
 
 

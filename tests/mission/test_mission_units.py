@@ -11,14 +11,21 @@ from hypothesis import strategies as st
 
 from mavfi_cli.companion.pipeline import Reaction
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName, VehicleProcessError
-from mavfi_cli.core.files import plain, write_atomically, write_json, write_text
+from mavfi_cli.core.files import (
+    plain,
+    read_parquet,
+    write_atomically,
+    write_json,
+    write_parquet,
+    write_text,
+)
 from mavfi_cli.core.states import STATES
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory, VehicleState
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.run_folder import load_run, new_run_folder
-from mavfi_cli.mission.record.timetable import response_times
-from mavfi_cli.mission.record.trace import Trace, read_trace, write_trace
+from mavfi_cli.mission.record.tables import Trace
+from mavfi_cli.mission.run import response_times
 from mavfi_cli.spec.mission import ISOLATABLE, MissionConfig
 
 # Configuration -------------------------------------------------------------------------------
@@ -177,10 +184,10 @@ TRUTH = {
 
 def test_a_trace_comes_back_from_its_file(tmp_path):
     table = a_trace().table(TRUTH)
-    write_trace(tmp_path / "trace.parquet", table)
-    assert read_trace(tmp_path / "trace.parquet").equals(table)
+    write_parquet(tmp_path / "trace.parquet", table)
+    assert read_parquet(tmp_path / "trace.parquet", "trace").equals(table)
     first = (tmp_path / "trace.parquet").read_bytes()
-    write_trace(tmp_path / "again.parquet", a_trace().table(TRUTH))
+    write_parquet(tmp_path / "again.parquet", a_trace().table(TRUTH))
     assert (tmp_path / "again.parquet").read_bytes() == first
 
 
@@ -207,8 +214,8 @@ def test_truth_is_joined_by_stamp_and_null_where_there_is_none():
 
 
 def test_a_trace_of_nothing_is_a_table_all_the_same(tmp_path):
-    write_trace(tmp_path / "trace.parquet", Trace().table(TRUTH))
-    assert read_trace(tmp_path / "trace.parquet").num_rows == 0
+    write_parquet(tmp_path / "trace.parquet", Trace().table(TRUTH))
+    assert read_parquet(tmp_path / "trace.parquet", "trace").num_rows == 0
 
 
 # Quality of flight ---------------------------------------------------------------------------
@@ -232,26 +239,26 @@ def circle(count=2001, radius_m=3.0, time_s=10.0):
 
 def test_quality_of_a_circle_against_its_closed_form():
     found = quality.from_truth(circle(), 0.0, 99.0, np.array([3.0, 4.0, 0.0]))
-    assert found.flight_time_s == pytest.approx(10.0)
-    assert found.distance_m == pytest.approx(math.tau * 3.0, rel=1e-5)
-    assert found.mean_speed_mps == pytest.approx(0.6 * math.pi, rel=1e-5)
-    assert found.max_speed_mps == pytest.approx(0.6 * math.pi)
-    assert found.min_clearance_m == pytest.approx(1.0, abs=1e-5)
-    assert found.goal_distance_m == pytest.approx(4.0)
-    assert found.energy_regression_j == pytest.approx(100.0)
-    assert found.energy_propeller_j == pytest.approx(70.0)
+    assert found["flight_time_s"] == pytest.approx(10.0)
+    assert found["distance_m"] == pytest.approx(math.tau * 3.0, rel=1e-5)
+    assert found["mean_speed_mps"] == pytest.approx(0.6 * math.pi, rel=1e-5)
+    assert found["max_speed_mps"] == pytest.approx(0.6 * math.pi)
+    assert found["min_clearance_m"] == pytest.approx(1.0, abs=1e-5)
+    assert found["goal_distance_m"] == pytest.approx(4.0)
+    assert found["energy_regression_j"] == pytest.approx(100.0)
+    assert found["energy_propeller_j"] == pytest.approx(70.0)
 
 
 def test_only_the_flight_itself_counts():
     half = quality.from_truth(circle(), 5.0, 10.0, np.zeros(3))
-    assert half.flight_time_s == pytest.approx(5.0)
-    assert half.distance_m == pytest.approx(math.pi * 3.0, rel=1e-5)
-    assert half.energy_regression_j == pytest.approx(25.0)
+    assert half["flight_time_s"] == pytest.approx(5.0)
+    assert half["distance_m"] == pytest.approx(math.pi * 3.0, rel=1e-5)
+    assert half["energy_regression_j"] == pytest.approx(25.0)
 
 
 @pytest.mark.parametrize("window", [(math.inf, 12.0), (99.0, 100.0), (7.0, 7.0)])
 def test_a_flight_that_never_was_has_no_quality(window):
-    assert quality.from_truth(circle(), *window, np.zeros(3)) == quality.QualityOfFlight()
+    assert quality.from_truth(circle(), *window, np.zeros(3)) == dict.fromkeys(quality.QUALITY)
 
 
 def test_what_the_companion_knows_by_itself():
@@ -261,7 +268,7 @@ def test_what_the_companion_knows_by_itself():
     )
     true = quality.from_truth(data, 0.0, 99.0, np.zeros(3))
     unknown = dict.fromkeys(("min_clearance_m", "energy_regression_j", "energy_propeller_j"))
-    assert found.to_dict() == {**true.to_dict(), **unknown}
+    assert found == {**true, **unknown}
 
 
 def test_a_world_without_boxes_has_no_clearance():

@@ -8,8 +8,8 @@ import pytest
 from missions import RECORD
 
 from mavfi_cli.core.states import STATES
-from mavfi_cli.mission.record.plan_file import read_plans
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.record.tables import read_plans
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
-from mavfi_cli.mission.recorder import Recorder
+from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 

@@ -14,12 +14,9 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from mavfi_cli.fi import bits
+from mavfi_cli.mission.record.quality import QUALITY
 
 Record = Mapping[str, Any]
-QUALITY = (
-    "flight_time_s", "distance_m", "mean_speed_mps", "max_speed_mps", "min_clearance_m",
-    "goal_distance_m", "energy_regression_j", "energy_propeller_j",
-)  # fmt: skip
 _PLACES = {
     **{name: ("quality_of_flight", name) for name in QUALITY},
     "replans": ("pilot", "replans"),

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.files import write_json
+from mavfi_cli.core.files import read_parquet, write_json
 from mavfi_cli.mission.record.measures import FlightRecord, record_of
-from mavfi_cli.mission.record.trace import read_trace
 from mavfi_cli.spec.stack import FIRST
 
 if TYPE_CHECKING:
@@ -134,7 +133,7 @@ def load_run(path: str | Path) -> Run:
         raise RecordError(f"{folder.path}: no {RESULT} ({hint})")
     try:
         result = json.loads(folder.result.read_text())
-        trace = read_trace(folder.trace) if folder.trace.is_file() else None
+        trace = read_parquet(folder.trace, "trace") if folder.trace.is_file() else None
     except (OSError, ValueError) as error:
         raise RecordError(f"{folder.path}: damaged ({error})") from None
     if not isinstance(result, dict) or result.get("schema") != 1:

@@ -1,15 +1,26 @@
-"""Trace of a mission: one row per control tick, written as Parquet."""
+"""The tables of a mission, as Parquet: trace, plans, and the timetable of the kernels."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mavfi_cli.core.files import write_atomically
+from mavfi_cli.companion.executor import Invocation
+from mavfi_cli.companion.pipeline import Reaction
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import read_parquet, write_parquet
 from mavfi_cli.core.states import BY_NAME, STATES, DType, Message, State
-from mavfi_cli.core.types import CollisionReport, Command, Trajectory, VehicleState
+from mavfi_cli.core.types import (
+    WAYPOINT_FIELDS,
+    CollisionReport,
+    Command,
+    Trajectory,
+    VehicleState,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -122,15 +133,108 @@ class Trace:
         return columns
 
 
-def write_trace(path: Path, table: pa.Table) -> None:
-    """Write the trace as zstd-compressed Parquet, atomically. Equal tables give equal bytes."""
-    import pyarrow.parquet as pq
+# Plans: one row per waypoint ----------------------------------------------------------------------
 
-    write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
+_PLAN = {"stamp_s": np.float64, "trajectory_seq": np.int32, "future_collision_seq": np.int32}
 
 
-def read_trace(path: Path) -> pa.Table:
-    """Read a trace."""
-    import pyarrow.parquet as pq
+def write_plans(path: Path, plans: Sequence[Trajectory]) -> None:
+    """Write all plans of a mission, as received by the mission logic."""
+    import pyarrow as pa
 
-    return pq.read_table(path)
+    lengths = [len(plan.waypoints) for plan in plans]
+    columns: dict[str, pa.Array] = {
+        "plan": np.repeat(np.arange(len(plans), dtype=np.int32), lengths)
+    }
+    for name, kind in _PLAN.items():
+        columns[name] = np.repeat(np.array([getattr(plan, name) for plan in plans], kind), lengths)
+    waypoints = [plan.waypoints for plan in plans] or [np.zeros((0, len(WAYPOINT_FIELDS)))]
+    for place, name in enumerate(WAYPOINT_FIELDS):
+        columns[name] = np.concatenate([each[:, place] for each in waypoints])
+    columns["duration_s"] = np.concatenate([plan.durations_s for plan in plans] or [np.zeros(0)])
+    write_parquet(path, pa.table(columns))
+
+
+def read_plans(path: Path) -> list[Trajectory]:
+    """Read plans. The file does not contain plans without waypoints.
+
+    Raises:
+        RecordError: The file is missing, damaged, or of another format.
+    """
+    columns = _columns(path, "plans", ("plan", *_PLAN, *WAYPOINT_FIELDS, "duration_s"))
+    plans = []
+    for number in np.unique(columns["plan"]):
+        rows = columns["plan"] == number
+        first = int(np.argmax(rows))
+        plans.append(
+            Trajectory(
+                waypoints=np.column_stack([columns[name][rows] for name in WAYPOINT_FIELDS]),
+                durations_s=columns["duration_s"][rows],
+                **{name: columns[name][first].item() for name in _PLAN},
+            )
+        )
+    return plans
+
+
+# Timetable: one row per invocation or reaction ----------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timetable:
+    """Timetable of one mission.
+
+    Attributes:
+        invocations: Invocations in the order of their starts. An output takes effect at the end,
+            unless the node died or was killed.
+        reactions: Responses from a depth frame to the first setpoint that depends on it.
+    """
+
+    invocations: Sequence[Invocation] = ()
+    reactions: Sequence[Reaction] = ()
+
+
+_RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's
+
+
+def write_timetable(path: Path, timetable: Timetable) -> None:
+    """Write a timetable with the columns `kernel`, `start_s` and `end_s`."""
+    import pyarrow as pa
+
+    rows = [(each.node, each.start_s, each.end_s) for each in timetable.invocations]
+    rows += [(_RESPONSE, r.frame_stamp_s, r.setpoint_stamp_s) for r in timetable.reactions]
+    kinds = {"kernel": pa.string(), "start_s": pa.float64(), "end_s": pa.float64()}
+    columns = {
+        name: pa.array([row[place] for row in rows], kind)
+        for place, (name, kind) in enumerate(kinds.items())
+    }
+    write_parquet(path, pa.table(columns))
+
+
+def read_timetable(path: Path) -> Timetable:
+    """Read a timetable.
+
+    Raises:
+        RecordError: The file is missing, damaged, or of another format.
+    """
+    columns = _columns(path, "time table", ("kernel", "start_s", "end_s"))
+    rows = list(zip(*(column.tolist() for column in columns.values()), strict=True))
+    return Timetable(
+        invocations=tuple(
+            Invocation(node=kernel, start_s=start_s, end_s=end_s)
+            for kernel, start_s, end_s in rows
+            if kernel != _RESPONSE
+        ),
+        reactions=tuple(
+            Reaction(frame_stamp_s=start_s, setpoint_stamp_s=end_s)
+            for kernel, start_s, end_s in rows
+            if kernel == _RESPONSE
+        ),
+    )
+
+
+def _columns(path: Path, what: str, names: Sequence[str]) -> dict[str, np.ndarray]:
+    table = read_parquet(path, what)
+    try:
+        return {name: table[name].to_numpy() for name in names}
+    except KeyError as error:
+        raise RecordError(f"{path}: no {what} can be read ({error})") from None
