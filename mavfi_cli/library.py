@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.core.errors import MissingLibrary
+from mavfi_cli.core.errors import MavfiError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,12 +79,14 @@ class Campaign:
         """Return the table as a pandas data frame.
 
         Raises:
-            MissingLibrary: pandas is not installed. Says how to install it.
+            MavfiError: pandas is not installed. Says how to install it.
         """
         try:
             import pandas  # noqa: F401  pyarrow's own error does not say what to install
         except ImportError:
-            raise MissingLibrary("to_pandas", "pandas", extra="pandas") from None
+            raise MavfiError(
+                "to_pandas needs pandas; install it with: pip install 'mavfi[pandas]'"
+            ) from None
         return self.table.to_pandas()
 
 

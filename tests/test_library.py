@@ -8,7 +8,7 @@ from pyarrow import parquet
 
 import mavfi_cli as mavfi
 from mavfi_cli import library
-from mavfi_cli.core.errors import ConfigError, MissingLibrary, UnknownKey
+from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownKey
 
 HEAVY = ("numba", "numpy", "torch", "pyarrow", "ompl", "fcl", "pymavlink", "click")
 
@@ -99,5 +99,5 @@ def test_a_campaign_becomes_a_data_frame(flown_campaign):
 def test_without_pandas_one_line_says_what_to_install(flown_campaign, monkeypatch):
     read = mavfi.campaign(flown_campaign)  # pyarrow looks for pandas with its first table only
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(MissingLibrary, match=r"pip install 'mavfi\[pandas\]'"):
+    with pytest.raises(MavfiError, match=r"pip install 'mavfi\[pandas\]'"):
         read.to_pandas()

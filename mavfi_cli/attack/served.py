@@ -90,7 +90,7 @@ class ServedProcess:
             send(self.connection, message)
             answer: tuple[Any, int] = receive(self.connection)
         except (OSError, EOFError):
-            raise TargetError(name, f"does not load: {self.last_words()}") from None
+            raise TargetError(name, f"does not start: {self.last_words()}") from None
         return answer
 
     def last_words(self) -> str:

@@ -28,7 +28,7 @@ MAX_VOXELS = 60_000_000  # limits the memory for a corrupted map or bound
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObstacleGrid:
-    """Blocked voxels in a box around the obstacles. Outside the box, `bounds_enu_m` is free."""
+    """Blocked voxels in a box around the obstacles. The rest of `bounds_enu_m` is free."""
 
     blocked: Blocked  # (nx, ny, nz), 1 if the vehicle's centre must not be there
     origin_enu_m: FloatArray  # (3,) lower corner of voxel (0, 0, 0)

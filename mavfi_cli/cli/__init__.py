@@ -14,8 +14,8 @@ from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
 # name -> (module, what it does); the help page must not import the modules
 _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
-    "sitl": ("mavfi_cli.cli.sitl", "Run the simulated vehicle alone, for any MAVLink client."),
-    "world": ("mavfi_cli.cli.world", "List, make, check and draw worlds."),
+    "sitl": ("mavfi_cli.cli.delegate", "Run the simulated vehicle alone, for any MAVLink client."),
+    "world": ("mavfi_cli.cli.delegate", "List, make, check and draw worlds."),
     "replay": ("mavfi_cli.cli.replay", "Repeat a run and compare the records."),
     "kernels": ("mavfi_cli.cli.kernels", "Flip bits in isolated kernels, one fault per run."),
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),

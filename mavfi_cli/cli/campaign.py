@@ -68,7 +68,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.campaigns.begin import begin, chosen
     from mavfi_cli.campaigns.run import Options, fly_missing
     from mavfi_cli.campaigns.specification import Keep
-    from mavfi_cli.cli.missions_view import missions_view
+    from mavfi_cli.cli.progress import missions_view
 
     spec, folder = chosen(what, options["out"], options["scale"], options["changes"])
     flying = Options(

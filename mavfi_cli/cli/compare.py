@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, names_in
 
 _missions = partial(click.option, cls=GroupedOption, group="Missions")
 _settings = partial(click.option, cls=GroupedOption, group="Faults and detectors")
@@ -52,7 +52,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     interrupted comparison. Writes compare.json, compare.csv, compare.svg and timeline.svg.
     """
     from mavfi_cli.campaigns.run import Options
-    from mavfi_cli.cli.missions_view import missions_view
+    from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
     from mavfi_cli.report.compare_plot import draw_compare_plot
     from mavfi_cli.report.drawing import write_svg
@@ -87,14 +87,10 @@ def _plan(options: dict[str, Any]) -> Any:
     if options["platforms"]:
         chosen["platforms"] = options["platforms"]
     if options["inject"] is not None:
-        targets = _names(options["inject"])
+        targets = names_in(options["inject"])
         if not targets:
             raise ConfigError("name at least one, or none", key="inject")
         chosen["inject"] = () if targets == ("none",) else targets
     if options["detectors"] is not None:
-        chosen["detectors"] = _names(options["detectors"])
+        chosen["detectors"] = names_in(options["detectors"])
     return ComparePlan(**chosen)
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, names_in
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -87,7 +87,7 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     to those in the folder. Writes evaluation.json, evaluation.csv, roc.svg and recovery.svg.
     """
     from mavfi_cli.campaigns.run import Options
-    from mavfi_cli.cli.missions_view import missions_view
+    from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
     from mavfi_cli.report.detector_plots import draw_recovery_plot, draw_roc_plot
     from mavfi_cli.report.drawing import write_svg
@@ -120,18 +120,14 @@ def _plan(options: dict[str, Any]) -> Any:
     named = options["detectors"]
     return EvaluationPlan(
         worlds=options["worlds"] or WORLDS,
-        detectors=DETECTORS if named is None else _names(named),
+        detectors=DETECTORS if named is None else names_in(named),
         flights=options["flights"],
         golden_flights=max(options["golden_flights"], options["flights"]),
         first_seed=options["first_seed"],
-        protect=_names(options["protect"]),
+        protect=names_in(options["protect"]),
         models=options["models"],
         level=options["level"],
-        fields=_names(options["fields"]),
+        fields=names_in(options["fields"]),
         seed=options["seed"],
         base=MissionConfig(**base),
     )
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())

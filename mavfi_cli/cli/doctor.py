@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
+from dataclasses import asdict
 
 import click
 
@@ -20,13 +21,13 @@ def doctor(as_json: bool) -> None:
 
     Exits with code 1 if mavfi cannot fly here. Limitations do not count.
     """
-    from mavfi_cli.mission.machine import CheckResult, check_machine
+    from mavfi_cli.mission.machine import FAILED, check_machine
 
     checks = []
     for check in check_machine():
         checks.append(check)
         if not as_json:
-            colour, mark = _MARKS[check.verdict.value]
+            colour, mark = _MARKS[check.verdict]
             first, *rest = textwrap.wrap(check.found, WIDTH - _INDENT) or [""]
             click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<20} {first}")
             for line in rest:
@@ -34,6 +35,6 @@ def doctor(as_json: bool) -> None:
             if check.remedy:
                 click.echo(f"{'':<{_INDENT}}-> {check.remedy}")
     if as_json:
-        click.echo(json.dumps([check.to_dict() for check in checks], indent=2))
-    if any(check.verdict is CheckResult.FAILED for check in checks):
+        click.echo(json.dumps([asdict(check) for check in checks], indent=2))
+    if any(check.verdict == FAILED for check in checks):
         raise click.exceptions.Exit(1)

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, spelling
+from mavfi_cli.cli.grouped import (
+    GroupedCommand,
+    GroupedOption,
+    given_options,
+    names_in,
+    refuse_given,
+    spelling,
+)
 from mavfi_cli.core.errors import ConfigError, FaultSpecError
 
 if TYPE_CHECKING:
@@ -51,7 +58,7 @@ class _Stages(click.ParamType[Any]):
         """The names, in the given order."""
         if isinstance(value, tuple):
             return value
-        return tuple(part.strip() for part in str(value).split(",") if part.strip())
+        return names_in(str(value))
 
 
 _mission = partial(click.option, cls=GroupedOption, group="Mission")
@@ -163,7 +170,7 @@ def fly(
     from mavfi_cli import library
     from mavfi_cli.cli.progress import progress_view
     from mavfi_cli.report.drawing import write_svg
-    from mavfi_cli.report.summary import outcome_line, summary_lines
+    from mavfi_cli.report.summary import folder_lines, outcome_line, summary_lines
     from mavfi_cli.report.top_view import draw_top_view
 
     mission = _mission_of(config)
@@ -175,10 +182,8 @@ def fly(
     if as_json:
         click.echo(json.dumps(run.result, indent=2, sort_keys=True))
     else:
-        click.echo("\n".join(summary_lines(run.result)))
-        click.echo(
-            f"\nRun folder  {folder.path}" + (f"  (see {folder.picture.name})" if picture else "")
-        )
+        drawn = folder_lines(run, folder.picture if picture else None)
+        click.echo("\n".join([*summary_lines(run.result), *drawn]))
     if run.record.outcome == "interrupted":
         raise click.exceptions.Exit(130)
     if expect is not None and run.record.outcome != expect:
@@ -246,32 +251,23 @@ def _faults(
     from mavfi_cli.spec.fault import FaultConfig
     from mavfi_cli.spec.instruction import InstructionConfig
 
-    in_file = "source" if base.instruction is None else "instruction"
-    level = given.get("level", in_file)
-    prior = base.fault if level == "source" else base.instruction
-    names = _EITHER | (_SOURCE if level == "source" else _INSTRUCTION)
-    asked = {name: given[name] for name in names & set(given)}
+    source = given.get("level", "source" if base.instruction is None else "instruction") == "source"
+    prior = base.fault if source else base.instruction
     target = given.get("inject", None if prior is None else prior.target)
     if target is None:
-        _refuse(_SOURCE | _EITHER | _INSTRUCTION, given, "--inject")
-        if level == "instruction":
+        refuse_given(_SOURCE | _EITHER | _INSTRUCTION, "needs --inject")
+        if not source:
             raise click.UsageError("--level instruction needs --inject NODE")
         return None, None
-    if level == "source":
-        _refuse(_INSTRUCTION, given, "--level instruction")
-    else:
-        _refuse(_SOURCE, given, "--level source")
+    own, other = (_SOURCE, _INSTRUCTION) if source else (_INSTRUCTION, _SOURCE)
+    refuse_given(other, f"needs --level {'instruction' if source else 'source'}")
+    asked = {name: given[name] for name in (_EITHER | own) & set(given)}
     if "fault_seed" in asked:
         asked["seed"] = asked.pop("fault_seed")
-    if level == "source":
-        fault = replace(base.fault or FaultConfig(target=target), target=target, **asked)
-        fault.check()
-        return fault, None
-    instruction = base.instruction or InstructionConfig(target=target)
-    instruction = replace(instruction, target=target, **asked)
-    instruction.strategy()
-    instruction.node()
-    return None, instruction
+    kind: Any = FaultConfig if source else InstructionConfig
+    fault: Any = replace(prior or kind(target=target), target=target, **asked)
+    fault.check()
+    return (fault, None) if source else (None, fault)
 
 
 def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig | None:
@@ -280,16 +276,9 @@ def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig |
 
     name = given.get("detector", None if base.detector is None else base.detector.name)
     if name is None or name == "none":
-        _refuse(_DETECTOR, given, "--detector NAME")
+        refuse_given(_DETECTOR, "needs --detector NAME")
         return None
     asked = {option: given[option] for option in _DETECTOR & set(given)}
     if base.detector is None or base.detector.name != name:
         return DetectorConfig(name=name, **asked)
     return replace(base.detector, **asked)
-
-
-def _refuse(unused: set[str], given: dict[str, Any], needs: str) -> None:
-    """Reject options that would have no effect."""
-    for name in given:
-        if name in unused:
-            raise click.UsageError(f"{spelling(name)} needs {needs}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import click
@@ -9,11 +10,7 @@ from click.core import ParameterSource
 
 
 class GroupedOption(click.Option):
-    """An option that the help shows in the section of its group.
-
-    Args:
-        group: title of the section.
-    """
+    """An option that the help shows in the section of its group."""
 
     def __init__(self, *args: Any, group: str, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -51,3 +48,15 @@ def spelling(name: str) -> str:
         if param.name == name:
             return param.opts[0]
     return name
+
+
+def refuse_given(names: Collection[str], why: str) -> None:
+    """Reject options that would have no effect: `why` goes after the option."""
+    for name in given_options():
+        if name in names:
+            raise click.UsageError(f"{spelling(name)} {why}")
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """The names in a list that is separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, refuse_given
 from mavfi_cli.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -86,31 +86,19 @@ def kernels(**options: Any) -> None:
     """
     if options["replay"] is not None:
         others = [name for name in options if name not in ("replay", "kernel", "runs")]
-        _refuse(others, "goes without --replay: a record says how it was drawn")
-        limit = options["runs"] if _given("runs") else 0
+        refuse_given(others, "goes without --replay: a record says how it was drawn")
+        limit = given_options().get("runs", 0)
         if not _replay_folder(options["replay"], options["kernel"], limit):
             raise click.exceptions.Exit(1)
     elif options["program"] is not None:
-        _refuse(("kernel", "world", "world_seed"), "goes without --program")
+        refuse_given(("kernel", "world", "world_seed"), "goes without --program")
         _attack_program(options)
     else:
-        _refuse(
+        refuse_given(
             ("args", "compare", "ignore_lines", "stdin_file", "scope", "function"),
             "needs --program",
         )
         _attack_kernels(options)
-
-
-def _given(name: str) -> bool:
-    source = click.get_current_context().get_parameter_source(name)
-    return source is click.core.ParameterSource.COMMANDLINE
-
-
-def _refuse(names: Sequence[str], why: str) -> None:
-    """Reject options that would have no effect, with exit code 2."""
-    for option in click.get_current_context().command.params:
-        if option.name in names and _given(option.name):
-            raise click.UsageError(f"{option.opts[0]} {why}")
 
 
 def _plan(options: dict[str, Any]) -> Plan:
@@ -237,6 +225,8 @@ def _tell(summary: dict[str, Any], table: str, files: str, options: dict[str, An
     click.echo(table)
     if options["out"] is not None:
         click.echo(f"\nFiles  {options['out']}: {files}")
+    else:
+        click.echo("\nNothing is saved; --out FOLDER keeps records, tables and plots.")
 
 
 def _replay_folder(folder: Path, kernels: tuple[str, ...], runs: int) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import click
@@ -21,7 +22,7 @@ def platforms(names: tuple[str, ...], as_json: bool) -> None:
 
     profiles = [load_platform(name) for name in names or platform_names()]
     if as_json:
-        click.echo(json.dumps([_plain(profile) for profile in profiles], indent=2))
+        click.echo(json.dumps([asdict(profile) for profile in profiles], indent=2))
     elif names:
         click.echo("\n\n".join(_explained(profile) for profile in profiles))
     else:
@@ -100,9 +101,3 @@ def _measured(profile: Any) -> str:
             "only, neither in campaigns nor with `mavfi replay`.",
         ]
     )
-
-
-def _plain(profile: Any) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(profile)

@@ -1,4 +1,4 @@
-"""Progress of a mission on stderr: a live line on a terminal, plain lines elsewhere."""
+"""Progress on stderr: a live line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.mission.progress import Event, FlightProgress, Watcher
 
 if TYPE_CHECKING:
@@ -16,83 +17,50 @@ if TYPE_CHECKING:
 
     from mavfi_cli.spec.mission import MissionConfig
 
-_PLAIN_EVERY_S = 10.0
+PLAIN_EVERY_S = 10.0
 _TOLD = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")
+_MOST_SETTINGS = 6  # more settings have no rates here; `campaign status` shows all
+_Part = str | tuple[str, str]  # text, or text and its style on a terminal
 
 
-class _Plain(Watcher):
-    """Print a line per event, and one every ten simulated seconds."""
+class _Lines:
+    """Plain lines: notes at once, progress every ten seconds."""
 
-    def __init__(self, title: str) -> None:
-        self._title = title
-        self._next_s = _PLAIN_EVERY_S
+    def __init__(self, first_s: float) -> None:
+        self._next_s, self._last_s = first_s, 0.0
 
-    def on_progress(self, progress: FlightProgress) -> None:
-        """Print a line every ten simulated seconds."""
-        if progress.stamp_s >= self._next_s:
-            self._next_s = progress.stamp_s + _PLAIN_EVERY_S
-            click.echo(_line(progress), err=True)
+    def note(self, *parts: _Part) -> None:
+        click.echo("".join(p if isinstance(p, str) else p[0] for p in parts), err=True)
 
-    def on_note(self, text: str) -> None:
-        """Print a line."""
-        click.echo(text, err=True)
-
-    def on_event(self, event: Event) -> None:
-        """Print a line for events of interest."""
-        if self._title:  # not earlier: a mission that cannot begin prints one line only
-            click.echo(self._title, err=True)
-            self._title = ""
-        if event.kind in _TOLD:
-            click.echo(f"{event.stamp_s:7.2f} s  {event.text}", err=True)
+    def update(self, text: str, at_s: float, *, last: bool = False) -> None:
+        if at_s < self._last_s:  # the next campaign
+            self._next_s = 0.0
+        self._last_s = at_s
+        if at_s >= self._next_s or last:
+            self._next_s = at_s + PLAIN_EVERY_S
+            self.note(text)
 
 
-class _Live(Watcher):
-    """One line that is rewritten, with events scrolling above it."""
+class _LiveLine(_Lines):
+    """One line that is rewritten, with notes scrolling above it."""
 
-    def __init__(self, live: Live, title: str) -> None:
+    def __init__(self, live: Live) -> None:
         self._live = live
-        self._title = title
 
-    def on_progress(self, progress: FlightProgress) -> None:
-        """Rewrite the line."""
-        self._live.update(_line(progress), refresh=True)
-
-    def on_note(self, text: str) -> None:
-        """Print above the line."""
-        from rich.text import Text
-
-        self._live.console.print(Text(text))
-
-    def on_event(self, event: Event) -> None:
-        """Print events of interest above the line."""
+    def note(self, *parts: _Part) -> None:
         from rich.text import Text  # no markup: an autopilot may send any text
 
-        if self._title:
-            self._live.console.print(Text(self._title, "bold"))
-            self._title = ""
-        if event.kind in _TOLD:
-            stamp = (f"{event.stamp_s:7.2f} s", "dim")
-            self._live.console.print(Text.assemble(stamp, "  ", event.text))
+        self._live.console.print(Text.assemble(*parts))
 
-
-def _line(progress: FlightProgress) -> str:
-    goal = "" if progress.goal_distance_m is None else f"{progress.goal_distance_m:5.1f} m to go  "
-    return (
-        f"{progress.stamp_s:7.2f} s  {progress.phase:<12} {goal}"
-        f"{progress.speed_mps:.1f} m/s  replans {progress.replans}"
-    )
+    def update(self, text: str, at_s: float, *, last: bool = False) -> None:
+        self._live.update(text, refresh=True)
 
 
 @contextmanager
-def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
-    """The watcher that suits stderr: none, plain lines, or a live line."""
-    if quiet:
-        yield Watcher()
-        return
-    where = config.link or f"{config.world}, seed {config.seed}"
-    title = f"Flying {config.vehicle} in {where}" if config.link is None else f"Flying {where}"
+def _screen(first_s: float) -> Iterator[_Lines]:
+    """The lines that suit stderr; plain progress begins after `first_s`."""
     if not sys.stderr.isatty():
-        yield _Plain(title)
+        yield _Lines(first_s)
         return
     from rich.console import Console
     from rich.live import Live
@@ -100,4 +68,109 @@ def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
     console = Console(stderr=True)
     # No refresh thread: a mission may fork, and a process that forks must have one thread only.
     with Live("starting", console=console, auto_refresh=False, transient=True) as live:
-        yield _Live(live, title)
+        yield _LiveLine(live)
+
+
+class _FlightView(Watcher):
+    def __init__(self, screen: _Lines, title: str) -> None:
+        self._screen, self._title = screen, title
+
+    def on_progress(self, progress: FlightProgress) -> None:
+        self._screen.update(_flight_line(progress), progress.stamp_s)
+
+    def on_note(self, text: str) -> None:
+        self._screen.note(text)
+
+    def on_event(self, event: Event) -> None:
+        if self._title:  # not earlier: a mission that cannot begin prints one line only
+            self._screen.note((self._title, "bold"))
+            self._title = ""
+        if event.kind in _TOLD:
+            self._screen.note((f"{event.stamp_s:7.2f} s", "dim"), "  ", event.text)
+
+
+class _MissionsView(Spectator):
+    def __init__(self, screen: _Lines) -> None:
+        self._screen = screen
+
+    def on_progress(self, progress: Progress) -> None:
+        last = progress.over == progress.total
+        self._screen.update(progress_line(progress), progress.elapsed_s, last=last)
+
+    def on_end(self, progress: Progress) -> None:
+        if line := _end_line(progress):
+            self._screen.note(line)
+
+    def on_note(self, text: str) -> None:
+        self._screen.note(text)
+
+
+@contextmanager
+def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
+    """The watcher of one mission for stderr."""
+    if quiet:
+        yield Watcher()
+        return
+    where = config.link or f"{config.world}, seed {config.seed}"
+    title = f"Flying {config.vehicle} in {where}" if config.link is None else f"Flying {where}"
+    with _screen(PLAIN_EVERY_S) as screen:
+        yield _FlightView(screen, title)
+
+
+@contextmanager
+def missions_view(*, quiet: bool) -> Iterator[Spectator]:
+    """The spectator of many missions for stderr."""
+    if quiet:
+        yield Spectator()
+        return
+    with _screen(0.0) as screen:
+        yield _MissionsView(screen)
+
+
+def _flight_line(progress: FlightProgress) -> str:
+    goal = "" if progress.goal_distance_m is None else f"{progress.goal_distance_m:5.1f} m to go  "
+    return f"{progress.stamp_s:7.2f} s  {progress.phase:<12} {goal}{progress.speed_mps:.1f} m/s" + (
+        f"  replans {progress.replans}" if progress.replans else ""
+    )
+
+
+def progress_line(progress: Progress) -> str:
+    """One line: missions, rate, remaining time, success rates so far."""
+    parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
+    if progress.eta_s is not None:
+        parts.append(f"{progress.rate_per_h:.0f} an hour")
+        if progress.over < progress.total:
+            parts.append(f"{_duration(progress.eta_s)} to go")
+    if progress.success_rate is not None:
+        parts.append(f"{_percent(progress.success_rate)} % success{_by_setting(progress)}")
+    if progress.again:
+        parts.append(f"{progress.again} begun again")
+    return ", ".join(parts)
+
+
+def _by_setting(progress: Progress) -> str:
+    """The rate of each setting, if there are few."""
+    if not 2 <= len(progress.outcomes) <= _MOST_SETTINGS:
+        return ""
+    rates = [f"{name} {_percent(rate)}" for name, rate in progress.success_rates.items()]
+    return f" ({', '.join(rates)})"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f}"
+
+
+def _end_line(progress: Progress) -> str:
+    """The time that the missions took; empty if none was flown."""
+    flown = progress.over - progress.before
+    if not flown:
+        return ""
+    line = f"{flown} missions in {_duration(progress.elapsed_s)}, {progress.rate_per_h:.0f} an hour"
+    outside = progress.outside
+    return line if outside is None else f"{line}, {100.0 * outside:.1f} % of it outside missions"
+
+
+def _duration(seconds: float) -> str:
+    minutes, left = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{left:02d} h" if hours else f"{minutes}:{left:02d} min"

@@ -27,6 +27,7 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     effect of the fault. An interrupted replay leaves no files.
     """
     from mavfi_cli.core.errors import Interrupted
+    from mavfi_cli.core.files import file_digest
     from mavfi_cli.core.versions import installed_versions, version_differences
     from mavfi_cli.fi.tracer.record import read
     from mavfi_cli.mission.progress import Watcher
@@ -36,7 +37,6 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
         differing_results,
         first_difference,
         interrupted,
-        same_file,
     )
     from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.report.summary import difference_lines, outcome_line
@@ -61,7 +61,9 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
         for section in differing_results(recorded.result, again.result)
         if not (gdb and section in _TELL_ACTIVATION)
     ]
-    identical = same_file(recorded.folder.trace, again.folder.trace) and not differing
+    identical = (
+        file_digest(recorded.folder.trace) == file_digest(again.folder.trace) and not differing
+    )
     parting = first_difference(recorded, again, truth=True)
     if as_json:
         comparison = {

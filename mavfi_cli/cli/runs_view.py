@@ -6,29 +6,17 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import click
 
-from mavfi_cli.cli.missions_view import PLAIN_EVERY_S
-
-
-class RunsView(Protocol):
-    """Progress of the runs, kernel by kernel."""
-
-    def show(self, kernel: str, done: int) -> None:
-        """The kernel has `done` recorded runs; 0: it begins."""
-
-    def stage(self, what: str) -> None:
-        """Name the step before the first run of the current kernel."""
+from mavfi_cli.cli.progress import PLAIN_EVERY_S
 
 
 class PlainRuns:
     """Print a line when a kernel begins, every ten seconds, and at the end.
 
     Args:
-        kernels: the kernels, in the order of attack.
-        runs: number of runs per kernel.
         clock: host time, s.
     """
 
@@ -61,12 +49,7 @@ class PlainRuns:
 
 
 class _LiveRuns:
-    """A bar over all runs that names the kernel, and the step before its first run.
-
-    Args:
-        bar: progress bar of click.
-        kernels, runs: as for `PlainRuns`.
-    """
+    """A bar over all runs that names the kernel, and the step before its first run."""
 
     def __init__(self, bar: Any, kernels: Sequence[str], runs: int) -> None:
         self._bar, self._kernels, self._runs = bar, list(kernels), runs
@@ -86,7 +69,7 @@ class _LiveRuns:
 
 
 @contextmanager
-def runs_view(kernels: Sequence[str], runs: int) -> Iterator[RunsView]:
+def runs_view(kernels: Sequence[str], runs: int) -> Iterator[PlainRuns | _LiveRuns]:
     """The view for stderr: plain lines, or a bar."""
     if not sys.stderr.isatty():
         yield PlainRuns(kernels, runs)

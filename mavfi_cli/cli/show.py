@@ -21,7 +21,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
     """Summarise RUN, a run folder."""
     from mavfi_cli.mission.golden import kept_golden, paired_golden
     from mavfi_cli.mission.record.run_folder import load_run
-    from mavfi_cli.report.summary import difference_lines, event_lines, summary_lines
+    from mavfi_cli.report.summary import difference_lines, event_lines, folder_lines, summary_lines
 
     record = load_run(run)
     if picture is not None:
@@ -41,10 +41,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
             lines += difference_lines(record, golden)
     if events:
         lines += ["", "Events", *event_lines(record.result)]
-    click.echo("\n".join(lines))
-    click.echo(f"\nRun folder  {record.folder.path}")
-    if picture is not None:
-        click.echo(f"Picture     {picture}")
+    click.echo("\n".join([*lines, *folder_lines(record, picture)]))
 
 
 def _note(text: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import click
@@ -45,7 +46,7 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
 
     found = [load_stack(name) for name in names or stack_names()]
     if as_json:
-        click.echo(json.dumps([_plain(stack) for stack in found], indent=2))
+        click.echo(json.dumps([asdict(stack) for stack in found], indent=2))
     elif not names:
         click.echo("\n".join([
             *(f"{stack.name:<19}{stack.description}" for stack in found),
@@ -110,9 +111,3 @@ def _told(value: Any) -> str:
     if isinstance(value, tuple):
         return ", ".join(" + ".join(nodes) for nodes in value) or "none"
     return f"{value:g}"
-
-
-def _plain(stack: Any) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(stack)

@@ -52,7 +52,7 @@ def train(
     pip install 'mavfi[train]'.
     """
     from mavfi_cli.campaigns.run import Options
-    from mavfi_cli.cli.missions_view import missions_view
+    from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.detect.fit import KINDS
     from mavfi_cli.report.detector_plots import draw_loss_curve
     from mavfi_cli.report.drawing import write_svg

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, refuse_given
 
 
 class _Positive(click.FloatRange):
@@ -105,7 +104,12 @@ def vpm(
     if as_json and as_csv:
         raise click.UsageError("--json or --csv, not both")
     if not fly:
-        _refuse_unused()
+        refuse_given(_FLYING, "needs --fly")
+        given = given_options()
+        if "platform" not in given:
+            refuse_given(["chain"], "needs --platform: it is how its latencies add up")
+        if "response" in given:
+            refuse_given(["chain"], "or --response, not both: either is the response time")
     if options["models"] is not None and options["train"]:
         raise click.UsageError("--models or --train, not both")
     chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
@@ -162,23 +166,6 @@ def _measured(path: str, platform: str | None) -> dict[str, tuple[float, str]]:
     return {name: (100.0 * each.share, each.told(path)) for name, each in known.items()}
 
 
-def _refuse_unused() -> None:
-    """Reject options that have no effect without --fly or --platform, with exit code 2."""
-    context = click.get_current_context()
-    for option in context.command.params:
-        if option.name in _FLYING and _given(str(option.name)):
-            raise click.UsageError(f"{option.opts[0]} needs --fly")
-    if _given("chain") and not _given("platform"):
-        raise click.UsageError("--chain needs --platform: it is how its latencies add up")
-    if _given("chain") and _given("response"):
-        raise click.UsageError("--chain or --response, not both: either is the response time")
-
-
-def _given(name: str) -> bool:
-    source = click.get_current_context().get_parameter_source(name)
-    return source is ParameterSource.COMMANDLINE
-
-
 def _flown(
     vehicles: list[Any],
     known: dict[str, tuple[float, str]],
@@ -187,7 +174,7 @@ def _flown(
     options: dict[str, Any],
 ) -> dict[str, Any]:
     from mavfi_cli.campaigns.run import Options
-    from mavfi_cli.cli.missions_view import missions_view
+    from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.studies.flight_plan import WORLDS, RedundancyPlan
     from mavfi_cli.studies.redundancy import fly_and_report
 
@@ -224,8 +211,7 @@ def _choices(options: dict[str, Any]) -> Any:
 
 def _save(told: dict[str, Any], out: Path) -> list[str]:
     """Write all files; return their names."""
-    from mavfi_cli.core.errors import RecordError
-    from mavfi_cli.core.files import write_json, write_text
+    from mavfi_cli.core.files import write_json, write_text, writing
     from mavfi_cli.report.drawing import write_svg
     from mavfi_cli.report.model_plots import (
         draw_flight_plot,
@@ -235,10 +221,8 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
     from mavfi_cli.report.tables.model import model_csv
     from mavfi_cli.report.tables.redundancy import redundancy_csv
 
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordError(f"{out}: {error.strerror or error}") from None
     write_json(out / "vpm.json", told)
     write_text(out / "vpm.csv", model_csv(told))
     write_svg(draw_roofline_plot(told), out / "roofline.svg")

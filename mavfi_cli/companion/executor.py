@@ -43,7 +43,7 @@ class TurnOver(Exception):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Loss:
+class _Loss:
     """Loss of a node's process."""
 
     node: str
@@ -55,13 +55,7 @@ class Loss:
 
 @dataclass(slots=True, eq=False)
 class Node(Generic[In, Out]):
-    """A node: its kernel and its queue of length one.
-
-    Attributes:
-        kernel: Function from input and start stamp to output.
-        on_start: Callback for every invocation with input and start stamp.
-        on_restart: Callback after a restart, before the node reads its next input.
-    """
+    """A node: its kernel and its queue of length one."""
 
     name: str
     kernel: Callable[[In, float], Out]
@@ -73,7 +67,7 @@ class Node(Generic[In, Out]):
     dropped: int = 0  # inputs replaced by a newer one before they were read
     busy_s: float = 0.0
     process: NodeProcess | None = None  # process that runs the kernel; None for this one
-    losses: list[Loss] = field(default_factory=list)
+    losses: list[_Loss] = field(default_factory=list)
     restarts: int = 0
     finished: int = 0  # completed or failed invocations
     free_s: float = 0.0  # end of the newest invocation outside the queue
@@ -148,10 +142,6 @@ class Executor:
         compute_first: Draw an invocation's latency after its computation.
         restart_s: Simulated time from a node's end until its successor is ready, s.
         watchdog_s: Simulated time after which an unfinished invocation is killed, s.
-        now_s: Present simulated time, s.
-        nodes: All nodes by name, in the order of their addition.
-        losses: Losses of all nodes, in order.
-        timetable: All invocations in the order of their starts.
     """
 
     draw_latency_s: Callable[[str], float]
@@ -162,7 +152,7 @@ class Executor:
     watchdog_s: float = 5.0
     now_s: float = 0.0
     nodes: dict[str, AnyNode] = field(default_factory=dict)
-    losses: list[Loss] = field(default_factory=list)
+    losses: list[_Loss] = field(default_factory=list)
     timetable: list[Invocation] = field(default_factory=list)
     _events: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)  # a heap
     _waiting: list[AnyNode] = field(default_factory=list)
@@ -191,7 +181,6 @@ class Executor:
         """Run a node's kernel in a separate process from now on, until `close`.
 
         Args:
-            name: Name of the node. Nodes that share its process move with it.
             process: Process that serves them; by default a fork of this one with a copy of their
                 state.
         """
@@ -346,9 +335,6 @@ class Executor:
         """Kill the process of a node as a signal would. Does nothing if the node is down.
 
         Its present and waiting inputs are lost.
-
-        Args:
-            name: Name of a node in a separate process.
         """
         node = self.nodes[name]
         together = (node, *node.mates)
@@ -373,7 +359,7 @@ class Executor:
         self._at(gone_s, self._end_process, job.node)
 
     def _note_loss(self, node: AnyNode, gone_s: float, loss: NodeLost) -> None:
-        entry = Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how,
+        entry = _Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how,
                      traceback=loss.traceback)  # fmt: skip
         node.losses.append(entry)
         self.losses.append(entry)

@@ -19,11 +19,11 @@ from mavfi_cli.fi.source.injector import (
     Injector,
     Listener,
     MemoryInjector,
+    Moment,
     Reader,
     SourceInjector,
     Strike,
 )
-from mavfi_cli.fi.source.schedule import Moment
 from mavfi_cli.spec.fault import DETECTOR, PROCESS, FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -189,7 +189,7 @@ class SourceInjection(NoInjection):
         """Write the first strike to disk before its message is passed on."""
         self._strike = strike
         if self._state == "planned":
-            self._news.append(strike_text(strike))
+            self._news.append(_strike_text(strike))
             self._state = "applied"
             if self._path is not None:
                 write_json(self._path, self.record())
@@ -211,7 +211,7 @@ class SourceInjection(NoInjection):
             "level": "source",
             "state": self._state,
             "reason": injector.missed if self._state == "not_injected" else "",
-            "request": self._config.to_dict(),
+            "request": asdict(self._config),
             "stage": self._stage,
             "states": list(self._units),
             "units": list(self._units.values()),
@@ -238,7 +238,7 @@ class SourceInjection(NoInjection):
         return "read", Reader(name=self._reader, stamp_s=stamp_s, state=next(iter(self._units)))
 
 
-def strike_text(strike: Strike) -> str:
+def _strike_text(strike: Strike) -> str:
     """Describe the changes of a strike in one line."""
     if not strike.changes:
         return "fault: the process is killed"

@@ -18,9 +18,6 @@ class LatencyModel:
     Each kernel has its own random stream, so the number of calls of one kernel never changes the
     latencies of another. On a measured platform the latency is the host time of the kernel's newest
     invocation, times the profile's factor.
-
-    Args:
-        wall: Clock with the host times, for a measured platform.
     """
 
     def __init__(

@@ -68,8 +68,6 @@ class NodeProcess:
     """Runs kernels for the executor: `order` sends an input, `take` returns its output.
 
     Args:
-        connection: Our end of the socket pair.
-        pid: Process id of the child.
         ending: Returns how the process ended if another waiter reaped it, else None.
         patient: Never treat the process as hung, because a debugger may hold it.
     """
@@ -83,7 +81,7 @@ class NodeProcess:
         patient: bool = False,
     ) -> None:
         self._socket = connection
-        self._pid = pid
+        self.pid = pid
         self._ending = ending
         self._patient = patient
         if not patient:
@@ -94,11 +92,7 @@ class NodeProcess:
 
     @classmethod
     def fork(cls, runs: Mapping[str, Run]) -> NodeProcess:
-        """Fork this process.
-
-        Args:
-            runs: Kernels by node name; the child uses its own copies.
-        """
+        """Fork this process."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
 
         def child() -> int:
@@ -109,11 +103,6 @@ class NodeProcess:
         pid = fork(child)
         theirs.close()
         return cls(ours, pid)
-
-    @property
-    def pid(self) -> int:
-        """Process id of the child."""
-        return self._pid
 
     def order(self, node: str, value: Any, start_s: float) -> int:
         """Send an input. Return the number to pass to `take`.
@@ -173,7 +162,7 @@ class NodeProcess:
     def _cpu_s(self) -> float:
         """Return the CPU time of the process in seconds; 0 after its end."""
         try:
-            return time.clock_gettime(~self._pid << 3 | 2)  # clock id of clock_getcpuclockid
+            return time.clock_gettime(~self.pid << 3 | 2)  # clock id of clock_getcpuclockid
         except OSError:
             return 0.0
 
@@ -184,7 +173,7 @@ class NodeProcess:
         if told is not None:
             return told
         with contextlib.suppress(ChildProcessError):
-            _, status = os.waitpid(self._pid, 0)
+            _, status = os.waitpid(self.pid, 0)
             if os.WIFSIGNALED(status):
                 return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
             return f"ended with code {os.waitstatus_to_exitcode(status)}"
@@ -198,10 +187,10 @@ class NodeProcess:
         self._gone = True
         if kill:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self._pid, signal.SIGKILL)
+                os.kill(self.pid, signal.SIGKILL)
         if self._ending() is None:
             with contextlib.suppress(ChildProcessError):
-                os.waitpid(self._pid, 0)
+                os.waitpid(self.pid, 0)
 
 
 def serve(connection: socket.socket, runs: Mapping[str, Run]) -> NoReturn:

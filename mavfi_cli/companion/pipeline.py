@@ -11,9 +11,9 @@ strike it and the detector may withhold it. A withheld message ends the turn.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from mavfi_cli.core.types import (
     VehicleState,
 )
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.fi.source.schedule import Moment
+from mavfi_cli.fi.source.injector import Moment
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import Stack
@@ -62,7 +62,7 @@ PLAN_STATES = {s.name for s in of_stage(Stage.PLANNING)} - FOLLOWED_STATES
 CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 
 
-class Withheld(TurnOver):
+class _Withheld(TurnOver):
     """The detector withholds a message."""
 
     def __init__(self, decision: Decision) -> None:
@@ -94,10 +94,7 @@ class Companion:
     """Perception, planning and control of one mission.
 
     Attributes:
-        pilot: The mission's state machine.
-        executor: Nodes and simulated time.
-        report, command: Newest messages that took effect.
-        plans: All plans that took effect.
+        plan_failures: Number of failed plans by the planner's reason.
         reactions: Depth frames with the first setpoint that depends on each.
     """
 
@@ -117,9 +114,9 @@ class Companion:
         self.protection = protection
         self.pilot = Pilot(_pilot_params(config, stack), briefing.goal_enu_m)
         self._recovery = Recovery(protection, self.pilot, self._follower, self._see_again)
-        self._latency = LatencyModel(platform, config.seed, wall)
+        self.latency = LatencyModel(platform, config.seed, wall)
         self.executor = Executor(
-            draw_latency_s=self._latency.draw_s,
+            draw_latency_s=self.latency.draw_s,
             cores=platform.cores,
             compute_first=platform.measured_factor is not None,
             wall=wall,
@@ -148,6 +145,7 @@ class Companion:
         self.report: CollisionReport | None = None
         self.command: Command | None = None
         self.plans: list[Trajectory] = []
+        self.plan_failures: Counter[str] = Counter()
         self.reactions: list[Reaction] = []
 
     # Perception
@@ -205,6 +203,7 @@ class Companion:
             self.plans.append(result)
             self._follower.read(result, "mission logic", self._now_s, PLAN_STATES)
         else:
+            self.plan_failures[result.reason] += 1
             self.protection.lose_plan()
         self.pilot.on_plan(result)
 
@@ -245,8 +244,6 @@ class Companion:
         """Compute a command, which is due after control's latency.
 
         Args:
-            inputs: Vehicle's state and reference.
-            attempt: Number of earlier computations of this command.
             fresh: State of the controller to begin with; None for its own.
         """
         assert self._state is not None
@@ -277,7 +274,7 @@ class Companion:
         """Let a due command take effect."""
         try:
             command = self.command = self.publish(setpoint.command, setpoint)
-        except Withheld as withheld:
+        except _Withheld as withheld:
             self._track_again(setpoint, withheld.decision)
             return
         active = self.pilot.active
@@ -327,12 +324,8 @@ class Companion:
     def publish(self, message: M, setpoint: Setpoint | None = None) -> M:
         """Give a kernel's output to its receivers. Return it as they get it.
 
-        Args:
-            message: Output of a kernel.
-            setpoint: Setpoint of a command.
-
         Raises:
-            Withheld: The detector withholds the message. Its recovery has begun.
+            TurnOver: The detector withholds the message. Its recovery has begun.
         """
         moment = self._moment(foresees=isinstance(message, CollisionReport) and message.collision)
         if isinstance(message, CollisionReport):
@@ -342,7 +335,7 @@ class Companion:
             decision = self._judge(message, setpoint)
             if decision.withheld:
                 self._recovery.recover(message, decision)
-                raise Withheld(decision)
+                raise _Withheld(decision)
         return message
 
     def _judge(self, message: Message, setpoint: Setpoint | None) -> Decision:
@@ -362,11 +355,7 @@ class Companion:
         """Let a fault strike memory, and the detector look at the active plan, before its use.
 
         If control owns its queue, its copy is the active trajectory, and control passes the rest of
-        it to the other nodes. Otherwise the next tick replaces the copy.
-
-        Returns:
-            Trajectory that control uses in this tick instead of the active one; None if it is the
-            same.
+        it to the other nodes. Otherwise the copy lasts for this tick, and is returned.
         """
         active, moment, copy = self.pilot.active, self._moment(), None
         self._injection.strike_memory(moment)
@@ -431,11 +420,6 @@ class Companion:
             phase=self.pilot.mode.value,
             foresees=foresees,
         )
-
-    @property
-    def measured(self) -> dict[str, Any] | None:
-        """Return factor and medians of a measured platform; None for any other."""
-        return self._latency.summary()
 
     @property
     def sees(self) -> bool:

@@ -105,8 +105,6 @@ class Protection(NoProtection):
     """A gate with its counters.
 
     Args:
-        config: Detector and stages.
-        stack: Stack of the mission, as for `load_stack`.
         wall: Clock for the host time of all checks, under "gate".
     """
 

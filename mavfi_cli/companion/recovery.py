@@ -32,12 +32,6 @@ from mavfi_cli.fi.source.injector import Follower
 class Recovery:
     """Acts on the pilot and its active plan after alarms.
 
-    Args:
-        protection: Judges messages; the null object accepts all.
-        pilot: Pilot whose plan is dropped, changed or requested.
-        follower: Gets withheld messages.
-        recompute_perception: Has perception recompute from the newest frame.
-
     Attributes:
         state: Newest vehicle state, from which a holding vehicle plans anew.
     """
@@ -77,7 +71,6 @@ class Recovery:
         an order of magnitude more.
 
         Args:
-            stamp_s: Present stamp, s.
             unharmed: Plan before this tick's strike, which the gate has already judged.
         """
         active, (seen, seen_at) = self._pilot.active, self._looked
@@ -90,12 +83,7 @@ class Recovery:
         self._looked = (active.trajectory, at)
 
     def look_ahead(self, stamp_s: float, only: int | None = None) -> None:
-        """Drop anomalous waypoints of the plan ahead before other nodes use them.
-
-        Args:
-            stamp_s: Present stamp, s.
-            only: Drop this waypoint only.
-        """
+        """Drop anomalous waypoints of the plan ahead before other nodes use them."""
         active = self._pilot.active
         while (flown := active.trajectory) is not None:
             decision = self._protection.ahead(flown, active.waypoint, only, stamp_s)

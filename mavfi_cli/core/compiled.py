@@ -44,12 +44,7 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 
 
 def _numba() -> Any:
-    """Import numba without BLAS support.
-
-    To find BLAS, numba imports all of scipy.linalg, which takes 0.14 s of CPU time in every
-    process. No kernel here multiplies matrices. A kernel that used `@`, `np.dot` or `np.linalg`
-    would fail to compile with an error.
-    """
+    """Import numba without BLAS: no kernel multiplies matrices, and finding it takes 0.14 s."""
     import numba
 
     if "numba.np.arraymath" not in sys.modules and _BLAS not in sys.modules:

@@ -80,16 +80,6 @@ def shipped_base(kind: str, name: object, path: Path, folder: Path) -> str:
     return str(name)
 
 
-def load_shipped(kind: str, name_or_path: str, folder: Path, cls: type[T]) -> T:
-    """Load a shipped `kind` by its name, or a user's own TOML file by its path, as `cls`.
-
-    Raises:
-        UnknownName: Nothing shipped has this name, and it is not a path to a TOML file.
-        ConfigError: The file cannot be used.
-    """
-    return load_toml(shipped_path(kind, name_or_path, folder), cls)
-
-
 def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:
     """Convert a TOML syntax error, with its line if the parser reports one."""
     problem, at, place = str(error).rpartition(" (at line ")

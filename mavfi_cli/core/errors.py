@@ -1,36 +1,8 @@
-"""The error tree. Each error takes the objects it is about and composes its own message.
-
-MavfiError                      a known error; printed in one line, exit code 1
-├── UnknownName                 a world, planner, vehicle ... that does not exist; exit code 2
-├── BrokenPlugIn                a planner or detector of another package that does not load
-├── ConfigError                 a file or value that cannot be used
-│   └── UnknownKey              a TOML key that no setting has
-├── WorldError                  start or goal blocked or outside, or invalid boxes
-├── LinkError                   the MAVLink connection failed
-│   ├── EndpointError           a URL that cannot be opened
-│   ├── NoAutopilot             no autopilot heartbeat arrived
-│   ├── CommandRefused          the autopilot refused a command; quotes its messages
-│   └── LinkLost                the peer stopped sending or closed the connection
-├── CannotLift                  a vehicle whose rotors cannot lift its compute; gives the numbers
-├── VehicleProcessError         the simulated vehicle could not start or ended early
-├── ModelError                  a detector model or data set that cannot be used or created
-│   └── OtherStack              a detector model for another stack than the mission's
-├── RecordError                 a run folder that cannot be written or read
-├── FaultError                  a fault that cannot be described, injected or repeated
-│   ├── FaultSpecError          an inconsistent fault description
-│   ├── BitOutsideWidth         a bit that the type or register does not have
-│   ├── FieldUnavailable        a field (sign, exponent, mantissa) that the type lacks
-│   ├── TracingForbidden        ptrace is not permitted; says how to allow it
-│   ├── TargetError             a program that cannot be started, or ends before the trigger
-│   └── BuildMismatch           a fault record made with another build; says what differs
-├── MissingLibrary              an optional library that is not installed; says how to install it
-└── Interrupted                 the user asked to stop
-"""
+"""The errors that users see. Each composes its own message of one line."""
 
 from __future__ import annotations
 
 import difflib
-import shlex
 from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
@@ -74,21 +46,8 @@ class UnknownName(MavfiError):
         super().__init__(f"unknown {kind} {name!r}; {_suggestion(name, known)}")
 
 
-class BrokenPlugIn(MavfiError):
-    """An installed plug-in that cannot be loaded."""
-
-    def __init__(self, name: str, value: str, error: Exception) -> None:
-        found = f"{type(error).__name__}: {error}"
-        super().__init__(f"the plug-in {name!r} ({value}) does not load: {found}")
-
-
 def named_member(kind: type[E], what: str, name: str | E) -> E:
     """Return the member of an enumeration with this value.
-
-    Args:
-        kind: Enumeration.
-        what: Word for its members, for the error.
-        name: Value of the member.
 
     Raises:
         UnknownName: No member has this value. Suggests the nearest.
@@ -100,13 +59,7 @@ def named_member(kind: type[E], what: str, name: str | E) -> E:
 
 
 class ConfigError(MavfiError):
-    """A file or a value that cannot be used. Gives file, line, key and the problem.
-
-    Attributes:
-        problem: Description of the problem without the place.
-        path: File; None if the value is not in a file.
-        key: Name of the setting, or empty.
-    """
+    """A file or a value that cannot be used. Gives file, line, key and the problem."""
 
     def __init__(
         self, problem: str, *, path: Path | None = None, line: int | None = None, key: str = ""
@@ -197,18 +150,6 @@ class ModelError(MavfiError):
         super().__init__(problem if path is None else f"{path}: {problem}")
 
 
-class OtherStack(ModelError):
-    """A detector model that was fitted to flights of another stack. Says how to fit one."""
-
-    def __init__(self, detector: str, *, made_for: str, flown: str, path: Path | None) -> None:
-        super().__init__(
-            f"{detector}: this model is for the stack {made_for!r}, the mission flies {flown!r}; "
-            f"fit one with mavfi train --stack {shlex.quote(flown)} and name it with --model, or "
-            "ask for this one with --any-stack-model, or any_stack = true in a campaign",
-            path=path,
-        )
-
-
 class RecordError(MavfiError):
     """A run folder that cannot be written or read."""
 
@@ -254,13 +195,6 @@ class BuildMismatch(FaultError):
 
     def __init__(self, differences: Iterable[str]) -> None:
         super().__init__(f"the record is of another build: {'; '.join(differences)}")
-
-
-class MissingLibrary(MavfiError):
-    """An optional library that is not installed. Says how to install it."""
-
-    def __init__(self, what: str, library: str, *, extra: str) -> None:
-        super().__init__(f"{what} needs {library}; install it with: pip install 'mavfi[{extra}]'")
 
 
 class Interrupted(MavfiError):

@@ -9,7 +9,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,12 +19,21 @@ from mavfi_cli.core.errors import RecordError
 PACKAGE = Path(__file__).parents[1]
 
 
-def file_digest(name: str) -> str:
+def file_digest(name: str | Path) -> str:
     """Return the SHA-256 of a file's bytes; empty if there is no such file."""
     try:
         return hashlib.sha256(Path(name).read_bytes()).hexdigest()
     except OSError:
         return ""
+
+
+@contextlib.contextmanager
+def writing(place: Path) -> Iterator[None]:
+    """Turn an OSError of the block into a RecordError that names the place."""
+    try:
+        yield
+    except OSError as error:
+        raise RecordError(f"{place}: {error.strerror or error}") from None
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -37,16 +46,19 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         RecordError: The file could not be written (disk full, no permission). The old file stays.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with writing(path), contextlib.ExitStack() as undo:
+        undo.callback(_remove, temporary)
         with temporary.open("wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise RecordError(f"{path}: {error.strerror or error}") from None
+        undo.pop_all()
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def require_svg(path: Path) -> None:
@@ -88,7 +100,7 @@ def read_parquet(path: Path, what: str) -> Any:
     try:
         return pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise RecordError(f"{path}: no {what} can be read ({error})") from None
+        raise RecordError(f"{path}: damaged, no {what} can be read ({error})") from None
 
 
 def plain(value: Any) -> Any:

@@ -24,6 +24,7 @@ with the descriptor of a channel on which the guard says {"pid"} at the begin an
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import faulthandler
 import functools
 import gc
@@ -45,19 +46,19 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.processes import (
-    GUARD,
-    ONE_THREAD,
-    SERVER,
-    WORKER,
-    become_reaper,
-    call_this_process,
-    die_with,
-    end_children,
-    fork,
-    threads,
-)
+from mavfi_cli.core.processes import fork
 
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
+# What ps calls them.
+SERVER, GUARD, WORKER = "mavfi-server", "mavfi-guard", "mavfi-worker"
+ONE_THREAD = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "JE_ARROW_MALLOC_CONF": "background_thread:false",
+}
+"""Environment of a process that forks itself. Its libraries then start no threads."""
+
+_prctl = ctypes.CDLL(None, use_errno=True).prctl
 PACKET = 1 << 17  # bytes, of an order or a report
 ERRORS, SCRATCH = "stderr.txt", "tmp"
 _READY = b"ready"
@@ -82,11 +83,7 @@ class ForkServerFailed(MavfiError):
 
 
 class ForkServer:
-    """Starts workers; the server itself is started with the first, and again where it was killed.
-
-    Args:
-        module: name of the module whose `perform` does the work.
-    """
+    """Starts workers that call a module's `perform`, and the server again if it was killed."""
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -97,9 +94,7 @@ class ForkServer:
         """Have a fresh worker do a task; the channel on which its guard reports.
 
         Args:
-            task: plain values.
             folder: for what the worker leaves, its standard error and temporary files included.
-            limit_s: wall time after which it is killed.
 
         Raises:
             ForkServerFailed: the server cannot be started.
@@ -161,12 +156,12 @@ class ForkServer:
 
 def main() -> NoReturn:
     """Load the module, then fork a guard for every order until the client closes its end."""
-    call_this_process(SERVER)
+    _call_this_process(SERVER)
     control = socket.socket(fileno=int(sys.argv[1]))
     module = cast(_Module, importlib.import_module(sys.argv[2]))
     module.prepare()
     gc.collect()
-    if (count := threads()) > 1:
+    if (count := _threads()) > 1:
         sys.exit(f"error: {count} threads where one is needed: a fork would lack the others")
     gc.freeze()  # the collector would touch, and so copy, every page that forks share
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the guards
@@ -187,8 +182,8 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
     control.close()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     order, channel = json.loads(packet), socket.socket(fileno=descriptor)
-    call_this_process(GUARD)
-    become_reaper()
+    _call_this_process(GUARD)
+    _become_reaper()
     begun_s, guard = time.monotonic(), os.getpid()
     reading, writing = os.pipe()
 
@@ -204,7 +199,7 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
         channel.send(json.dumps({"pid": worker}).encode())
         late = _await(worker, channel, begun_s + float(order["limit_s"]))
         _, status = os.waitpid(worker, 0)
-        end_children()
+        _end_children()
         told: dict[str, Any] = {"report": _last_words(reading)}
         if late:
             told["timeout"] = True
@@ -214,7 +209,7 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
             told["exit"] = os.WEXITSTATUS(status)
         told["wall_s"] = round(time.monotonic() - begun_s, 6)
         channel.send(json.dumps(told).encode())
-    end_children()
+    _end_children()
     return 0
 
 
@@ -258,9 +253,9 @@ def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -
     """The whole life of a worker, in a process group of its own."""
     code, report = 1, {}
     try:
-        call_this_process(WORKER)
+        _call_this_process(WORKER)
         os.setsid()
-        die_with(guard)
+        _die_with(guard)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
         folder = Path(order["folder"])
@@ -290,6 +285,59 @@ def _own_surroundings(folder: Path) -> None:
         os.close(descriptor)
     faulthandler.enable(sys.stderr)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+# Processes ----------------------------------------------------------------------------------------
+
+
+def _become_reaper() -> None:
+    """Make orphaned descendants of this process its children from now on."""
+    _request(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def _die_with(parent: int) -> None:
+    """Have the kernel kill this process when its parent ends. Exit now if it has already ended."""
+    _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _threads() -> int:
+    """Count the threads of this process. A fork copies one thread, but the locks of all."""
+    return len(os.listdir("/proc/self/task"))
+
+
+def _call_this_process(name: str) -> None:
+    """Set the name of this process in ps and top, at most 15 bytes."""
+    _request(_PR_SET_NAME, ctypes.c_char_p(name.encode()))
+
+
+def _request(option: int, value: int | ctypes.c_char_p) -> None:
+    if _prctl(option, value, 0, 0, 0) != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+
+
+def _end_children() -> None:
+    """Kill and reap every descendant of this process, which is their reaper.
+
+    A killed child leaves its own children to us, so the loop ends when there are none.
+    """
+    while children := _children():
+        for pid in children:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        for pid in children:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, 0)
+
+
+def _children() -> list[int]:
+    found: list[int] = []
+    for task in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):
+            found += map(int, (task / "children").read_text().split())
+    return found
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from functools import cache
 from importlib.metadata import EntryPoints, entry_points
 from typing import Any
 
-from mavfi_cli.core.errors import BrokenPlugIn, UnknownName
+from mavfi_cli.core.errors import MavfiError, UnknownName
 
 
 @cache
@@ -18,19 +18,17 @@ def installed(group: str) -> EntryPoints:
 def load_plug_in(group: str, kind: str, name: str, known: list[str]) -> Any:
     """Return what a plug-in's entry point names.
 
-    Args:
-        group: Group of the entry points.
-        kind: Word for the plug-in, for the error.
-        known: Names to suggest.
-
     Raises:
         UnknownName: No plug-in has this name. Suggests the nearest.
-        BrokenPlugIn: Its module cannot be imported, or lacks the object.
+        MavfiError: Its module cannot be imported, or lacks the object.
     """
     for entry in installed(group):
         if entry.name == name:
             try:
                 return entry.load()
             except Exception as error:  # another package's code may raise anything
-                raise BrokenPlugIn(name, entry.value, error) from None
+                found = f"{type(error).__name__}: {error}"
+                raise MavfiError(
+                    f"the plug-in {name!r} ({entry.value}) does not load: {found}"
+                ) from None
     raise UnknownName(kind, name, known)

@@ -42,116 +42,84 @@ class State:
     detected: bool = False  # True for the 13 inputs of the autoencoder
 
 
-def _field(name: str) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
-    def read(message: Message, _index: int) -> Scalar:
-        """Return the field's value."""
-        value: Scalar = getattr(message, name)
-        return value
-
-    def write(message: Message, _index: int, value: Scalar) -> Message:
-        """Return a copy of the message with another value."""
-        return replace(message, **{name: value})  # type: ignore[arg-type]
-
-    return read, write
+_Access = tuple[Callable[..., Scalar], Callable[..., Message]]
 
 
-def _element(
-    array: str, column: int | None
-) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
-    """Return reader and writer of row `index` of an array or of one of its columns."""
+def _field(name: str) -> _Access:
+    """Return reader and writer of a field."""
+    return (
+        lambda message, _index: getattr(message, name),
+        lambda message, _index, value: replace(message, **{name: value}),
+    )
+
+
+def _element(array: str, column: int | None = None) -> _Access:
+    """Return reader and writer of row `index` of an array, or of one of its columns."""
 
     def place(index: int) -> int | tuple[int, int]:
         return index if column is None else (index, column)
 
-    def read(message: Message, index: int) -> Scalar:
-        """Return the element's value."""
-        return float(getattr(message, array)[place(index)])
-
     def write(message: Message, index: int, value: Scalar) -> Message:
-        """Return a copy of the message, and of its array, with another value."""
         changed = np.array(getattr(message, array))
         changed[place(index)] = value
         return replace(message, **{array: changed})  # type: ignore[arg-type]
 
-    return read, write
+    return lambda message, index: float(getattr(message, array)[place(index)]), write
 
 
-def _component(array: str, column: int) -> tuple[Callable[..., Scalar], Callable[..., Message]]:
+def _component(array: str, column: int) -> _Access:
     """Return reader and writer of one component of a vector."""
-    read, write = _element(array, None)
+    read, write = _element(array)
     return (
         lambda message, _index: read(message, column),
         lambda message, _index, value: write(message, column, value),
     )
 
 
-def _perception() -> list[State]:
-    kind = {"stage": Stage.PERCEPTION, "message": CollisionReport}
-    rows = [
-        ("time_to_collision", "time_to_collision_s", DType.FLOAT64, "s", True),
-        ("future_collision_seq", "future_collision_seq", DType.INT32, "1", True),
-        ("collision", "collision", DType.BOOL, "1", False),
-    ]
-    table = []
-    for name, attribute, dtype, unit, detected in rows:
-        read, write = _field(attribute)
-        table.append(
-            State(name=name, group=name, dtype=dtype, unit=unit, read=read, write=write,
-                  detected=detected, **kind)  # type: ignore[arg-type]
-        )  # fmt: skip
-    return table
+_STAGES = {
+    CollisionReport: Stage.PERCEPTION, Trajectory: Stage.PLANNING, Command: Stage.CONTROL,
+}  # fmt: skip
 
 
-_WAYPOINT_UNITS = {"position": "m", "yaw": "rad", "velocity": "m/s", "acceleration": "m/s^2"}
-
-
-def _waypoint_group(name: str) -> str:
-    if name == "yaw":
-        return "yaw"
-    return {"v": "velocity", "a": "acceleration"}.get(name[0], "position")
-
-
-def _planning() -> list[State]:
-    table = []
-    for column, name in enumerate(WAYPOINT_FIELDS):
-        read, write = _element("waypoints", column)
-        group = _waypoint_group(name)
-        table.append(
-            State(name=f"waypoint_{name}", stage=Stage.PLANNING, dtype=DType.FLOAT64,
-                  unit=_WAYPOINT_UNITS[group], group=f"waypoint_{group}", message=Trajectory,
-                  read=read, write=write, detected=group != "acceleration")
-        )  # fmt: skip
-    read, write = _element("durations_s", None)
-    table.append(
-        State(name="waypoint_duration", stage=Stage.PLANNING, dtype=DType.FLOAT64, unit="s",
-              group="waypoint_duration", message=Trajectory, read=read, write=write)
+def _state(
+    message: type[Message],
+    name: str,
+    access: _Access,
+    unit: str = "1",
+    *,
+    dtype: DType = DType.FLOAT64,
+    group: str = "",
+    detected: bool = False,
+) -> State:
+    read, write = access
+    return State(
+        name=name, stage=_STAGES[message], dtype=dtype, unit=unit, group=group or name,
+        message=message, read=read, write=write, detected=detected,
     )  # fmt: skip
-    for name in ("trajectory_seq", "future_collision_seq"):
-        read, write = _field(name)
-        table.append(
-            State(name=f"plan_{name}", stage=Stage.PLANNING, dtype=DType.INT32, unit="1",
-                  group=f"plan_{name}", message=Trajectory, read=read, write=write)
-        )  # fmt: skip
-    return table
 
 
-def _control() -> list[State]:
-    table = []
-    for column, axis in enumerate("xyz"):
-        read, write = _component("velocity_enu_mps", column)
-        table.append(
-            State(name=f"command_v{axis}", stage=Stage.CONTROL, dtype=DType.FLOAT64, unit="m/s",
-                  group="command_velocity", message=Command, read=read, write=write, detected=True)
-        )  # fmt: skip
-    read, write = _field("yaw_rad")
-    table.append(
-        State(name="command_yaw", stage=Stage.CONTROL, dtype=DType.FLOAT64, unit="rad",
-              group="command_yaw", message=Command, read=read, write=write, detected=True)
-    )  # fmt: skip
-    return table
+def _waypoint(column: int, name: str) -> State:
+    kind = {"y": "yaw", "v": "velocity", "a": "acceleration"}.get(name[0] if name != "y" else "")
+    group, unit = kind or "position", _UNITS[kind or "position"]
+    return _state(Trajectory, f"waypoint_{name}", _element("waypoints", column), unit,
+                  group=f"waypoint_{group}", detected=group != "acceleration")  # fmt: skip
 
 
-STATES: tuple[State, ...] = (*_perception(), *_planning(), *_control())
+_UNITS = {"position": "m", "yaw": "rad", "velocity": "m/s", "acceleration": "m/s^2"}
+
+STATES: tuple[State, ...] = (
+    _state(CollisionReport, "time_to_collision", _field("time_to_collision_s"), "s", detected=True),
+    _state(CollisionReport, "future_collision_seq", _field("future_collision_seq"),
+           dtype=DType.INT32, detected=True),
+    _state(CollisionReport, "collision", _field("collision"), dtype=DType.BOOL),
+    *(_waypoint(column, name) for column, name in enumerate(WAYPOINT_FIELDS)),
+    _state(Trajectory, "waypoint_duration", _element("durations_s"), "s"),
+    *(_state(Trajectory, f"plan_{name}", _field(name), dtype=DType.INT32)
+      for name in ("trajectory_seq", "future_collision_seq")),
+    *(_state(Command, f"command_v{axis}", _component("velocity_enu_mps", column), "m/s",
+             group="command_velocity", detected=True) for column, axis in enumerate("xyz")),
+    _state(Command, "command_yaw", _field("yaw_rad"), "rad", detected=True),
+)  # fmt: skip
 BY_NAME: dict[str, State] = {state.name: state for state in STATES}
 
 

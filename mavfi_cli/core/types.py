@@ -122,7 +122,6 @@ class StackMark:
     """Identity of the companion's stack. Error-free flights differ between stacks.
 
     Attributes:
-        name: Name of the stack.
         digest: SHA-256 of its settings. Equal digests mean equal stacks.
     """
 

@@ -111,7 +111,7 @@ class AutoencoderDetector(FittedDetector):
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the reconstruction error: the mean square over the 13 scaled deltas."""
-        error: float = _reconstruction_error(self._flat, deltas)
+        error: float = _reconstruction_error(self.flat, deltas)
         return error
 
     def learn(self, deltas: Codes, stage: Stage) -> None:

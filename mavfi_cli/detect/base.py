@@ -17,7 +17,6 @@ class Detector(Protocol):
     """Scores deltas (COUNT,) int16 in the order of `preprocess.NAMES`; 0 means no change.
 
     Attributes:
-        name: Registered name.
         per_stage: True if each stage is scored alone and an alarm recomputes that stage. False if
             one score covers the whole vector and an alarm recomputes control.
     """
@@ -45,22 +44,8 @@ class Detector(Protocol):
         """Update the model with an accepted sample. A fixed model does nothing."""
 
 
-class Factory(Protocol):
-    """Creates a detector. An entry point in the group `mavfi.detectors` names a factory."""
-
-    def __call__(self, *, model: Path | None = None, threshold: float | None = None) -> Detector:
-        """Create a new detector.
-
-        Args:
-            model: Model file; None selects the model shipped with the package.
-            threshold: Replaces the model's threshold; a number of sigmas for a Gaussian model.
-
-        Raises:
-            ModelError: The model file cannot be used.
-            ConfigError: The threshold is out of range.
-        """
-
-
+# An entry point of this group names a function that creates a detector. It takes the arguments of
+# `find_detector` but the name.
 ENTRY_POINT_GROUP = "mavfi.detectors"
 
 
@@ -80,9 +65,10 @@ def find_detector(
 
     Raises:
         UnknownName: No detector has this name. Suggests the nearest.
-        BrokenPlugIn: Its package does not load.
+        MavfiError: Its package does not load.
         ModelError: The model file cannot be used.
         ConfigError: The threshold is out of range.
     """
-    factory: Factory = load_plug_in(ENTRY_POINT_GROUP, "detector", name, detector_names())
-    return factory(model=model, threshold=threshold)
+    factory = load_plug_in(ENTRY_POINT_GROUP, "detector", name, detector_names())
+    detector: Detector = factory(model=model, threshold=threshold)
+    return detector

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.files import read_parquet, write_parquet
 from mavfi_cli.core.types import FloatArray, StackMark, Stage
 from mavfi_cli.detect.preprocess import COUNT, NAMES, Codes, PreprocessParams, states_digest
 from mavfi_cli.detect.watch import EXTENDED
 
 SCHEMA = "2"
+_CODED = (*NAMES, *(state.name for state in EXTENDED))
 _FLAGS = ("reports", "plan_steps", "new_waypoint")
 _META = (b"mavfi_samples", b"mavfi_states", b"mavfi_preprocess")
 _STACK = (b"mavfi_stack", b"mavfi_stack_digest")
@@ -67,7 +68,6 @@ class Dataset:
     def save(self, path: Path) -> None:
         """Write the data set as Parquet, atomically. Equal data sets give equal bytes."""
         import pyarrow as pa
-        import pyarrow.parquet as pq
 
         flights = self.flights
         lengths = [len(flight.stamps_s) for flight in flights]
@@ -78,19 +78,15 @@ class Dataset:
         }
         for flag in _FLAGS:
             columns[flag] = pa.array(_joined([getattr(f, flag) for f in flights]), pa.bool_())
-        deltas = np.concatenate([np.zeros((0, COUNT), np.int16), *(f.deltas for f in flights)])
-        for place, name in enumerate(NAMES):
-            columns[name] = pa.array(deltas[:, place], pa.int16())
-        extended = np.concatenate(
-            [np.zeros((0, len(EXTENDED)), np.int16), *(f.extended for f in flights)]
-        )
-        for place, state in enumerate(EXTENDED):
-            columns[state.name] = pa.array(extended[:, place], pa.int16())
+        codes = [np.column_stack([f.deltas, f.extended]) for f in flights]
+        coded = np.concatenate([np.zeros((0, len(_CODED)), np.int16), *codes])
+        for place, name in enumerate(_CODED):
+            columns[name] = pa.array(coded[:, place], pa.int16())
         stack = self.stack.name.encode(), self.stack.digest.encode()
         table = pa.table(columns).replace_schema_metadata(
             dict(zip((*_META, *_STACK), (*_signature(self.preprocess), *stack), strict=True))
         )
-        write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
+        write_parquet(path, table)
 
     @classmethod
     def load(cls, path: Path, preprocess: PreprocessParams | None = None) -> Dataset:
@@ -100,17 +96,12 @@ class Dataset:
             preprocess: Parameters that the data set must have been made with.
 
         Raises:
-            ModelError: The file is unreadable, is not a data set, or was made with another state
-                table or other preprocessing.
+            RecordError: The file is unreadable.
+            ModelError: It is not a data set, or was made with another state table or other
+                preprocessing.
         """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         params = preprocess or PreprocessParams()
-        try:
-            table = pq.read_table(path)
-        except (OSError, pa.ArrowException) as error:
-            raise ModelError(f"no readable data set: {_line(error)}", path=path) from None
+        table = read_parquet(path, "data set")
         metadata = table.schema.metadata or {}
         found = tuple(metadata.get(key) for key in _META)
         if found[0] is None:
@@ -128,10 +119,6 @@ def _signature(preprocess: PreprocessParams) -> tuple[bytes, ...]:
     return SCHEMA.encode(), states_digest().encode(), preprocess.digest().encode()
 
 
-def _line(error: BaseException) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
-
-
 def _joined(arrays: list[NDArray[np.generic]]) -> NDArray[np.generic]:
     return np.concatenate(arrays) if arrays else np.zeros(0)
 
@@ -144,14 +131,13 @@ def _flights(table: object) -> Iterable[FlightSamples]:
         return
     changed = (worlds[1:] != worlds[:-1]) | (seeds[1:] != seeds[:-1])
     edges = [0, *(np.flatnonzero(changed) + 1).tolist(), rows]
-    deltas = np.column_stack([columns[name] for name in NAMES]).astype(np.int16)
-    extended = np.column_stack([columns[state.name] for state in EXTENDED]).astype(np.int16)
+    coded = np.column_stack([columns[name] for name in _CODED]).astype(np.int16)
     for start, end in itertools.pairwise(edges):
         yield FlightSamples(
             world=str(worlds[start]),
             seed=int(seeds[start]),
             stamps_s=columns["stamp_s"][start:end],
             **{flag: columns[flag][start:end].astype(np.bool_) for flag in _FLAGS},
-            deltas=deltas[start:end],
-            extended=extended[start:end],
+            deltas=coded[start:end, :COUNT],
+            extended=coded[start:end, COUNT:],
         )

@@ -12,9 +12,10 @@ precision with a fixed seed, so the same data and the same version of torch give
 
 from __future__ import annotations
 
+import itertools
 import math
 import platform
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -48,17 +49,8 @@ _YAW = [NAMES.index("waypoint_yaw"), NAMES.index("command_yaw")]
 KINDS = ("gad", "aad", "range", "l2")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Split:
-    """Indices of the flights of a data set by their use."""
-
-    train: tuple[int, ...]
-    validation: tuple[int, ...]
-    threshold: tuple[int, ...]
-
-
-def split(dataset: Dataset, seed: int) -> _Split:
-    """Split by flight, in the same way for each world.
+def split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
+    """Split by flight, in the same way for each world. Return the indices by their use.
 
     Raises:
         ModelError: There are fewer than FLIGHTS_MIN flights.
@@ -70,14 +62,11 @@ def split(dataset: Dataset, seed: int) -> _Split:
     parts: dict[str, list[int]] = {"train": [], "validation": [], "threshold": []}
     for number, place in enumerate(ordered):
         parts[_TURNS[number % len(_TURNS)]].append(place)
-    return _Split(**{name: tuple(sorted(places)) for name, places in parts.items()})
+    return {name: sorted(places) for name, places in parts.items()}
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
     """Check before the flights that `fit` will be able to use them.
-
-    Args:
-        flights: Maximum number of flights.
 
     Raises:
         UnknownName: A kind is unknown.
@@ -86,7 +75,7 @@ def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) ->
     """
     for kind in kinds:
         if kind not in KINDS:
-            raise _unknown(kind)
+            raise UnknownName("detector", kind, KINDS)
     _refuse_few(flights)
     if n_sigma is not None:
         checked_threshold(n_sigma, "n sigma")
@@ -99,16 +88,10 @@ def _refuse_few(flights: int) -> None:
         raise ModelError(f"{flights} flights are too few to fit to: {FLIGHTS_MIN} at least")
 
 
-def _unknown(kind: str) -> UnknownName:
-    return UnknownName("detector", kind, KINDS)
-
-
 def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = None) -> Model:
     """Fit one kind of detector.
 
     Args:
-        kind: Kind of detector: gad, aad, range or l2.
-        seed: Seed of the autoencoder's initial weights and of the split.
         n_sigma: Threshold of the Gaussian model. None selects the smallest integer that the
             flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
 
@@ -119,18 +102,15 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     """
     parts = split(dataset, seed)
     flights = dataset.flights
-    train = [flights[place] for place in parts.train]
-    validation = [flights[place] for place in parts.validation]
-    held_out = [flights[place] for place in parts.threshold]
+    train, validation, held_out = ([flights[place] for place in parts[use]] for use in parts)
     details: dict[str, Any] = {}
     detector: Any
     if kind == "gad":
-        cold = (
-            GaussianDetector.cold()
-            if n_sigma is None
-            else GaussianDetector.cold(checked_threshold(n_sigma, "n sigma"))
-        )
-        detector = _warmed(cold, [*train, *validation])
+        given = gaussian.N_SIGMA if n_sigma is None else checked_threshold(n_sigma, "n sigma")
+        detector = GaussianDetector.cold(given)
+        for flight, stage in itertools.product([*train, *validation], Stage):
+            for deltas in flight.of_stage(stage):
+                detector.learn(deltas, stage)
         largest = _largest(detector, held_out)
         details["largest_distance_sigma"] = largest
         if n_sigma is None:
@@ -156,7 +136,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         detector.memory["threshold"][0] = _largest(detector, held_out)
         details.update(trained.provenance)
     else:
-        raise _unknown(kind)
+        raise UnknownName("detector", kind, KINDS)
     arrays = {name: np.array(array) for name, array in detector.memory.items()}
     return Model(
         detector=kind,
@@ -166,15 +146,6 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         preprocess=dataset.preprocess,
         provenance=_provenance(dataset, parts, seed, detector.threshold, details),
     )
-
-
-def _warmed(detector: GaussianDetector, flights: list[FlightSamples]) -> GaussianDetector:
-    """Return the detector after it has learned all samples of the flights."""
-    for flight in flights:
-        for stage in Stage:
-            for deltas in flight.of_stage(stage):
-                detector.learn(deltas, stage)
-    return detector
 
 
 def scale_of(flights: list[FlightSamples]) -> FloatArray:
@@ -215,7 +186,8 @@ def mirrored(deltas: Codes) -> NDArray[np.int64]:
 def scores(detector: Detector, flight: FlightSamples) -> FloatArray:
     """Return the score of every judged message (n,): the highest score of its stages."""
     found = np.zeros(len(flight.deltas))
-    rows = zip(flight.deltas, *(_flags(flight)), strict=True)
+    flags = (flight.reports, flight.plan_steps, flight.new_waypoint)
+    rows = zip(flight.deltas, *(flag.tolist() for flag in flags), strict=True)
     for row, (deltas, report, step, new) in enumerate(rows):
         if report:
             found[row] = detector.score(deltas, Stage.PERCEPTION)
@@ -225,10 +197,6 @@ def scores(detector: Detector, flight: FlightSamples) -> FloatArray:
         if (new or step) and detector.per_stage:
             found[row] = max(found[row], detector.score(deltas, Stage.PLANNING))
     return found
-
-
-def _flags(flight: FlightSamples) -> tuple[list[bool], list[bool], list[bool]]:
-    return flight.reports.tolist(), flight.plan_steps.tolist(), flight.new_waypoint.tolist()
 
 
 def _all(flights: list[FlightSamples]) -> Codes:
@@ -247,20 +215,18 @@ def _largest(detector: Detector, flights: list[FlightSamples]) -> float:
 
 
 def _provenance(
-    dataset: Dataset, parts: _Split, seed: int, threshold: float, details: Mapping[str, Any]
+    dataset: Dataset,
+    parts: Mapping[str, Sequence[int]],
+    seed: int,
+    threshold: float,
+    details: Mapping[str, Any],
 ) -> dict[str, Any]:
-    def named(places: tuple[int, ...]) -> list[str]:
-        return [f"{dataset.flights[p].world}/{dataset.flights[p].seed}" for p in places]
-
+    names = [f"{flight.world}/{flight.seed}" for flight in dataset.flights]
     return {
         "flights": len(dataset),
         "samples": sum(len(flight.deltas) for flight in dataset.flights),
         "worlds": sorted({flight.world for flight in dataset.flights}),
-        "split": {
-            "train": named(parts.train),
-            "validation": named(parts.validation),
-            "threshold": named(parts.threshold),
-        },
+        "split": {use: [names[place] for place in places] for use, places in parts.items()},
         "seed": seed,
         "threshold": threshold,
         "versions": {
@@ -294,10 +260,6 @@ def _require_torch() -> None:
 
 def train_autoencoder(inputs: FloatArray, validation: FloatArray, *, seed: int) -> _TrainedWeights:
     """Train on scaled vectors (n, 13) and keep the best weights for the validation (m, 13).
-
-    Args:
-        inputs, validation: Scaled deltas, each vector once.
-        seed: Seed of the first start; each further start uses the next.
 
     Raises:
         ModelError: torch is not installed.

@@ -29,6 +29,7 @@ class FittedDetector:
     """A detector with its state in one flat array, which compiled code takes as one argument.
 
     Attributes:
+        flat: All of the memory as one array, the argument of compiled code.
         shapes: Names and shapes of the parts of the memory, in their order. The first part is the
             threshold, a single number.
         divisors: Parts, besides the threshold, whose numbers must all be above 0.
@@ -48,7 +49,7 @@ class FittedDetector:
 
     def __init__(self, arrays: Mapping[str, FloatArray]) -> None:
         pieces = [np.asarray(arrays[name], np.float64).ravel() for name in self.shapes]
-        self._flat: FloatArray = np.concatenate([*pieces, np.zeros(self.scratch)])
+        self.flat: FloatArray = np.concatenate([*pieces, np.zeros(self.scratch)])
         self.stack: StackMark | None = None
         self.extended: Ranges | None = None
         self._views()
@@ -58,7 +59,7 @@ class FittedDetector:
         start = 0
         for name, shape in self.shapes.items():
             end = start + math.prod(shape)
-            self._memory[name] = self._flat[start:end].reshape(shape)
+            self._memory[name] = self.flat[start:end].reshape(shape)
             start = end
 
     @property
@@ -67,21 +68,16 @@ class FittedDetector:
         return self._memory
 
     @property
-    def flat(self) -> FloatArray:
-        """All of the memory as one array, the argument of compiled code."""
-        return self._flat
-
-    @property
     def threshold(self) -> float:
         """Threshold. A score above it raises an alarm."""
-        threshold: float = self._flat.item(0)
+        threshold: float = self.flat.item(0)
         return threshold
 
     @classmethod
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
         """Create the detector of a model file; None selects the one for the default stack.
 
-        See `base.Factory`.
+        See `base.find_detector`.
         """
         path = model_file.shipped(cls.name) if model is None else model
         positive = (next(iter(cls.shapes)), *cls.divisors)
@@ -89,12 +85,12 @@ class FittedDetector:
         detector = cls(loaded.arrays)
         detector.stack, detector.extended = loaded.stack, loaded.extended
         if threshold is not None:
-            detector._flat[0] = model_file.checked_threshold(threshold)
+            detector.flat[0] = model_file.checked_threshold(threshold)
         return detector
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"flat": self._flat, "stack": self.stack, "extended": self.extended}
+        return {"flat": self.flat, "stack": self.stack, "extended": self.extended}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._flat, self.stack, self.extended = state["flat"], state["stack"], state["extended"]
+        self.flat, self.stack, self.extended = state["flat"], state["stack"], state["extended"]
         self._views()

@@ -176,9 +176,6 @@ class Gate:
         because the collision check uses a corrupted waypoint long before it is flown. The call does
         not change the gate, and the detector does not learn.
 
-        Args:
-            first: Index of the present waypoint.
-
         Returns:
             Alarm of the first bad step, which names the waypoint to drop, or alarm about extended
             states that differ from the accepted plan's.

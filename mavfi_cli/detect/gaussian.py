@@ -144,10 +144,10 @@ class GaussianDetector(FittedDetector):
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the distance of the stage's most anomalous delta from its mean, in sigmas."""
         first, end = span(stage)
-        distance: float = _farthest(self._flat, deltas, first, end)
+        distance: float = _farthest(self.flat, deltas, first, end)
         return distance
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
         """Apply equations 1 and 2 to each state of the stage."""
         first, end = span(stage)
-        _welford(self._flat, deltas, first, end)
+        _welford(self.flat, deltas, first, end)

@@ -21,7 +21,7 @@ class NormDetector(FittedDetector):
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the norm of the scaled deltas."""
-        length: float = _norm(self._flat, deltas)
+        length: float = _norm(self.flat, deltas)
         return length
 
     def learn(self, deltas: Codes, stage: Stage) -> None:

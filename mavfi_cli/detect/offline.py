@@ -128,20 +128,15 @@ def replay(
     gate = Gate(probe, protect, params)
     in_a_row = {True: 0, False: 0}
     for row, stamp_s in enumerate(messages.stamps_s.tolist()):
-        for is_report in (True, False):
-            if is_report:
-                report = messages.report(row)
-                if report is None:
-                    continue
-                alarm = gate.judge_report(report)
-            else:
-                command = messages.command(row)
-                if command is None:
-                    continue
-                ahead = flown.ahead(row, stamp_s)
-                if ahead is not None:
+        for is_report, message in ((True, messages.report(row)), (False, messages.command(row))):
+            if isinstance(message, CollisionReport):
+                alarm = gate.judge_report(message)
+            elif message is not None:
+                if (ahead := flown.ahead(row, stamp_s)) is not None:
                     gate.judge_ahead(*ahead)
-                alarm = gate.judge_tick(messages.waypoint(row), 0, command)
+                alarm = gate.judge_tick(messages.waypoint(row), 0, message)
+            else:
+                continue
             judged = _Judgement(
                 stamp_s=stamp_s,
                 report=is_report,

@@ -60,10 +60,6 @@ def of_config(config: MissionConfig) -> Briefing:
 def require_flyable(briefing: Briefing, takeoff_height_m: float, tolerance_m: float) -> None:
     """Reject a goal that is too near, too far, or outside the flight levels.
 
-    Args:
-        briefing: Briefing to check.
-        tolerance_m: Distance from the goal that counts as reached.
-
     Raises:
         ConfigError: The goal is invalid. Says why.
     """

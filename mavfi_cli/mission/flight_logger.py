@@ -19,11 +19,7 @@ PROGRESS_EVERY_S = 1.0
 
 
 class FlightLogger:
-    """Finds events by comparing each tick with the last.
-
-    Attributes:
-        events: All events so far.
-    """
+    """Finds events by comparing each tick with the last."""
 
     def __init__(self, watcher: Watcher) -> None:
         self.events: list[Event] = []

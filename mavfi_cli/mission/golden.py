@@ -7,7 +7,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from mavfi_cli.core.errors import Interrupted, RecordError
+from mavfi_cli.core.errors import Interrupted
+from mavfi_cli.core.files import writing
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import Run, load_run
 from mavfi_cli.mission.replay import config_of, interrupted
@@ -39,14 +40,14 @@ def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run
         return golden
     kept = run.folder.path / FOLDER
     note(f"flying the golden pair: {config.world}, seed {config.seed}")
-    try:
-        with tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent:
-            flown = fly_mission(config, Path(parent), Watcher())
-            if interrupted(load_run(flown.path)):
-                raise Interrupted("interrupted: the golden pair was not flown to its end")
-            if kept.is_dir():
-                shutil.rmtree(kept)
-            shutil.move(flown.path, kept)
-    except OSError as error:
-        raise RecordError(f"{kept}: {error.strerror or error}") from None
+    with (
+        writing(kept),
+        tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent,
+    ):
+        flown = fly_mission(config, Path(parent), Watcher())
+        if interrupted(load_run(flown.path)):
+            raise Interrupted("interrupted: the golden pair was not flown to its end")
+        if kept.is_dir():
+            shutil.rmtree(kept)
+        shutil.move(flown.path, kept)
     return load_run(kept)

@@ -19,7 +19,8 @@ from mavfi_cli.autonomy import collision, tracking
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.companion.kernels import ControlInput
-from mavfi_cli.core.errors import ConfigError, RecordError, TargetError
+from mavfi_cli.core.errors import ConfigError, TargetError
+from mavfi_cli.core.files import writing
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.mission.record.measures import record_of
@@ -41,7 +42,7 @@ def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
         TargetError: A flight did not reach its goal, or there are too few inputs of a kernel.
         MavfiError: The mission could not begin.
     """
-    name, recorder = flight_name(config), _flown(config)
+    name, recorder = _flight_name(config), _flown(config)
     given = {
         node: [value for value, _ in recorder.orders.get(node, [])]
         for node in ("point_cloud", "octomap", "control")
@@ -80,7 +81,7 @@ def _flown(config: MissionConfig) -> Recorder:
         flight = record_of(fly_golden(config, Path(scratch), recorder))
     if not flight.succeeded:
         problem = f"ended with {flight.outcome}: {flight.reason}"
-        raise TargetError(flight_name(config), problem)
+        raise TargetError(_flight_name(config), problem)
     return recorder
 
 
@@ -116,7 +117,9 @@ def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
             return _spread(found)
         another = replace(config, seed=seed)
         found += _hard_tasks(another, _flown(another))
-    raise TargetError(flight_name(config), "has too few plans round an obstacle, as the next seeds")
+    raise TargetError(
+        _flight_name(config), "has too few plans round an obstacle, as the next seeds"
+    )
 
 
 def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
@@ -169,18 +172,16 @@ def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
     path = folder / INPUTS
     if path.is_file():
         (known, *_), sha256 = load_inputs(path)
-        if known.flight != flight_name(config):
+        if known.flight != _flight_name(config):
             raise ConfigError(f"holds inputs of a {known.flight}", path=path)
         return {"inputs": path, "inputs_sha256": sha256, "flight": known.flight}
     inputs = record_inputs(config)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordError(f"{folder}: {error.strerror}") from None
     sha256 = save_inputs(path, inputs)
-    return {"inputs": path, "inputs_sha256": sha256, "flight": flight_name(config)}
+    return {"inputs": path, "inputs_sha256": sha256, "flight": _flight_name(config)}
 
 
-def flight_name(config: MissionConfig) -> str:
+def _flight_name(config: MissionConfig) -> str:
     """Describe a golden run in words."""
     return f"golden flight: world {config.world}, seed {config.seed}"

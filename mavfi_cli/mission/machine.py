@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
@@ -13,32 +14,27 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from enum import Enum
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-
-class CheckResult(Enum):
-    """Result of a check."""
-
-    OK = "ok"
-    LIMITED = "limited"  # flying works, but something else does not
-    FAILED = "failed"  # flying does not work
+OK = "ok"
+LIMITED = "limited"  # flying works, but something else does not
+FAILED = "failed"  # flying does not work
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """One line of the report."""
+    """One line of the report; it has a remedy unless the verdict is OK."""
 
     name: str
-    verdict: CheckResult
+    verdict: str
     found: str
     remedy: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for --json."""
-        return {**asdict(self), "verdict": self.verdict.value}
+
+def _check(name: str, found: str, *, remedy: str = "", failed: bool = False) -> Check:
+    verdict = FAILED if failed else LIMITED if remedy else OK
+    return Check(name=name, verdict=verdict, found=found, remedy=remedy)
 
 
 _WHEELS = {
@@ -63,6 +59,7 @@ sys.exit(0 if height_m > 1.0 else 1)
 _ALLOW_PTRACE = (
     "allow ptrace: sysctl kernel.yama.ptrace_scope=1; in a container --cap-add SYS_PTRACE"
 )
+_INSTALL = "pip install -e . in the project's folder"
 _EXTRAS = {"train": "torch", "cluster": "distributed"}
 
 
@@ -70,7 +67,7 @@ def check_machine() -> Iterator[Check]:
     """Run all checks in sequence and yield their results."""
     yield _python()
     yield _processor()
-    yield from _wheels()
+    yield _wheels()
     yield _extras()
     yield _disk()
     yield _loopback()
@@ -79,28 +76,24 @@ def check_machine() -> Iterator[Check]:
 
 
 def _python() -> Check:
-    version = platform.python_version()
-    good = sys.version_info >= (3, 11)
-    return Check(
-        name="Python", verdict=CheckResult.OK if good else CheckResult.FAILED, found=version,
-        remedy="" if good else "install Python 3.11 or newer",
-    )  # fmt: skip
+    old = sys.version_info < (3, 11)
+    remedy = "install Python 3.11 or newer" if old else ""
+    return _check("Python", platform.python_version(), remedy=remedy, failed=old)
 
 
 def _processor() -> Check:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     system, machine = platform.system(), platform.machine()
-    found = f"{system} {machine}, {cores} core{'s' if cores != 1 else ''} usable"
+    remedy = ""
     if system != "Linux" or machine not in ("x86_64", "aarch64"):
-        return Check(name="Processor", verdict=CheckResult.LIMITED, found=found,
-                     remedy="wheels exist for Linux on x86-64")  # fmt: skip
-    if machine == "aarch64":
-        return Check(name="Processor", verdict=CheckResult.LIMITED, found=found,
-                     remedy="jsbsim and pyoctomap have no wheel here: build them")  # fmt: skip
-    return Check(name="Processor", verdict=CheckResult.OK, found=found)
+        remedy = "wheels exist for Linux on x86-64"
+    elif machine == "aarch64":
+        remedy = "jsbsim and pyoctomap have no wheel here: build them"
+    found = f"{system} {machine}, {cores} core{'s' if cores != 1 else ''} usable"
+    return _check("Processor", found, remedy=remedy)
 
 
-def _wheels() -> Iterator[Check]:
+def _wheels() -> Check:
     missing, found = [], []
     for distribution, module in _WHEELS.items():
         try:
@@ -109,43 +102,35 @@ def _wheels() -> Iterator[Check]:
         except (ImportError, importlib.metadata.PackageNotFoundError, OSError) as error:
             missing.append(f"{distribution} ({error})")
     if missing:
-        problem = "missing: " + "; ".join(missing)
-        yield Check(name="Libraries", verdict=CheckResult.FAILED, found=problem,
-                    remedy="pip install -e . in the project's folder")  # fmt: skip
-    else:
-        yield Check(name="Libraries", verdict=CheckResult.OK, found=", ".join(found))
+        return _check("Libraries", "missing: " + "; ".join(missing), remedy=_INSTALL, failed=True)
+    return _check("Libraries", ", ".join(found))
 
 
 def _extras() -> Check:
     have = [extra for extra, module in _EXTRAS.items() if importlib.util.find_spec(module)]
     lack = [extra for extra in _EXTRAS if extra not in have]
     found = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
-    return Check(name="Extras", verdict=CheckResult.OK, found=found)
+    return _check("Extras", found)
 
 
 def _disk() -> Check:
     free = shutil.disk_usage(Path.cwd()).free / 1e9
-    good = free > 1.0
-    return Check(
-        name="Disk", verdict=CheckResult.OK if good else CheckResult.LIMITED,
-        found=f"{free:.1f} GB free here",
-        remedy="" if good else "a campaign wants more room; name another folder with --out",
-    )  # fmt: skip
+    remedy = "a campaign wants more room; name another folder with --out" if free <= 1.0 else ""
+    return _check("Disk", f"{free:.1f} GB free here", remedy=remedy)
 
 
 def _loopback() -> Check:
+    udp = functools.partial(socket.socket, socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
+        with udp() as there, udp() as here:
             there.bind(("127.0.0.1", 0))
             there.settimeout(2.0)
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
-                here.sendto(b"mavfi", there.getsockname())
-            good = there.recv(16) == b"mavfi"
+            here.sendto(b"mavfi", there.getsockname())
+            there.recv(16)
     except OSError as error:
-        return Check(name="Loopback", verdict=CheckResult.LIMITED, found=f"UDP fails: {error}",
-                     remedy="`mavfi fly` does not need it; ground stations do")  # fmt: skip
-    return Check(name="Loopback", verdict=CheckResult.OK if good else CheckResult.LIMITED,
-                 found="UDP on 127.0.0.1 works")  # fmt: skip
+        remedy = "`mavfi fly` does not need it; ground stations do"
+        return _check("Loopback", f"UDP fails: {error}", remedy=remedy)
+    return _check("Loopback", "UDP on 127.0.0.1 works")
 
 
 def _physics() -> Check:
@@ -156,10 +141,9 @@ def _physics() -> Check:
             timeout=120.0, check=False,
         )  # fmt: skip
     if run.returncode == 0:
-        return Check(name="Vehicle", verdict=CheckResult.OK, found=run.stdout.strip())
+        return _check("Vehicle", run.stdout.strip())
     last = ((run.stderr or run.stdout).strip().splitlines() or ["no message"])[-1]
-    return Check(name="Vehicle", verdict=CheckResult.FAILED, found=last,
-                 remedy="pip install -e . in the project's folder")  # fmt: skip
+    return _check("Vehicle", last, remedy=_INSTALL, failed=True)
 
 
 def _injection() -> Iterator[Check]:
@@ -168,17 +152,13 @@ def _injection() -> Iterator[Check]:
     from mavfi_cli.fi.tracer.doctor import check_counting, check_tracing
 
     if not SUPPORTED:
-        yield Check(name="Tracing", verdict=CheckResult.LIMITED, found="not Linux on x86-64",
-                    remedy="instruction-level injection is not available here")  # fmt: skip
+        remedy = "instruction-level injection is not available here"
+        yield _check("Tracing", "not Linux on x86-64", remedy=remedy)
         return
-
     for capability in (check_tracing(), check_counting()):
-        remedy = capability.remedy
-        if capability.problem is not None:
-            remedy = remedy or _ALLOW_PTRACE
-        yield Check(
-            name=capability.name,
-            verdict=CheckResult.LIMITED if remedy else CheckResult.OK,
-            found=capability.problem or capability.found,
-            remedy=remedy,
+        failed = capability.problem is not None
+        yield _check(
+            capability.name,
+            capability.problem or capability.found,
+            remedy=capability.remedy or (_ALLOW_PTRACE if failed else ""),
         )

@@ -12,6 +12,7 @@ import numpy as np
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import file_digest
+from mavfi_cli.core.states import BY_NAME
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.spec.mission import MissionConfig
@@ -21,7 +22,7 @@ HOST_SECTION = "host"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Parting:
+class _Parting:
     """First value in which two runs differ."""
 
     stamp_s: float
@@ -68,7 +69,7 @@ def differing_results(this: dict[str, Any], other: dict[str, Any]) -> list[str]:
 
 def first_difference(
     this: Run, other: Run, *, truth: bool = False, leave_out: Collection[str] = ()
-) -> Parting | None:
+) -> _Parting | None:
     """Find the first difference between the traces of two runs; None if they are equal.
 
     Within a tick the columns are compared in the order of the pipeline: perception, planning,
@@ -80,54 +81,36 @@ def first_difference(
     """
     if this.trace is None or other.trace is None:
         raise RecordError(f"{(this if this.trace is None else other).folder.path}: no trace")
-    from mavfi_cli.core.states import BY_NAME
-
-    columns = [name for name in BY_NAME if name in this.trace.column_names]
-    columns += [c for c in this.trace.column_names if c not in BY_NAME and c != "stamp_s"]
+    names = this.trace.column_names
+    columns = [name for name in BY_NAME if name in names]
+    columns += [name for name in names if name not in BY_NAME and name != "stamp_s"]
     if not truth:
         columns = [c for c in columns if not c.startswith(("truth_", "power_"))]
-    columns = [c for c in columns if c not in leave_out]
-    rows = min(this.trace.num_rows, other.trace.num_rows)
-    first: tuple[int, str] | None = None
-    for column in columns:
-        a = this.trace[column].slice(0, rows).to_pylist()
-        b = other.trace[column].slice(0, rows).to_pylist()
-        limit = rows if first is None else first[0]
-        for row in range(limit):
-            if not _same(a[row], b[row]):
-                first = (row, column)
+    stamps = this.trace["stamp_s"]
+    rows = limit = min(this.trace.num_rows, other.trace.num_rows)
+    found: _Parting | None = None
+    for column in (c for c in columns if c not in leave_out):
+        pair = (run.slice(0, limit)[column].to_pylist() for run in (this.trace, other.trace))
+        for row, (a, b) in enumerate(zip(*pair, strict=True)):
+            if not _same(a, b):
+                found = _Parting(stamp_s=stamps[row].as_py(), column=column, this=a, other=b)
+                limit = row
                 break
-    if first is None:
-        return _end(this, other, rows)
-    row, column = first
-    return Parting(
-        stamp_s=this.trace["stamp_s"][row].as_py(),
-        column=column,
-        this=this.trace[column][row].as_py(),
-        other=other.trace[column][row].as_py(),
+    if found is not None:
+        return found
+    ends = (
+        ("outcome", this.record.outcome, other.record.outcome),
+        ("ticks", this.trace.num_rows, other.trace.num_rows),
     )
-
-
-def _end(this: Run, other: Run, rows: int) -> Parting | None:
-    """Compare length and outcome of two runs with equal traces so far."""
-    assert this.trace is not None
-    stamp_s = this.trace["stamp_s"][rows - 1].as_py() if rows else 0.0
-    ends = [run.record.outcome for run in (this, other)]
-    if ends[0] != ends[1]:
-        return Parting(stamp_s=stamp_s, column="outcome", this=ends[0], other=ends[1])
-    lengths = [0 if run.trace is None else run.trace.num_rows for run in (this, other)]
-    if lengths[0] != lengths[1]:
-        return Parting(stamp_s=stamp_s, column="ticks", this=lengths[0], other=lengths[1])
+    stamp_s = stamps[rows - 1].as_py() if rows else 0.0
+    for column, a, b in ends:
+        if a != b:
+            return _Parting(stamp_s=stamp_s, column=column, this=a, other=b)
     return None
 
 
 def _same(a: Any, b: Any) -> bool:
     return bool(a == b) or (isinstance(a, float) and isinstance(b, float) and a != a and b != b)
-
-
-def same_file(this: Path, other: Path) -> bool:
-    """Return True if two files have the same bytes."""
-    return this.read_bytes() == other.read_bytes()
 
 
 def largest_deviation_m(this: Run, other: Run) -> float:

@@ -22,7 +22,7 @@ from mavfi_cli.autonomy import is_compiled, planners, warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion, Reaction
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
-from mavfi_cli.core.files import file_digest, write_parquet
+from mavfi_cli.core.files import file_digest, write_json, write_parquet
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.core.versions import installed_versions
@@ -32,7 +32,7 @@ from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.measures import record_of
-from mavfi_cli.mission.record.run_folder import CRASH, RunFolder, new_run_folder, stem_of
+from mavfi_cli.mission.record.run_folder import RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.record.tables import Timetable, write_plans, write_timetable
 from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end, start_vehicle
 from mavfi_cli.spec.mission import MissionConfig, stack_of
@@ -251,7 +251,7 @@ def _write(
         "simulated_s": flight.end_s,
         "quality_of_flight": qof,
         **_statistics(companion, flight.images),
-        "measured_platform": companion.measured if companion else None,
+        "measured_platform": companion.latency.summary() if companion else None,
         "response_time_s": response_times(companion.reactions if companion else []),
         "events": [asdict(event) for event in flight.logger.events],
         "plans": [
@@ -265,6 +265,11 @@ def _write(
         "referee": None if referee is None else {k: v for k, v in referee.items() if k != "world"},
         "versions": installed_versions(),
         "host": host,
+        **(
+            {"plan_failures": dict(companion.plan_failures)}
+            if companion and companion.plan_failures
+            else {}
+        ),
         **({"files": {name: file_digest(name) for name in config.files}} if config.files else {}),
     }
     write_parquet(folder.trace, flight.trace.table(truth))
@@ -276,8 +281,8 @@ def _write(
         told = [*(loss.traceback for loss in companion.executor.losses), crash]
     write_timetable(folder.kernels, timetable)
     if errors := [text for text in told if text]:
-        (folder.path / CRASH).write_text("\n".join(errors))
-    folder.write_result(result)
+        folder.crash.write_text("\n".join(errors))
+    write_json(folder.result, result)
 
 
 def _statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:

@@ -28,9 +28,6 @@ class VehicleInProcess:
     Args:
         folder: where the vehicle leaves briefing and truth.
 
-    Attributes:
-        link: the companion's end of the link.
-
     Raises:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
     """
@@ -151,9 +148,6 @@ def other_end(
     config: MissionConfig, launch: StartVehicle = start_vehicle
 ) -> Iterator[tuple[Transport, Vehicle | None]]:
     """Connect to a mission's foreign autopilot, or else to a simulated vehicle that starts.
-
-    Args:
-        launch: starts the simulated vehicle.
 
     Raises:
         MavfiError: the link cannot be opened, or the vehicle cannot start.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from mavfi_cli.fi.bits import told_apart
@@ -94,14 +95,15 @@ def _flight_lines(flight: FlightRecord) -> list[str]:
     if qof["flight_time_s"] is None:
         return ["Flight      none: the mission ended before the companion took over"]
     flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in flight.events)
-    asked, failed = counters["plans_requested"], counters["plans_failed"]
+    asked, failed, again = (counters[k] for k in ("plans_requested", "plans_failed", "replans"))
+    why = ", ".join(f"{reason} {n}x" for reason, n in flight.plan_failures.items())
     return [
         f"Flight      {_number(qof['flight_time_s'], 's')}, "
         f"{_number(qof['distance_m'], 'm')} flown, "
         f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
         *_clearance_and_energy(qof),
-        f"Plans       {asked} requested: {flown} flown ({counters['replans']} replans), "
-        f"{failed} failed, {asked - flown - failed} not used",
+        f"Plans       {asked} requested: {flown} flown{f' ({again} replans)' if again else ''}, "
+        f"{failed} failed{f' ({why})' if why else ''}, {asked - flown - failed} not used",
         f"Obstacles   {counters['collisions_foreseen']} collisions predicted, "
         f"{counters['slowdowns']} slowdowns, {counters['stops']} stops",
     ]
@@ -175,6 +177,17 @@ def _detection_lines(detection: Section, cost: DetectionCost | None) -> list[str
             f"{100.0 * cost.detection_share:.4f} % of the flight time"
         )
     return lines
+
+
+def folder_lines(run: Run, picture: Path | None) -> list[str]:
+    """Return the run folder, and what to look at in it."""
+    inside = "" if picture != run.folder.picture else f"  (see {run.folder.picture.name})"
+    return [
+        "",
+        f"Run folder  {run.folder.path}" + inside,
+        *([f"Traceback   {run.folder.crash}"] if run.folder.crash.is_file() else []),
+        *([f"Picture     {picture}"] if picture is not None and not inside else []),
+    ]
 
 
 def event_lines(result: dict[str, Any]) -> list[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mavfi_cli.core.errors import ConfigError, OtherStack, UnknownName
+from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import Stage
-from mavfi_cli.spec.stack import lineage, load_stack
+from mavfi_cli.spec.stack import load_stack
 
 if TYPE_CHECKING:
     from mavfi_cli.detect.base import Detector
@@ -65,16 +66,17 @@ def model_path(config: DetectorConfig, stack: str) -> Path | None:
     `detector_of` rejects the model of a base stack without `any_stack`.
 
     Args:
-        config: Configuration of the detector.
         stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
     """
     from mavfi_cli.detect.model import shipped, shipped_stacks
 
     if config.model is not None:
         return Path(config.model)
-    for each in lineage(load_stack(stack)):
-        if each.name in shipped_stacks() and (path := shipped(config.name, each.name)).is_file():
+    while stack:
+        flown = load_stack(stack)
+        if flown.name in shipped_stacks() and (path := shipped(config.name, flown.name)).is_file():
             return path
+        stack = flown.base
     return None
 
 
@@ -82,13 +84,11 @@ def detector_of(config: DetectorConfig, stack: str) -> Detector:
     """Create a new detector for a mission with the given stack.
 
     Args:
-        config: Configuration of the detector.
         stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
 
     Raises:
         UnknownName: No detector has this name. Suggests the nearest.
-        OtherStack: The model is for another stack, and `any_stack` is not set.
-        ModelError: The model cannot be used.
+        ModelError: The model cannot be used, or is for another stack without `any_stack`.
         ConfigError: The threshold is out of range, or the model lacks ranges of extended states.
     """
     from mavfi_cli.detect.base import find_detector
@@ -101,7 +101,12 @@ def detector_of(config: DetectorConfig, stack: str) -> Detector:
         flown = load_stack(stack).mark
         if made_for.digest != flown.digest:
             other = f"{made_for.name} as it was" if made_for.name == flown.name else made_for.name
-            raise OtherStack(config.name, made_for=other, flown=stack, path=path)
+            raise ModelError(
+                f"{config.name}: made for the stack {other!r}, not for {stack!r}; fit one with "
+                f"mavfi train --stack {shlex.quote(stack)}, or allow it with "
+                "--any-stack-model (any_stack in a campaign)",
+                path=path,
+            )
     watch_of(config, detector)
     return detector
 

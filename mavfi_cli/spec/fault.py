@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.states import BY_NAME
@@ -53,10 +52,6 @@ class FaultConfig:
     persistence: str = "transient"
     duration_s: float | None = None  # None: until the end of the mission
     period_s: float = 1.0
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for the record of the run."""
-        return asdict(self)
 
     @property
     def attacks_detector(self) -> bool:

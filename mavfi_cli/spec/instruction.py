@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
@@ -48,10 +48,6 @@ class InstructionConfig:
     bits: int = 1
     null: bool = False
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for the record of the run."""
-        return asdict(self)
-
     def node(self) -> str:
         """Return the target node.
 
@@ -83,6 +79,11 @@ class InstructionConfig:
                 f"{UNIFORM}, `mavfi kernels` takes both"
             )
         return chosen
+
+    def check(self) -> None:
+        """Validate the configuration. Raises as `strategy` and `node`."""
+        self.strategy()
+        self.node()
 
     def sampling_name(self) -> str:
         """Return the name of the population, which every report states."""

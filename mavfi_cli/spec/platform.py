@@ -27,7 +27,7 @@ _FOLDER = Path(__file__).parent / "platforms"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KernelLatency:
+class _KernelLatency:
     """Latency of one kernel, log-normally distributed round its median."""
 
     latency_s: float  # median latency of an invocation
@@ -48,7 +48,7 @@ class PlatformProfile:
 
     name: str
     cores: int
-    kernels: dict[str, KernelLatency]
+    kernels: dict[str, _KernelLatency]
     description: str = ""
     carried: bool = True  # False: it stays on the ground and costs the vehicle no power or lift
     power_w: float = 0.0  # thermal design power
@@ -197,7 +197,7 @@ def _measured(factor: float) -> PlatformProfile:
     return PlatformProfile(
         name=f"{MEASURED}:{factor:g}",
         cores=len(os.sched_getaffinity(0)),
-        kernels=dict.fromkeys(KERNELS, KernelLatency(latency_s=0.0, source=source)),
+        kernels=dict.fromkeys(KERNELS, _KernelLatency(latency_s=0.0, source=source)),
         description=f"{source}; needs --realtime, and does not repeat",
         carried=False,
         measured_factor=factor,
@@ -214,14 +214,14 @@ def _given(file: _PlatformFile, path: Path) -> dict[str, str]:
 
 def _kernels(
     file: _PlatformFile, base: PlatformProfile | None, path: Path
-) -> dict[str, KernelLatency]:
+) -> dict[str, _KernelLatency]:
     """Return the latency of each kernel: its own entry, or the base's times the file's factor."""
     based = {} if base is None else base.kernels
     entries = {name: _KernelEntry(scale=file.scale, source=file.sources.get("scale", ""))
                for name in based}  # fmt: skip
     kernels = {}
     for name, entry in {**entries, **file.kernels}.items():
-        under = based.get(name, KernelLatency(latency_s=0.0))
+        under = based.get(name, _KernelLatency(latency_s=0.0))
         latency_s, source = entry.latency_s, entry.source or f"set in {path.name}"
         if entry.scale is not None:
             if base is None:
@@ -233,7 +233,7 @@ def _kernels(
         assert latency_s is not None
         spread = under.spread if entry.spread is None else entry.spread
         try:
-            kernels[name] = KernelLatency(latency_s=latency_s, spread=spread, source=source)
+            kernels[name] = _KernelLatency(latency_s=latency_s, spread=spread, source=source)
         except ValueError as error:
             raise ConfigError(str(error), path=path) from None
     return kernels

@@ -11,7 +11,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -187,14 +187,6 @@ def load_stack(text: str) -> Stack:
     sources = {**values.get("sources", {}), **dict.fromkeys(changed, "this variant's name")}
     about = {"name": text, "base": name, "description": "", "sources": sources}
     return structure({**values, **changed, **about}, Stack)  # its errors are not the file's
-
-
-def lineage(stack: Stack) -> Iterator[Stack]:
-    """Yield the stack, its base, the base's base and so on. Raises as `load_stack`."""
-    yield stack
-    while stack.base:
-        stack = load_stack(stack.base)
-        yield stack
 
 
 def _values(path: Path) -> tuple[dict[str, Any], str]:

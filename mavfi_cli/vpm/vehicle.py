@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.core.config import load_shipped
+from mavfi_cli.core.config import load_toml, shipped_path
 from mavfi_cli.spec.platform import HARDWARE, LARGEST, PlatformProfile, check_hardware
 
 CALIBRATED = ("rotor_pull_n", "response_s")  # the parameters that a calibration may set
@@ -95,7 +95,7 @@ def load_vehicle(name_or_path: str) -> ModelVehicle:
         UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
         ConfigError: the file cannot be used.
     """
-    return load_shipped("vehicle", name_or_path, _VEHICLES, ModelVehicle)
+    return load_toml(shipped_path("vehicle", name_or_path, _VEHICLES), ModelVehicle)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,4 +139,4 @@ def load_board(name_or_path: str) -> Board:
         UnknownName: no shipped board has this name, and it is not a path to a TOML file.
         ConfigError: the file cannot be used.
     """
-    return load_shipped("board", name_or_path, _BOARDS, Board)
+    return load_toml(shipped_path("board", name_or_path, _BOARDS), Board)

@@ -14,7 +14,7 @@ from collections import Counter
 from pathlib import Path
 
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.core.processes import GUARD, SERVER, WORKER
+from mavfi_cli.core.fork_server import GUARD, SERVER, WORKER
 
 RUNNER, VEHICLE = "runner", "vehicle"
 VICTIMS = (RUNNER, SERVER, GUARD, WORKER)

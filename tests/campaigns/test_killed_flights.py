@@ -13,7 +13,7 @@ from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.processes import GUARD, WORKER
+from mavfi_cli.core.fork_server import GUARD, WORKER
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from killing import (
 from live_processes import none_left
 from plans import planned
 
-from mavfi_cli.core.processes import GUARD, WORKER
+from mavfi_cli.core.fork_server import GUARD, WORKER
 
 pytestmark = pytest.mark.slow
 

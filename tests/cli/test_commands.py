@@ -180,9 +180,7 @@ def test_doctor_exits_with_1_where_flying_would_not_work(command_line, monkeypat
     from mavfi_cli.mission import machine
 
     found = "missing: ompl, " + ", ".join(f"library-{number} 1.0" for number in range(20))
-    broken = machine.Check(
-        name="Libraries", verdict=machine.CheckResult.FAILED, found=found, remedy="pip"
-    )
+    broken = machine.Check(name="Libraries", verdict=machine.FAILED, found=found, remedy="pip")
     monkeypatch.setattr(machine, "check_machine", lambda: iter([broken]))
     code, out, _ = command_line("doctor")
     assert code == 1

@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 
 from mavfi_cli.campaigns.progress import Progress
-from mavfi_cli.cli.missions_view import missions_view, progress_line
+from mavfi_cli.cli.progress import missions_view, progress_line
 
 
 def progress(over, outcomes, **changes):

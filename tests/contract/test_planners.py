@@ -8,7 +8,7 @@ import pytest
 from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.occupancy import empty_snapshot
 from mavfi_cli.core import plug_ins
-from mavfi_cli.core.errors import BrokenPlugIn, UnknownName
+from mavfi_cli.core.errors import MavfiError, UnknownName
 from mavfi_cli.testing import PlannerContract
 from mavfi_cli.testing.planners import PARAMS, posed, wall_with_gap
 
@@ -78,7 +78,7 @@ def test_other_packages_plug_in_by_entry_point(plugged_in):
 
 
 def test_a_plug_in_that_does_not_load_is_an_error_of_one_line(plugged_in):
-    with pytest.raises(BrokenPlugIn, match=r"'gone' \(nowhere_at_all:Gone\) does not load: Mod"):
+    with pytest.raises(MavfiError, match=r"'gone' \(nowhere_at_all:Gone\) does not load: Mod"):
         planners.find("gone")
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from live_processes import LONG_S, children, gone
 
-from mavfi_cli.core.fork_server import PACKET, ForkServer, ForkServerFailed
-from mavfi_cli.core.processes import SERVER
+from mavfi_cli.core.fork_server import PACKET, SERVER, ForkServer, ForkServerFailed
 
 
 @pytest.fixture

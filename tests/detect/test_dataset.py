@@ -4,7 +4,7 @@ import pyarrow.parquet as pq
 import pytest
 from detect_builders import STACK, plan, trace
 
-from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.errors import ModelError, RecordError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect.dataset import Dataset
 from mavfi_cli.detect.offline import flight_of
@@ -54,10 +54,10 @@ def test_a_flight_can_be_in_a_set_only_once():
 
 def test_what_is_no_data_set_is_refused(tmp_path):
     path = tmp_path / "x.parquet"
-    with pytest.raises(ModelError, match="no readable data set"):
+    with pytest.raises(RecordError, match="no data set can be read"):
         Dataset.load(path)
     path.write_bytes(b"nonsense")
-    with pytest.raises(ModelError, match="no readable data set"):
+    with pytest.raises(RecordError, match="no data set can be read"):
         Dataset.load(path)
     pq.write_table(pa.table({"a": [1]}), path)
     with pytest.raises(ModelError, match="is no data set of mavfi"):

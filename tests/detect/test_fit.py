@@ -53,7 +53,7 @@ def parts_of(dataset, places):
 
 def test_the_split_is_by_flight_alike_in_each_world_and_drawn(dataset):
     split = fit.split(dataset, 1)
-    parts = [split.train, split.validation, split.threshold]
+    parts = [split["train"], split["validation"], split["threshold"]]
     assert [len(part) for part in parts] == [10, 2, 8]
     assert sorted(place for part in parts for place in part) == list(range(20))
     for part in parts:
@@ -79,7 +79,7 @@ def test_bad_requests(dataset):
 def test_gad_is_warmed_by_the_flights_that_set_no_threshold(dataset):
     fitted = fit.fit("gad", dataset, n_sigma=6.5)
     split = fit.split(dataset, 1)
-    learned = parts_of(dataset, [*split.train, *split.validation])
+    learned = parts_of(dataset, [*split["train"], *split["validation"]])
     x = np.concatenate([each.of_stage(Stage.PLANNING) for each in learned])[:, 2].astype(float)
     assert fitted.arrays["count"][2] == len(x)
     assert fitted.arrays["mean"][2] == pytest.approx(x.mean())
@@ -94,7 +94,7 @@ def test_a_threshold_is_the_largest_score_of_flights_that_training_did_not_see(
     fitted = fit.fit(kind, dataset)
     model.save(tmp_path / "m.json", fitted)
     detector = base.find_detector(kind, model=tmp_path / "m.json")
-    held_out = parts_of(dataset, fit.split(dataset, 1).threshold)
+    held_out = parts_of(dataset, fit.split(dataset, 1)["threshold"])
     images = fit.mirrored(np.concatenate([each.deltas for each in held_out])).astype(np.int16)
     largest = max(detector.score(deltas, Stage.CONTROL) for deltas in images)
     assert detector.threshold == largest > 0.0

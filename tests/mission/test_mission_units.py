@@ -273,7 +273,7 @@ def test_what_the_companion_knows_by_itself():
 
 def test_a_world_without_boxes_has_no_clearance():
     data = {**circle(), "clearance_m": np.full(2001, math.inf)}
-    assert quality.from_truth(data, 0.0, 99.0, np.zeros(3)).min_clearance_m is None
+    assert quality.from_truth(data, 0.0, 99.0, np.zeros(3))["min_clearance_m"] is None
 
 
 # Response time -------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from mavfi_cli.mission.replay import (
     differing_results,
     first_difference,
     largest_deviation_m,
-    same_file,
 )
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.report.summary import difference_lines
@@ -82,8 +81,8 @@ def test_a_vehicle_whose_flight_has_ended_stays_where_it_is(sideways):
 
 def test_a_fault_repeats_to_the_byte(sideways, tmp_path):
     again = load_run(fly_mission(config_of(sideways), tmp_path, Watcher()).path)
-    assert same_file(again.folder.trace, sideways.folder.trace)
-    assert same_file(again.folder.tlog, sideways.folder.tlog)
+    assert again.folder.trace.read_bytes() == sideways.folder.trace.read_bytes()
+    assert again.folder.tlog.read_bytes() == sideways.folder.tlog.read_bytes()
     assert not differing_results(again.result, sideways.result)
 
 

@@ -235,9 +235,12 @@ def select(names: Iterable[str]) -> tuple[str, ...]:
 
     Raises:
         UnknownName: there is no kernel of a name; names the nearest.
+        TargetError: a file has no kernel.
     """
     chosen = list(names)
     files = [str(Path(name).resolve()) for name in chosen if name.endswith(".py")]
+    for file in files:
+        find(file)
     wanted = {find(name).name for name in chosen if not name.endswith(".py")}
     if not chosen:
         wanted = set(KERNELS)

@@ -150,7 +150,7 @@ class KernelPlace:
         try:
             scope: KernelScope = receive(process.connection)
         except (OSError, EOFError):
-            raise TargetError(self.name, f"does not load: {process.last_words()}") from None
+            raise TargetError(self.name, f"cannot be attacked: {process.last_words()}") from None
         return _Layout(scope=scope, image=Image(pid, scope.regions), digest=digest_of_code)
 
     def start(self) -> Tracee:

@@ -43,7 +43,7 @@ def find(name: str) -> Planner:
 
     Raises:
         UnknownName: No planner has this name. Suggests the nearest.
-        BrokenPlugIn: Its package does not load.
+        MavfiError: Its package does not load.
     """
     plain = canonical_planner(name)
     if plain in _OURS:

@@ -71,7 +71,6 @@ class Corruption:
     Attributes:
         bits: number of distinct bits of `field` that are flipped.
         duration_s: duration of a stuck-at or intermittent fault, s.
-        period_s: time between two strikes of an intermittent fault, s.
     """
 
     effect: Effect = Effect.FLIP

@@ -12,7 +12,7 @@ import json
 import pickle
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,7 +26,7 @@ from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import FaultError, RecordError
-from mavfi_cli.core.files import own_digest, write_atomically
+from mavfi_cli.core.files import own_digest, write_atomically, writing
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.tracer import record
@@ -45,20 +45,16 @@ CACHE = ".profiles"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlannedFault:
-    """One exact instruction-level fault of a mission.
-
-    Attributes:
-        node: the attacked node.
-        order: number of the node's order in which the fault strikes, from 1.
-        context: further entries of the record: kernel, invocation, simulated time, sampling.
-        recorded: the repeated record; None for a drawn fault.
-    """
+    """One exact instruction-level fault of a mission."""
 
     fault: InstructionFault
-    node: str
-    order: int
-    context: Mapping[str, Any]
-    recorded: Mapping[str, Any] | None = None
+    context: Mapping[str, Any]  # further entries of the record, by the names of _CONTEXT
+    recorded: Mapping[str, Any] | None = None  # the repeated record; None for a drawn fault
+
+    @property
+    def order(self) -> int:
+        """Number of the node's order in which the fault strikes, from 1."""
+        return int(self.context["node_invocation"])
 
 
 def _plan_fault(
@@ -68,12 +64,7 @@ def _plan_fault(
     versions: Mapping[str, str],
     fly_golden: Callable[[MissionConfig, Path, Recorder], object],
 ) -> _PlannedFault:
-    """Draw the fault of a mission and a seed.
-
-    Args:
-        out: the folder below which golden runs and profiles are kept.
-        fly_golden: function that flies a mission into a folder and records it.
-    """
+    """Draw the fault of a mission and a seed; arguments as for `injection_of`."""
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
     golden = replace(config, fault=None, instruction=None, detector=None, isolate=())
@@ -116,10 +107,10 @@ def _plan_fault(
         "windows": found.windows,
         "profiled_instructions": found.executed,
         "seed": asked.seed,
-        "request": asked.to_dict(),
+        "request": asdict(asked),
     }
     struck = replace(fault, corruption=None) if asked.null else fault
-    return _PlannedFault(fault=struck, node=node, order=drawn.order, context=context)
+    return _PlannedFault(fault=struck, context=context)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,13 +156,7 @@ def _planned_of(recorded: Mapping[str, Any]) -> _PlannedFault:
         context = {name: recorded[name] for name in _CONTEXT}
     except KeyError as error:
         raise RecordError(f"the fault record is damaged: it has no {error}") from None
-    return _PlannedFault(
-        fault=fault,
-        node=context["node"],
-        order=context["node_invocation"],
-        context=context,
-        recorded=recorded,
-    )
+    return _PlannedFault(fault=fault, context=context, recorded=recorded)
 
 
 _CONTEXT = (
@@ -186,10 +171,8 @@ def _kept(path: Path, make: Callable[[], T]) -> T:
         kept: T = pickle.loads(path.read_bytes())
         return kept
     value = make()
-    try:
+    with writing(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordError(f"{path.parent}: {error.strerror or error}") from None
     write_atomically(path, lambda file: pickle.dump(value, file))
     return value
 
@@ -207,14 +190,10 @@ def _key(golden: MissionConfig, versions: Mapping[str, str]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-_TIMING = ("stop_s",)
-
-
 class _InstructionInjection(NoInjection):
     """One instruction-level fault in one mission; messages pass unchanged.
 
     Args:
-        spawned: the process that will be the attacked node.
         for_debugger: called when the node waits for a debugger at the injected instruction.
     """
 
@@ -232,10 +211,7 @@ class _InstructionInjection(NoInjection):
         self._tracer: TracerThread[LiveAttack] | None = None
         self._told = False
         self._finished: Callable[[], int] = lambda: 0
-
-    @property
-    def node(self) -> str:
-        return self._planned.node
+        self.node = str(planned.context["node"])
 
     def begin(self, path: Path) -> None:
         self._path = path
@@ -318,7 +294,7 @@ class _InstructionInjection(NoInjection):
 
 def _in_result(written: Mapping[str, Any]) -> dict[str, Any]:
     """A fault record as result.json carries it: the same in every repetition."""
-    injection = {k: v for k, v in written["injection"].items() if k not in _TIMING}
+    injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
     state = "applied" if injection["applied"] else "not_injected"
     if written["corruption"] is None and not written.get("not_injected_reason"):
         state = "null"

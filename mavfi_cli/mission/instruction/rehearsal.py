@@ -153,18 +153,14 @@ def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
     Raises:
         TracingForbidden: the operating system neither counts nor lets us trace.
     """
-    spawned, counter = ServedProcess(PROGRAM), None
-    counts = []
-    try:
+    spawned, counts = ServedProcess(PROGRAM), []
+    with contextlib.ExitStack() as leaving:
+        leaving.callback(spawned.kill)
         scope = spawned.begin(setup, f"node {setup.node}")
         address = Image(spawned.pid, scope.regions).address(scope.entry)
-        counter = EntryCounter(spawned.pid, address)
+        counter = leaving.enter_context(contextlib.closing(EntryCounter(spawned.pid, address)))
         process = NodeProcess(spawned.connection, spawned.pid)
         for value, start_s in orders:
             process.take(process.order(setup.node, value, start_s))
             counts.append(counter.read())
-    finally:
-        if counter is not None:
-            counter.close()
-        spawned.kill()
     return counts

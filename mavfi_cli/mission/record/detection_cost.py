@@ -33,18 +33,12 @@ class DetectionCost:
     """Cost of a detector in one flight.
 
     Attributes:
-        checks: Number of checks by the gate, including checks of whole plans.
-        checks_host_s: Total host time of the checks, s.
         flight_s: Flight time, or simulated time of the whole mission if that is unknown, s.
         recomputations: Number of recomputations per stage. The record lists the first alarms and
             only counts the others, which are distributed over the stages in the same ratio.
             Numbers may therefore be fractions.
         recovery_s: Simulated time of the recomputations per stage, each at the mean latency of its
             kernels in this flight, s.
-        compute_s: Simulated time of all kernels, recomputations included, s.
-        host_compute_s: Host time of all kernels, recomputations included, s.
-        platform: Name of the platform in the mission's configuration.
-        faulty: Whether the flight has a fault.
     """
 
     detector: str
@@ -82,9 +76,6 @@ class DetectionCost:
 def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
     """Compute the cost of detection and recovery in a flight.
 
-    Args:
-        result: Contents of result.json.
-
     Returns:
         Cost; None without a detector or without any check.
     """
@@ -99,6 +90,13 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
     if not checks or not flight_s:
         return None
     again = _recomputations(detection)
+
+    def mean_s(kernel: Mapping[str, Any] | None) -> float:
+        """Return the mean latency of an invocation, s."""
+        if not kernel or not kernel["invocations"]:
+            return 0.0
+        return float(kernel["busy_s"] / kernel["invocations"])
+
     return DetectionCost(
         detector=detection["detector"],
         checks=checks,
@@ -106,7 +104,7 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
         flight_s=flight_s,
         recomputations=again,
         recovery_s={
-            stage: math.fsum(again[stage] * _mean_s(kernels.get(name)) for name in names)
+            stage: math.fsum(again[stage] * mean_s(kernels.get(name)) for name in names)
             for stage, names in RECOMPUTED.items()
         },
         compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
@@ -123,8 +121,3 @@ def _recomputations(detection: Mapping[str, Any]) -> dict[str, float]:
     return {
         stage: listed.count(stage) * total / len(listed) if listed else 0.0 for stage in RECOMPUTED
     }
-
-
-def _mean_s(kernel: Mapping[str, Any] | None) -> float:
-    """Return the mean latency of an invocation, s."""
-    return kernel["busy_s"] / kernel["invocations"] if kernel and kernel["invocations"] else 0.0

@@ -58,6 +58,7 @@ class FlightRecord:
     pilot: Record = field(default_factory=dict)
     events: Sequence[dict[str, Any]] = ()
     plans: Sequence[Record] = ()
+    plan_failures: Mapping[str, int] = field(default_factory=dict)  # by reason; if any failed
     fault: Record = field(default_factory=dict)
     detection: Record = field(default_factory=dict)
     nodes: Record = field(default_factory=dict)
@@ -99,9 +100,6 @@ def measures_of(record: Record) -> dict[str, Any]:
     the goal's tolerance; `crashed`, whether a node died; `struck_s`, `struck_sites` and
     `first_bits`, when the fault was applied, and to what; `alarms`, those that are listed, oldest
     first; `episodes`, alarms in a row counted once; and STRUCK.
-
-    Args:
-        record: result.json, or what is known of it.
     """
     nodes: Record = record.get("nodes") or {}
     return {

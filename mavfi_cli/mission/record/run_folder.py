@@ -1,7 +1,4 @@
-"""The folder of one run: result.json, flight.svg, flight.tlog and tables.
-
-The tables are trace.parquet, plans.parquet and kernels.parquet.
-"""
+"""The folder of one run."""
 
 from __future__ import annotations
 
@@ -11,69 +8,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.files import read_parquet, write_json
+from mavfi_cli.core.files import read_parquet, writing
 from mavfi_cli.mission.record.measures import FlightRecord, record_of
 from mavfi_cli.spec.stack import FIRST
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-RESULT = "result.json"
-TRACE = "trace.parquet"
-PLANS = "plans.parquet"
-KERNELS = "kernels.parquet"
-TLOG = "flight.tlog"
-PICTURE = "flight.svg"
-FAULT = "fault.json"
-CRASH = "crash.txt"
-_SECTIONS = ("outcome", "config", "quality_of_flight", "pilot", "events", "versions", "host")
-_NEEDED = ("outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "host")
+RESULT, FAULT = "result.json", "fault.json"
+_NEEDED = (
+    "outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "versions", "host",
+)  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
 class RunFolder:
     """Paths in a run folder."""
 
-    path: Path
-
-    @property
-    def result(self) -> Path:
-        """Path of result.json: outcome, quality of flight, seeds, versions, configuration."""
-        return self.path / RESULT
-
-    @property
-    def trace(self) -> Path:
-        """Path of trace.parquet: states at every control tick."""
-        return self.path / TRACE
-
-    @property
-    def plans(self) -> Path:
-        """Path of plans.parquet: every waypoint of every plan."""
-        return self.path / PLANS
-
-    @property
-    def kernels(self) -> Path:
-        """Path of kernels.parquet: start and end of every invocation."""
-        return self.path / KERNELS
-
-    @property
-    def tlog(self) -> Path:
-        """Path of flight.tlog: every MAVLink frame of both directions."""
-        return self.path / TLOG
-
-    @property
-    def picture(self) -> Path:
-        """Path of flight.svg: top view of the flight."""
-        return self.path / PICTURE
-
-    @property
-    def fault(self) -> Path:
-        """Path of the fault record, which is on disk before the fault strikes."""
-        return self.path / FAULT
-
-    def write_result(self, result: dict[str, Any]) -> None:
-        """Write result.json atomically."""
-        write_json(self.result, result)
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.result = path / RESULT  # outcome, quality of flight, seeds, versions, configuration
+        self.trace = path / "trace.parquet"  # states at every control tick
+        self.plans = path / "plans.parquet"  # every waypoint of every plan
+        self.kernels = path / "kernels.parquet"  # start and end of every invocation
+        self.tlog = path / "flight.tlog"  # every MAVLink frame of both directions
+        self.picture = path / "flight.svg"  # top view of the flight
+        self.fault = path / FAULT  # fault record, on disk before the fault strikes
+        self.crash = path / "crash.txt"  # tracebacks of the companion and of nodes
 
 
 def stem_of(world: str) -> str:
@@ -88,11 +48,10 @@ def new_run_folder(parent: Path, stem: str) -> RunFolder:
     Raises:
         RecordError: The folder cannot be created.
     """
-    try:
+    with writing(parent):
         parent.mkdir(parents=True, exist_ok=True)
-        taken = [int(p.name.rpartition("-")[2]) for p in parent.glob(f"{stem}-[0-9]*")
-                 if p.name.rpartition("-")[2].isdigit()]  # fmt: skip
-        number = max(taken, default=0) + 1
+        ends = (path.name.rpartition("-")[2] for path in parent.glob(f"{stem}-[0-9]*"))
+        number = max((int(end) for end in ends if end.isdigit()), default=0) + 1
         while True:
             path = parent / f"{stem}-{number:03d}"
             try:
@@ -100,8 +59,7 @@ def new_run_folder(parent: Path, stem: str) -> RunFolder:
                 return RunFolder(path)
             except FileExistsError:
                 number += 1
-    except OSError as error:
-        raise RecordError(f"{parent}: {error.strerror or error}") from None
+    raise AssertionError("unreachable")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +96,7 @@ def load_run(path: str | Path) -> Run:
         raise RecordError(f"{folder.path}: damaged ({error})") from None
     if not isinstance(result, dict) or result.get("schema") != 1:
         raise RecordError(f"{folder.result}: written by another version of mavfi")
-    lacking = [name for name in _SECTIONS if name not in result]
-    if lacking:
-        raise RecordError(f"{folder.result}: damaged (without {', '.join(lacking)})")
-    missing = [key for key in _NEEDED if key not in result]
-    if missing:
+    if missing := [key for key in _NEEDED if key not in result]:
         raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")
     # Records from before the introduction of stacks flew the stack FIRST.
     result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}

@@ -61,11 +61,7 @@ class Trace:
         trajectory: tuple[Trajectory, int] | None,
         command: Command | None,
     ) -> None:
-        """Add a tick: the companion's inputs and decisions.
-
-        Args:
-            trajectory: Tracked trajectory and index of its present waypoint.
-        """
+        """Add a tick: the companion's inputs and decisions."""
         self._stamps.append(stamp_s)
         self._phases.append(phase)
         self._vehicle.append(
@@ -186,7 +182,6 @@ class Timetable:
     Attributes:
         invocations: Invocations in the order of their starts. An output takes effect at the end,
             unless the node died or was killed.
-        reactions: Responses from a depth frame to the first setpoint that depends on it.
     """
 
     invocations: Sequence[Invocation] = ()

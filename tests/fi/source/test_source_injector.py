@@ -19,8 +19,7 @@ from mavfi_cli.fi.source.fault import (
     When,
     draw_fault,
 )
-from mavfi_cli.fi.source.injector import SourceInjector, Strike
-from mavfi_cli.fi.source.schedule import Moment
+from mavfi_cli.fi.source.injector import Moment, SourceInjector, Strike
 
 TRAJECTORY = Trajectory(
     stamp_s=0.0,

@@ -22,7 +22,7 @@ def test_missions_and_source_level_faults_need_no_tracer():
     done = elsewhere(
         "import mavfi_cli.mission.run, mavfi_cli.fi.tracer.sampling, mavfi_cli.attack.campaign\n"
         "from mavfi_cli.mission.machine import check_machine\n"
-        "print([c.verdict.value for c in check_machine() if c.name == 'Tracing'])"
+        "print([c.verdict for c in check_machine() if c.name == 'Tracing'])"
     )
     assert (done.stdout.strip(), done.stderr) == ("['limited']", "")
 
