@@ -10,9 +10,8 @@ import statistics
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from mavfi_cli.companion.executor import Invocation
-from mavfi_cli.companion.pipeline import SAME_TICK_S, Reaction
-from mavfi_cli.core.types import Outcome
+from mavfi_cli.companion.pipeline import SAME_TICK_S
+from mavfi_cli.core.types import Invocation, Outcome, Reaction
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.record.tables import read_timetable
 from mavfi_cli.spec.platform import KERNELS

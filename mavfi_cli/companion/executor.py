@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from mavfi_cli.companion.node_process import NodeLost, NodeProcess
+from mavfi_cli.core.types import Invocation
 from mavfi_cli.core.wall import WallClock
 
 In = TypeVar("In")
@@ -121,15 +122,6 @@ class _Job:
             wall.add(self.node.name, host_s)
             self.done = True
         return self.output
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Invocation:
-    """A row of the timetable: node, start and end of an invocation."""
-
-    node: str
-    start_s: float
-    end_s: float
 
 
 @dataclass(slots=True)

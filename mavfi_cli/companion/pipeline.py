@@ -36,6 +36,7 @@ from mavfi_cli.core.types import (
     Command,
     DepthFrame,
     PointCloud,
+    Reaction,
     Stage,
     Trajectory,
     VehicleState,
@@ -80,14 +81,6 @@ class Setpoint:
     waypoint: int  # index in the trajectory of the inputs
     attempt: int  # number of recomputations
     frame_s: float | None  # stamp of a depth frame that no earlier command has used
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reaction:
-    """Response of the pipeline to one depth frame."""
-
-    frame_stamp_s: float
-    setpoint_stamp_s: float
 
 
 class Companion:

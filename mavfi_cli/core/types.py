@@ -118,6 +118,23 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Invocation:
+    """A row of the timetable: node, start and end of an invocation."""
+
+    node: str
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reaction:
+    """Response of the pipeline to one depth frame."""
+
+    frame_stamp_s: float
+    setpoint_stamp_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StackMark:
     """Identity of the companion's stack. Error-free flights differ between stacks.
 

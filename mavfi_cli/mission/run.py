@@ -20,11 +20,11 @@ import numpy as np
 
 from mavfi_cli.autonomy import is_compiled, planners, warm_up
 from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.companion.pipeline import Companion, Reaction
+from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.files import file_digest, write_json, write_parquet
 from mavfi_cli.core.processes import interruptible
-from mavfi_cli.core.types import Outcome
+from mavfi_cli.core.types import Outcome, Reaction
 from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.link.images import ImageReceiver
 from mavfi_cli.mission import briefing

@@ -3,9 +3,8 @@
 import pytest
 
 from mavfi_cli.analysis.timeline import chain_of, timeline_of, timelines, typical
-from mavfi_cli.companion.executor import Invocation
-from mavfi_cli.companion.pipeline import Reaction
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.types import Invocation, Reaction
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.record.tables import Timetable, read_timetable, write_timetable
 

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.companion.pipeline import Reaction
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName, VehicleProcessError
 from mavfi_cli.core.files import (
     plain,
@@ -20,7 +19,7 @@ from mavfi_cli.core.files import (
     write_text,
 )
 from mavfi_cli.core.states import STATES
-from mavfi_cli.core.types import CollisionReport, Command, Trajectory, VehicleState
+from mavfi_cli.core.types import CollisionReport, Command, Reaction, Trajectory, VehicleState
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.run_folder import load_run, new_run_folder

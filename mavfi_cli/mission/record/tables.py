@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mavfi_cli.companion.executor import Invocation
-from mavfi_cli.companion.pipeline import Reaction
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import read_parquet, write_parquet
 from mavfi_cli.core.states import BY_NAME, STATES, DType, Message, State
@@ -18,6 +16,8 @@ from mavfi_cli.core.types import (
     WAYPOINT_FIELDS,
     CollisionReport,
     Command,
+    Invocation,
+    Reaction,
     Trajectory,
     VehicleState,
 )
