@@ -90,9 +90,12 @@ def read(path: Path) -> Model:
         odd = sorted(set(data) ^ _KEYS)
         raise ModelError(f"corrupt model file: keys {', '.join(odd)}", path=path)
     try:
-        return structure(data, Model)
+        model = structure(data, Model)
     except ConfigError as error:
         raise ModelError(f"corrupt model file: {error}", path=path) from None
+    if asdict(model.preprocess) != data["preprocess"]:
+        raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
+    return model
 
 
 def load(

@@ -64,7 +64,7 @@ def test_what_is_saved_is_loaded_exactly(path):
         ({"preprocess": {"yaw_floor": 1.5}}, "corrupt model file: preprocess.yaw_floor: expected"),
         ({"preprocess": {"nonsense": 1}}, "corrupt model file: preprocess.nonsense: unknown key"),
         ({"preprocess": [1]}, "preprocess: expected a table, got"),
-        ({"preprocess": {"yaw_floor": -2}}, "made with another preprocessing"),
+        ({"preprocess": {"yaw_floor": -1}}, "preprocess: parameters are missing"),
         ({"preprocess": {"position_floor": 5000}}, "corrupt model file: preprocess"),
         ({"provenance": []}, "provenance: expected a table, got"),
         ({"provenance": None}, "corrupt model file: keys provenance"),
