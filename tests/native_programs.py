@@ -117,6 +117,37 @@ int main(void) {
     printf("%d %d\\n", WEXITSTATUS(status), left);
     return 0;
 }""",
+    # Bad guests: what the first argument names.
+    "guest": """
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+int main(int c, char **v) {
+    if (!strcmp(v[1], "prints")) for (int i = 0; i < 10000000; i++) puts("0123456789");
+    if (!strcmp(v[1], "eats")) {
+        for (long i = 0; i < 3000; i++) {
+            char *p = malloc(1 << 20); if (!p) return 9;
+            p[0] = 1;
+        }
+    }
+    if (!strcmp(v[1], "writes")) { int f = open(v[2], O_WRONLY | O_CREAT, 0644); write(f, "x", 1); }
+    if (!strcmp(v[1], "asks") && open("/dev/tty", O_RDWR) < 0) {
+        fputs("no terminal here\\n", stderr); return 1;
+    }
+    if (!strcmp(v[1], "waits")) pause();
+    if (!strcmp(v[1], "reads")) { char t[9]; FILE *f = fopen("in", "r"); puts(fgets(t, 9, f)); }
+    if (!strcmp(v[1], "pipes")) {
+        int p[2]; char t[2]; pipe(p);
+        if (fork() == 0) { pause(); return 0; }
+        read(p[0], t, 1);
+    }
+    if (!strcmp(v[1], "execs")) execlp("true", "true", NULL);
+    if (!strcmp(v[1], "says")) puts(getenv(v[2]) ? getenv(v[2]) : "nothing");
+    puts("done");
+    return 0;
+}""",
     # Known outcomes: `victim` is the attacked function.
     "benign": """
 #include <stdio.h>
@@ -178,12 +209,14 @@ def native_program(tmp_path_factory):
         pytest.skip(reason)
     folder = tmp_path_factory.mktemp("native")
 
-    def build(name):
-        path = folder / name
+    def build(name, *options):
+        path = folder / "".join((name, *options))
         if not path.exists():
             source = folder / f"{name}.c"
             source.write_text(SOURCES[name])
-            subprocess.run([compiler, "-O1", "-pthread", "-o", str(path), str(source)], check=True)
+            subprocess.run(
+                [compiler, "-O1", "-pthread", *options, "-o", str(path), str(source)], check=True
+            )
         return path
 
     return build

@@ -114,6 +114,7 @@ def run_campaign(
     folder: Path | None = None,
     progress: Progress = lambda _name, _done: None,
     stage: Stage = lambda _: None,
+    notice: Stage = lambda _: None,
 ) -> list[TargetRuns]:
     """Make golden run, profile, fault list and runs of every target.
 
@@ -123,6 +124,7 @@ def run_campaign(
             Runs that are already there are not repeated.
         progress: called with the target and the number of its completed runs; with 0 before its
             golden run and profile.
+        notice: called with what the user should know about a golden run.
 
     Raises:
         TracingForbidden: the operating system refuses.
@@ -134,7 +136,7 @@ def run_campaign(
         names = [target.stream[0] for target in targets if target.stream]
         journal = Journal(folder, plan.to_json(targets[0]), runs=plan.runs, kernels=names or None)
     with _AttackWorkers(jobs) as workers:
-        return [_attack(plan, each, workers, journal, progress, stage) for each in targets]
+        return [_attack(plan, each, workers, journal, progress, stage, notice) for each in targets]
 
 
 def _attack(
@@ -144,11 +146,12 @@ def _attack(
     journal: Journal | None,
     progress: Progress,
     stage: Stage,
+    notice: Stage,
 ) -> TargetRuns:
     begun = time.perf_counter()
     progress(target.name, 0)
     with one_processor():
-        prepared, place = _prepare(plan, target, stage)
+        prepared, place = _prepare(plan, target, stage, notice)
     stage(f"drawing {plan.runs} faults")
     golden = tuple(each.golden for each in prepared.inputs)
     bench = _Bench(plan=plan, target=prepared.target, golden=golden)
@@ -167,7 +170,9 @@ def _attack(
     return replace(prepared, records=records, wall_s=time.perf_counter() - begun)
 
 
-def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns, JudgedPlace]:
+def _prepare(
+    plan: Plan, target: AttackTarget, stage: Stage, notice: Stage
+) -> tuple[TargetRuns, JudgedPlace]:
     """Make golden run and profile; return them with the place where they were made."""
     begun = time.perf_counter()
     stage("loading")
@@ -176,6 +181,8 @@ def _prepare(plan: Plan, target: AttackTarget, stage: Stage) -> tuple[TargetRuns
         undo.callback(place.close)
         stage("golden runs")
         golden = tuple(golden_run(each) for each in places_of(place))
+        for text in dict.fromkeys(text for run in golden for text in run.notices):
+            notice(text)
         rng = _Bench(plan=plan, target=target, golden=golden).generator("profile")
         profiles: list[TargetProfile | None] = [None] * len(golden)
         if plan.strategy().rule is Rule.INSTRUCTION:

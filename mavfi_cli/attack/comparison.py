@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,6 +13,7 @@ from mavfi_cli.attack.target import Difference
 from mavfi_cli.core.errors import ConfigError
 
 STDOUT = "stdout"
+LARGEST_BYTES = 64 << 20  # of one compared output
 _SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
 
 
@@ -54,6 +55,13 @@ class OutputComparison:
             ignored=tuple(_pattern(text) for text in ignored),
         )
 
+    @classmethod
+    def from_json(cls, told: Mapping[str, Any]) -> OutputComparison:
+        """Make the comparison of which `to_json` told."""
+        names = told["file"] if isinstance(told["file"], list) else [told["file"]]
+        outputs = [STDOUT if name is None else f"file:{name}" for name in names]
+        return cls.of(outputs, tolerance=told["tolerance"], ignored=told.get("ignored", ()))
+
     def to_json(self) -> dict[str, Any]:
         """The entries that results depend on."""
         names: list[str | None] = [None] if self.stdout else []
@@ -67,7 +75,7 @@ class OutputComparison:
         """Read a run's outputs, by name; None for a file that it did not write."""
         found: dict[str, bytes | None] = {}
         if self.stdout:
-            found[STDOUT] = self._kept(stdout.read_bytes())
+            found[STDOUT] = self._kept(_beginning(stdout))
         for name in self.files:
             data = _read_inside(folder, name)
             found[name] = None if data is None else self._kept(data)
@@ -127,7 +135,13 @@ def _read_inside(folder: Path, name: str) -> bytes | None:
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()) or not path.is_file():
         return None
-    return path.read_bytes()
+    return _beginning(path)
+
+
+def _beginning(path: Path) -> bytes:
+    """The contents of a file, cut behind what is compared."""
+    with path.open("rb") as file:
+        return file.read(LARGEST_BYTES + 1)
 
 
 def compared(golden: bytes, output: bytes) -> Difference | None:

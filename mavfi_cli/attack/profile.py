@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,7 @@ STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
 _NOTHING = "executes nothing that may be hit"
 _CHECKED = 4  # instructions whose counts are checked, besides the most executed
+Guard = Callable[[Tracee], AbstractContextManager[object]]
 _FIRST = np.array([1])
 
 
@@ -62,6 +63,7 @@ def profile_run(
     enough: int = ENOUGH,
     limit: int = STEPS,
     watch: Watch | None = None,
+    guard: Guard = nullcontext,
 ) -> TargetProfile:
     """Step a golden run, or a sample of the windows that markers cut it into.
 
@@ -71,6 +73,7 @@ def profile_run(
         windows: the least number of windows of each marker to step, after half as many as a pilot.
         enough: more windows are stepped while they have at most this many instructions together,
             by the length of the pilot's.
+        guard: makes the context in which a run is stepped.
 
     Raises:
         TargetError: no instruction in scope executes, or the run does not repeat itself.
@@ -78,9 +81,9 @@ def profile_run(
     """
     begun = time.perf_counter()
     ends = (*markers, *([end] if end else []))
-    strata = [_Stepper(place, None, ends, limit, watch).step(_FIRST, 1)]
+    strata = [_Stepper(place, None, ends, limit, watch, guard).step(_FIRST, 1)]
     for marker in markers:
-        stepper = _Stepper(place, marker, ends, limit, watch)
+        stepper = _Stepper(place, marker, ends, limit, watch, guard)
         pilot, others = np.split(rng.permutation(stepper.count()) + 1, [max(1, windows // 2)])
         if not len(pilot):
             continue
@@ -116,18 +119,20 @@ def profile_calls(
     windows: int,
     limit: int = STEPS,
     watch: Watch | None = None,
+    guard: Guard = nullcontext,
 ) -> TargetProfile:
     """Step calls of one function, which is drawn in proportion to its calls.
 
     Args:
         windows: the most calls to step.
+        guard: makes the context in which a run is stepped.
 
     Raises:
         WindowTooLong: too many instructions.
         TargetError: none of the functions is ever called.
     """
     begun = time.perf_counter()
-    steppers = [_Stepper(place, entry, None, limit, watch) for entry in functions]
+    steppers = [_Stepper(place, entry, None, limit, watch, guard) for entry in functions]
     counts = [stepper.count() for stepper in steppers]
     if not any(counts):
         with _started(place) as tracee:
@@ -246,6 +251,7 @@ class _Stepper:
     markers: tuple[Location, ...] | None  # where windows end; None: when the function returns
     limit: int
     watch: Watch | None = None
+    guard: Guard = nullcontext
 
     def count(self) -> int:
         """Count the windows of a run."""
@@ -265,7 +271,7 @@ class _Stepper:
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:
         """Step windows of one run, until one lies inside the window before it."""
-        with _started(self.place) as tracee:
+        with _started(self.place) as tracee, self.guard(tracee):
             image = self.place.image(tracee)
             address = -1 if self.marker is None else image.address(self.marker)
             passed = 0

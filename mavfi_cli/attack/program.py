@@ -5,13 +5,16 @@ A program that is not short is profiled by exact execution counts.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import shutil
+import signal
+import stat
 import tempfile
 import time
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
-from mavfi_cli.attack.comparison import OutputComparison, compared, joined
+from mavfi_cli.attack.comparison import LARGEST_BYTES, STDOUT, OutputComparison, compared, joined
 from mavfi_cli.attack.counts import callgrind, read_counts, run_counted
+from mavfi_cli.attack.outcome import signal_name
 from mavfi_cli.attack.profile import (
     function_of,
     profile_calls,
@@ -40,15 +44,19 @@ from mavfi_cli.attack.target import (
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
+from mavfi_cli.fi.tracer.watched import Watched, watch
 
 
 def absolute_arguments(
     argv: Iterable[str], directory: Path, written: Iterable[str]
 ) -> Iterator[str]:
-    """Make arguments that name existing files absolute: the program runs in a scratch folder.
+    """Make arguments that name files absolute: the program runs in a folder of its own.
+
+    An argument that names an existing file is changed, and one with a slash that names a folder.
 
     Args:
         directory: the folder that they are relative to.
@@ -57,13 +65,42 @@ def absolute_arguments(
     own = {str(PurePosixPath(name)) for name in written}
     for argument in argv:
         path = directory / argument
-        if str(PurePosixPath(argument)) in own or argument.startswith("/") or not path.is_file():
+        named = path.is_file() or ("/" in argument and path.is_dir())
+        if str(PurePosixPath(argument)) in own or argument.startswith("/") or not named:
             yield argument
         else:
             yield str(path.resolve())
 
 
+def require_attackable(path: Path) -> None:
+    """Refuse a program that cannot be attacked.
+
+    Raises:
+        TargetError: a script, a set-uid program, or one for another processor.
+    """
+    with path.open("rb") as file:
+        head = file.read(256)
+    if head.startswith(b"#!"):
+        shell = head[2:].split(b"\n")[0].decode(errors="replace").strip()
+        program, _, option = shell.removeprefix("/usr/bin/env ").partition(" ")
+        line = " ".join(part for part in (option, str(path)) if part)
+        raise TargetError(
+            path.name,
+            f"is a script; attack its interpreter: --program {program} --args {line!r}",
+        )
+    if head[:5] != b"\x7fELF\x02" or head[18:20] != b"\x3e\0":
+        raise TargetError(path.name, "is no program for x86-64")
+    if path.stat().st_mode & (stat.S_ISUID | stat.S_ISGID):
+        raise TargetError(
+            path.name,
+            "is set-uid or set-gid: traced it has only your rights, and corrupted it must not have "
+            "more; attack a copy",
+        )
+
+
 _SHORT = 100_000  # instructions that are stepped rather than counted
+_STEP_LIMIT_S = 1e-3  # for one stepped instruction, about forty times what it takes
+_WATCHING = 20.0  # watching the system calls makes a run at most so much slower
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +111,7 @@ class ProgramTarget:
     comparison: OutputComparison
     objects: tuple[str, ...] = ()  # file names in scope; by default the program itself
     function: str | None = None  # hit only calls of this function
+    folder: Path | None = None  # each run works in a copy of it; None: in an empty folder
     limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
 
@@ -105,7 +143,29 @@ class ProgramTarget:
 
     def known(self) -> dict[str, Any]:
         """Everything that its results depend on."""
-        return self.context() | {"comparison": self.comparison.to_json()}
+        return self.context() | {
+            "comparison": self.comparison.to_json(),
+            "environment": dict(self.command.environment),
+            "memory_bytes": self.command.memory_bytes,
+            "folder": None if self.folder is None else str(self.folder),
+        }
+
+    @classmethod
+    def of_plan(cls, plan: Mapping[str, Any]) -> ProgramTarget:
+        """Make the target of which `known` told."""
+        command = Program.of(
+            plan["program"],
+            environment=plan["environment"],
+            stdin=Path(plan.get("stdin", os.devnull)),
+            memory_bytes=plan["memory_bytes"],
+        )
+        return cls(
+            command=command,
+            comparison=OutputComparison.from_json(plan["comparison"]),
+            objects=tuple(plan["scope"]),
+            function=plan["function"],
+            folder=None if plan["folder"] is None else Path(plan["folder"]),
+        )
 
     def open(self) -> Workplace:
         """Make a scratch folder for its runs."""
@@ -113,26 +173,28 @@ class ProgramTarget:
 
 
 class Workplace:
-    """A scratch folder with the output files of one worker.
+    """A scratch folder of one worker, with a folder in which the program runs, new for every run.
 
-    Nothing outside it is ever removed. If files are compared, the program runs in a folder in it
-    that is made anew for every run.
+    Nothing outside it is ever removed.
+
+    Raises:
+        TargetError: the program is of a kind that cannot be attacked.
     """
 
     kind = "program"
 
     def __init__(self, target: ProgramTarget) -> None:
+        require_attackable(Path(target.command.argv[0]))
         self.target, self.limits = target, target.limits
         self._golden: Golden | None = None
+        self._watched: Watched | None = None
         scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
         self._remove = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
         self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
         self._counts = scratch / "counts"
-        self._folder = scratch / "run" if target.comparison.files else None
-        self._command = target.command
-        if self._folder is not None:
-            self._folder.mkdir()
-            self._command = replace(target.command, directory=self._folder)
+        self._folder = scratch / "run"
+        self._folder.mkdir()
+        self._command = replace(target.command, directory=self._folder)
 
     @property
     def name(self) -> str:
@@ -156,13 +218,14 @@ class Workplace:
         return tracee
 
     def _renew_folder(self) -> None:
-        if self._folder is None:
-            return
         try:
             shutil.rmtree(self._folder)  # follows no link
-            self._folder.mkdir()
+            if self.target.folder is None:
+                self._folder.mkdir()
+            else:
+                shutil.copytree(self.target.folder, self._folder, symlinks=True)
         except OSError as error:
-            problem = f"leaves files in its scratch folder that cannot be removed: {error}"
+            problem = f"its folder cannot be made anew for the next run: {error}"
             raise TargetError(self.name, problem) from None
 
     def image(self, tracee: Tracee) -> Image:
@@ -179,8 +242,7 @@ class Workplace:
 
     def _parts(self) -> dict[str, bytes | None]:
         """The outputs of the last run, by name."""
-        folder = self._folder or self._command.directory
-        return self.target.comparison.parts(folder, self._stdout)
+        return self.target.comparison.parts(self._folder, self._stdout)
 
     def profile(
         self, rng: np.random.Generator, *, windows: int = 16, watch: Watch | None = None
@@ -192,61 +254,154 @@ class Workplace:
             UnknownName: no such object or function.
             TargetError: the function is never called, or the counts are not those of a run.
         """
+        if (watched := self._watch()).company:
+            raise TargetError(
+                self.name,
+                f"{watched.company}, which is not followed: nothing there could be counted or hit; "
+                "attack a program with one thread (--env OMP_NUM_THREADS=1 makes one of "
+                "some)",
+            )
         function, limit = self.target.function, self.limits.profile_steps
         if function is not None:
-            entry = function_of(self, function)
-            return profile_calls(self, rng, [entry], windows=windows, limit=limit, watch=watch)
+            return profile_calls(
+                self, rng, [function_of(self, function)], windows=windows, limit=limit,
+                watch=watch, guard=self._guard,
+            )  # fmt: skip
         if callgrind() is None:
-            return profile_run(self, rng, limit=limit, watch=watch)
+            return profile_run(self, rng, limit=limit, watch=watch, guard=self._guard)
         try:
-            return profile_run(self, rng, limit=min(limit, _SHORT), watch=watch)
+            short = min(limit, _SHORT)
+            return profile_run(self, rng, limit=short, watch=watch, guard=self._guard)
         except WindowTooLong:
             return self._counted(rng)
 
+    @contextlib.contextmanager
+    def _guard(self, tracee: Tracee) -> Iterator[None]:
+        """Give a stepped run a deadline, and compare it with the golden run if it ends."""
+        wall_s = self._watching_s + self.limits.profile_steps * _STEP_LIMIT_S
+        with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
+            yield
+        if alarm.fired:
+            raise TargetError(self.name, f"does not end within {wall_s:.0f} s when it is stepped")
+        if tracee.ended is not None:
+            self._require_golden("stepped", tracee.ended)
+
     def _counted(self, rng: np.random.Generator) -> TargetProfile:
         """Count the executions of a whole run by callgrind, and check some of them."""
-        begun, golden = time.perf_counter(), self._golden or self.fault_free()
+        begun = time.perf_counter()
         self._renew_folder()
         code = run_counted(
             self._command, stdout=self._stdout, stderr=self._stderr, counts=self._counts,
-            wall_s=golden.wall_s,
+            wall_s=self._known_golden().wall_s,
         )  # fmt: skip
-        counted = replace(golden, output=joined(self._parts()), exit_code=code)
-        if unlike := self.unlike(golden, counted):
-            problem = "does not run under callgrind as it does without, so it cannot be counted"
-            raise TargetError(self.name, f"{problem}: {unlike}")
+        self._require_golden("run under callgrind", Ended(exit_code=code, signal=None))
         profile = profile_counted(self, lambda paths: read_counts(self._counts, paths), begun)
         self._counts.unlink()
         require_counts(self, profile, rng)
         return profile
 
+    def _require_golden(self, how: str, ended: Ended) -> None:
+        """Refuse a profile if the profiled run has not ended and printed as the golden run."""
+        golden = self._known_golden()
+        if ended.signal is not None:
+            unlike = f"it is killed by {signal_name(ended.signal)}"
+        else:
+            again = replace(golden, output=joined(self._parts()), exit_code=ended.exit_code or 0)
+            unlike = self.unlike(golden, again)
+        if unlike:
+            problem = f"does not do the same when it is {how}, so it has no profile: {unlike}"
+            raise TargetError(self.name, problem)
+
+    def _known_golden(self) -> Golden:
+        return self._golden or self.fault_free()
+
+    @property
+    def _watching_s(self) -> float:
+        golden_s = self.limits.golden_s if self._golden is None else self._golden.wall_s
+        return _WATCHING * golden_s + self.limits.wall_grace_s
+
+    def _watch(self) -> Watched:
+        """What the program does in a fault-free run, found out once."""
+        if self._watched is None:
+            tracee = self.start()
+            try:
+                self._watched = watch(tracee, wall_s=min(self._watching_s, self.limits.golden_s))
+            finally:
+                tracee.kill()
+        return self._watched
+
     def fault_free(self) -> Golden:
         """Run once without a fault, timed from the entry point.
 
         Raises:
-            TargetError: a signal kills it, or it does not write a compared file.
+            TargetError: it does not end in time or by itself, lacks memory or a terminal, prints
+                too much, or does not write a compared file.
         """
         before_s = _children_cpu_s()
         tracee = self.start()
         before_s += linux.cpu_time_s(tracee.pid)
-        start = time.perf_counter()
-        ended = run_out(tracee)
-        if ended.exit_code is None:
-            raise TargetError(self.name, f"is killed by signal {ended.signal} without a fault")
+        start, limit_s = time.perf_counter(), self.limits.golden_s
+        with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=limit_s) as alarm:
+            ended = run_out(tracee)
+        tracee.kill()  # with what it has started
+        if alarm.fired:
+            raise TargetError(self.name, f"does not end within {limit_s:g} s without a fault")
+        wall_s, cpu_s = time.perf_counter() - start, _children_cpu_s() - before_s
         parts = self._parts()
-        if missing := [name for name, data in parts.items() if data is None]:
-            raise TargetError(
-                self.name,
-                f"writes no file {missing[0]} in the folder in which it runs, so there is nothing "
-                "to compare",
-            )
-        self._golden = Golden(
-            output=joined(parts),
-            exit_code=ended.exit_code,
-            cpu_s=_children_cpu_s() - before_s,
-            wall_s=time.perf_counter() - start,
+        self._require_sound(ended, parts)
+        golden = Golden(
+            output=joined(parts), exit_code=ended.exit_code or 0, cpu_s=cpu_s, wall_s=wall_s
         )
-        return self._golden
+        self._golden = self._golden or golden
+        return replace(golden, notices=tuple(self._notices()))
+
+    def _require_sound(self, ended: Ended, parts: Mapping[str, bytes | None]) -> None:
+        """Refuse a golden run with which no other can be compared."""
+        problem = self._failure(ended)
+        for name, data in parts.items():
+            if data is None:
+                problem = problem or (
+                    f"writes no file {name} in the folder in which it runs, so there is nothing to "
+                    "compare"
+                )
+            elif len(data) > LARGEST_BYTES:
+                what = "prints" if name == STDOUT else f"writes to {name}"
+                problem = problem or (
+                    f"{what} more than {LARGEST_BYTES >> 20} MB, the most that is compared: let it "
+                    "print less, or compare another output"
+                )
+        if problem:
+            raise TargetError(self.name, problem)
+
+    def _failure(self, ended: Ended) -> str:
+        """Why a fault-free run has failed; empty if it has not."""
+        if ended.signal == signal.SIGXFSZ:
+            return "writes more than 1 GB, and is stopped there"
+        if ended.exit_code == 0:
+            return ""
+        how = f"ends with exit code {ended.exit_code} without a fault"
+        if ended.signal is not None:
+            how = f"is killed by {signal_name(ended.signal)} without a fault"
+        how, silent = how + self._last_words(), self._stdout.stat().st_size == 0
+        watched, limit_bytes = self._watch(), self._command.memory_bytes
+        if watched.lacked_memory and limit_bytes is not None:
+            return f"{how}: it needs more than {limit_bytes / (1 << 30):g} GB; --memory allows more"
+        if watched.terminal and silent:
+            return f"{how}: it wants a terminal, and a campaign gives it none"
+        return how if ended.signal is not None else ""
+
+    def _last_words(self) -> str:
+        lines = self._stderr.read_text(errors="replace").strip().splitlines()
+        return f" ({lines[-1][:200]})" if lines else ""
+
+    def _notices(self) -> Iterator[str]:
+        outside = [p for p in self._watch().written if not Path(p).is_relative_to(self._folder)]
+        if outside:
+            more = f" and {len(outside) - 1} more" if len(outside) > 1 else ""
+            yield (
+                f"{self.name} writes outside its folder: {outside[0]}{more}; runs share that, and "
+                "faults may damage it"
+            )
 
     def unlike(self, golden: Golden, again: Golden) -> str:
         """How two fault-free runs differ; empty if they are equal."""

@@ -32,6 +32,7 @@ class RunLimits:
 
     factor: float = 10.0  # multiple of the golden CPU time and duration
     cpu_grace_s: float = 1.0
+    golden_s: float = 120.0  # of a run without a fault
     wall_grace_s: float = 5.0  # for delays on a loaded machine; only a blocked target waits as long
     follow_window: int = 64  # instructions after a destination fault
     profile_steps: int = 2_000_000  # of one window
@@ -45,6 +46,7 @@ class Golden:
     cpu_s: float
     wall_s: float
     exit_code: int = 0
+    notices: tuple[str, ...] = ()  # what the user should know about it
 
     @property
     def sha256(self) -> str:

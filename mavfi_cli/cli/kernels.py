@@ -47,6 +47,13 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
               "[stdout].")  # fmt: skip
 @_native("--ignore-lines", multiple=True, metavar="REGEX",
          help="Do not compare lines that contain a match. May be repeated.")  # fmt: skip
+@_native("--folder", type=click.Path(exists=True, file_okay=False, path_type=Path),
+         help="Folder of which each run gets a copy to work in  [an empty folder].")  # fmt: skip
+@_native("--env", multiple=True, metavar="NAME=VALUE",
+         help="Environment variable of the program. May be repeated.")  # fmt: skip
+@_native("--memory", default=2.0, show_default=True, metavar="GB",
+         type=click.FloatRange(min=0.0, min_open=True),
+         help="Largest memory of the program.")  # fmt: skip
 @_native("--scope", multiple=True, help="Shared object to attack. May be repeated.")
 @_native("--function", help="Attack only code that executes during calls of this function.")
 @_fault("--sampling", default="instruction-uniform", show_default=True,
@@ -94,8 +101,9 @@ def kernels(**options: Any) -> None:
         refuse_given(("kernel", "world", "world_seed"), "goes without --program")
         _attack_program(options)
     else:
+        programs = "args compare ignore_lines stdin_file folder env memory scope function"
         refuse_given(
-            ("args", "compare", "ignore_lines", "stdin_file", "scope", "function"),
+            programs.split(),
             "needs --program",
         )
         _attack_kernels(options)
@@ -136,6 +144,7 @@ def _attacked(
             folder=folder,
             progress=view.show,
             stage=view.stage,
+            notice=lambda text: click.echo(f"warning: {text}", err=True),
         )
 
 
@@ -188,7 +197,7 @@ def _attack_program(options: dict[str, Any]) -> None:
 def _program(options: dict[str, Any]) -> AttackTarget:
     from mavfi_cli.attack.comparison import OutputComparison
     from mavfi_cli.attack.program import ProgramTarget, absolute_arguments
-    from mavfi_cli.fi.tracer.spawn import Program
+    from mavfi_cli.fi.tracer.spawn import Program, kept_environment
 
     comparison = OutputComparison.of(
         options["compare"], tolerance=options["tolerance"], ignored=options["ignore_lines"]
@@ -197,15 +206,26 @@ def _program(options: dict[str, Any]) -> AttackTarget:
         arguments = shlex.split(options["args"] or "")
     except ValueError as error:
         raise ConfigError(str(error), key="args") from None
-    if comparison.files:
-        arguments = list(absolute_arguments(arguments, Path.cwd(), comparison.files))
-    stdin = (options["stdin_file"] or Path(os.devnull)).resolve()
+    command = Program.of(
+        [options["program"], *absolute_arguments(arguments, Path.cwd(), comparison.files)],
+        environment=kept_environment() | dict(map(_variable, options["env"])),
+        stdin=(options["stdin_file"] or Path(os.devnull)).resolve(),
+        memory_bytes=round(options["memory"] * (1 << 30)),
+    )
     return ProgramTarget(
-        command=Program.of([options["program"], *arguments], stdin=stdin),
+        command=command,
         comparison=comparison,
+        folder=None if options["folder"] is None else options["folder"].resolve(),
         objects=tuple(options["scope"]),
         function=options["function"],
     )
+
+
+def _variable(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise ConfigError(f"{text!r} is not NAME=VALUE", key="env")
+    return name, value
 
 
 def _save(

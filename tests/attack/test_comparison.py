@@ -23,16 +23,15 @@ from mavfi_cli.fi.tracer.tracee import Ended
 
 @pytest.fixture
 def place(native_program, tmp_path):
-    """Function from a shell script and what is compared to the place where it runs."""
+    """Function from a script of the shell and what is compared to the place where it runs."""
     native_program("counting")  # skips where nothing can be traced
     places = []
 
     def make(script, *outputs, **options):
         path = tmp_path / "script"
-        path.write_text(f"#!/bin/sh\n{script}\n")
-        path.chmod(0o755)
+        path.write_text(f"{script}\n")
         target = ProgramTarget(
-            command=Program.of([str(path)]),
+            command=Program.of(["sh", str(path)]),
             comparison=OutputComparison.of(outputs, **options),
         )
         places.append(target.open())

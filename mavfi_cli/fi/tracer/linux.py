@@ -22,16 +22,18 @@ from mavfi_cli.core.errors import TracingForbidden
 from mavfi_cli.fi.tracer import linux
 
 PEEKUSER, POKEUSER = 3, 6
-CONT, SINGLESTEP, DETACH = 7, 9, 17
+CONT, SINGLESTEP, DETACH, SYSCALL = 7, 9, 17, 24
 GETSIGINFO, GETREGSET, SETREGSET = 0x4202, 0x4204, 0x4205
 SEIZE, INTERRUPT, LISTEN = 0x4206, 0x4207, 0x4208
 
 OPTION_EXITKILL = 1 << 20
-TRACE_OPTIONS = (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4)  # fork, vfork, clone, exec
+TRACE_OPTIONS = (
+    1 | (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4)
+)  # marked call stops, fork, vfork, clone, exec
 EVENT_FORK, EVENT_VFORK, EVENT_CLONE, EVENT_EXEC, EVENT_STOP = 1, 2, 3, 4, 128
 WALL = 0x4000_0000
 ADDR_NO_RANDOMIZE = 0x0040000
-_AT_ENTRY = 9
+_AT_ENTRY, _AT_RANDOM = 9, 25
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _ptrace = _libc.ptrace
@@ -179,9 +181,24 @@ def cpu_time_s(pid: int) -> float:
 
 
 def entry_point(pid: int) -> int | None:
-    """The address at which a program begins, from its auxiliary vector."""
+    """The address at which a program begins."""
+    return _auxiliary(pid, _AT_ENTRY)
+
+
+def fix_random_bytes(pid: int, memory: Memory) -> None:
+    """Replace the random bytes that the kernel hands to a program that has not begun.
+
+    libc makes its stack canary of them.
+    """
+    place = _auxiliary(pid, _AT_RANDOM)
+    if place is not None:
+        memory.write(place, bytes(range(1, 17)))
+
+
+def _auxiliary(pid: int, key: int) -> int | None:
+    """A value of the auxiliary vector of a program."""
     words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
-    return next((value for key, value in words if key == _AT_ENTRY), None)
+    return next((value for name, value in words if name == key), None)
 
 
 @dataclass(frozen=True, slots=True)

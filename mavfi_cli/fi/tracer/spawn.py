@@ -17,11 +17,17 @@ from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee, best_mechanism
 
 # The shell says that it runs (so that its own exec is over) and waits for one line (so that the
 # tracer is attached before the program starts).
-# No core files, and no endless output of a corrupted program (in blocks of 512 bytes).
+# No core files, no endless output (in blocks of 512 bytes) and no endless memory (KiB) of a
+# corrupted program, and nothing in its environment that depends on where it runs.
 _LAUNCHER = (
-    "ulimit -c 0; ulimit -f 2097152; echo >&3 && read -r go <&3 && "
-    'cd -- "$1" && shift && exec "$@" 3<&-'
+    'ulimit -c 0; ulimit -f 2097152; ulimit -v "$1"; echo >&3 && read -r go <&3 && '
+    'cd -- "$2" && shift 2 && unset PWD OLDPWD && exec "$@" 3<&-'
 )
+
+
+MEMORY_BYTES = 2 << 30
+_KEPT = frozenset(("HOME", "LANG", "LANGUAGE", "LD_LIBRARY_PATH", "PATH", "TZ"))
+_KEPT_BEGINNINGS = ("LC_", "OMP_", "OPENBLAS_", "MKL_")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +38,7 @@ class Program:
     directory: Path
     environment: tuple[tuple[str, str], ...]
     stdin: Path = Path(os.devnull)
+    memory_bytes: int | None = MEMORY_BYTES  # largest address space; None: not limited
 
     @classmethod
     def of(
@@ -41,8 +48,13 @@ class Program:
         directory: Path | None = None,
         environment: Mapping[str, str] | None = None,
         stdin: Path = Path(os.devnull),
+        memory_bytes: int | None = MEMORY_BYTES,
     ) -> Program:
         """Make a command whose program is looked up on the path.
+
+        Args:
+            environment: by default those of our own variables that say where things are, in which
+                language to speak, and how many threads to start.
 
         Raises:
             TargetError: no such program, or it cannot be executed.
@@ -50,13 +62,23 @@ class Program:
         found = shutil.which(argv[0])
         if found is None:
             raise TargetError(argv[0], "no such program, or it is not executable")
-        chosen = os.environ if environment is None else environment
+        chosen = kept_environment() if environment is None else environment
         return cls(
             argv=(str(Path(found).resolve()), *argv[1:]),
             directory=(directory or Path.cwd()).resolve(),
             environment=tuple(sorted(chosen.items())),
             stdin=stdin,
+            memory_bytes=memory_bytes,
         )
+
+
+def kept_environment() -> dict[str, str]:
+    """Our own environment without what changes from shell to shell: it lies in memory."""
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if name in _KEPT or name.startswith(_KEPT_BEGINNINGS)
+    }
 
 
 def spawn(
@@ -82,6 +104,7 @@ def spawn(
             ours.send(b"\n")
             undo.pop_all()
     _await_exec(tracee, command)
+    linux.fix_random_bytes(tracee.pid, tracee.memory)
     return tracee
 
 
@@ -103,7 +126,8 @@ def _launch(command: Program, stdout: Path, stderr: Path, channel: int) -> int:
         (os.POSIX_SPAWN_OPEN, 2, str(stderr), truncate, 0o644),
         (os.POSIX_SPAWN_DUP2, channel, 3),
     ]
-    arguments = ["sh", "-c", _LAUNCHER, "sh", str(command.directory), *command.argv]
+    limit = "unlimited" if command.memory_bytes is None else str(command.memory_bytes >> 10)
+    arguments = ["sh", "-c", _LAUNCHER, "sh", limit, str(command.directory), *command.argv]
     with linux.fixed_addresses():
         return os.posix_spawn(
             "/bin/sh",

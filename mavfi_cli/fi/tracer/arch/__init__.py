@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from mavfi_cli.core.errors import TracingForbidden
 from mavfi_cli.fi.tracer.arch.interface import (
+    Asked,
     Detour,
     Flow,
     Instruction,
@@ -25,6 +26,7 @@ from mavfi_cli.fi.tracer.arch.interface import (
 SUPPORTED = platform.system() == "Linux" and platform.machine() == "x86_64"
 
 if SUPPORTED or TYPE_CHECKING:
+    from mavfi_cli.fi.tracer.arch.x86_64.calls import asked, call_name, lacks_memory
     from mavfi_cli.fi.tracer.arch.x86_64.decode import address_of, decode, widest_vector
     from mavfi_cli.fi.tracer.arch.x86_64.detour import detour_code, flow, prepare_system_call
     from mavfi_cli.fi.tracer.arch.x86_64.jumps import JUMP_FLAGS, inverting_bits
@@ -59,11 +61,13 @@ else:
     TRAITS = Registers = DebugBreakpoint = _Refusing()
     decode = address_of = erase_trap = record_steps = return_address = TRAITS
     all_registers = register_kind = widest_vector = width_of = TRAITS
+    asked = call_name = lacks_memory = TRAITS
     JUMP_FLAGS = inverting_bits = detour_code = flow = prepare_system_call = TRAITS
 
 __all__ = [
-    "JUMP_FLAGS", "SUPPORTED", "TRAITS", "DebugBreakpoint", "Detour", "Flow", "Instruction",
-    "MemoryUse", "RegisterUse", "Registers", "Traits", "address_of", "all_registers", "decode",
-    "detour_code", "erase_trap", "flow", "inverting_bits", "prepare_system_call", "record_steps",
-    "register_kind", "return_address", "widest_vector", "width_of",
+    "JUMP_FLAGS", "SUPPORTED", "TRAITS", "Asked", "DebugBreakpoint", "Detour", "Flow",
+    "Instruction", "MemoryUse", "RegisterUse", "Registers", "Traits", "address_of",
+    "all_registers", "asked", "call_name", "decode", "detour_code", "erase_trap", "flow",
+    "inverting_bits", "lacks_memory", "prepare_system_call", "record_steps", "register_kind",
+    "return_address", "widest_vector", "width_of",
 ]  # fmt: skip

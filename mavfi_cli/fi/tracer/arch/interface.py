@@ -84,6 +84,16 @@ class Flow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What a system call asks for; the defaults for one that does not matter."""
+
+    path: str = ""
+    folder: int | None = None  # descriptor of the folder of a relative path; None: the working one
+    writes: bool = False  # it changes the file or folder
+    terminal: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Traits:
     """One processor architecture under Linux."""
 
