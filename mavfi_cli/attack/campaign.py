@@ -12,6 +12,7 @@ import contextlib
 import multiprocessing
 import os
 import pickle
+import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -266,11 +267,26 @@ Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn
 def one_processor() -> Iterator[None]:
     """Stay on one processor: tracer and target switch all the time, which is fastest there."""
     before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, [max(before)])
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
+    with contextlib.closing(_claim_processor()):
+        try:
+            yield
+        finally:
+            os.sched_setaffinity(0, before)
+
+
+def _claim_processor() -> socket.socket:
+    """Stay on a processor that no other campaign has claimed; closing the result gives it up.
+
+    The claim is a name that one socket on the machine can have, so it ends with its process. If
+    all are claimed, the process is not bound to any.
+    """
+    claim = socket.socket(socket.AF_UNIX)
+    for processor in sorted(os.sched_getaffinity(0), reverse=True):
+        with contextlib.suppress(OSError):
+            claim.bind(f"\0mavfi-processor-{processor}")
+            os.sched_setaffinity(0, [processor])
+            break
+    return claim
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -330,8 +346,11 @@ def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     return results
 
 
-def _settle(queue: Any) -> None:
-    os.sched_setaffinity(0, [queue.get()])
+_claims: list[socket.socket] = []  # of a worker process, for its life
+
+
+def _settle() -> None:
+    _claims.append(_claim_processor())
 
 
 class _AttackWorkers:
@@ -344,12 +363,7 @@ class _AttackWorkers:
     def __enter__(self) -> _AttackWorkers:
         if self._jobs > 1:
             context = multiprocessing.get_context("spawn")
-            processors, queue = sorted(os.sched_getaffinity(0)), context.Queue()
-            for worker in range(self._jobs):
-                queue.put(processors[worker % len(processors)])
-            self._pool = ProcessPoolExecutor(
-                self._jobs, mp_context=context, initializer=_settle, initargs=(queue,)
-            )
+            self._pool = ProcessPoolExecutor(self._jobs, mp_context=context, initializer=_settle)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -135,7 +135,7 @@ def profile_calls(
     steppers = [_Stepper(place, entry, None, limit, watch, guard) for entry in functions]
     counts = [stepper.count() for stepper in steppers]
     if not any(counts):
-        with _started(place) as tracee:
+        with started(place) as tracee:
             image = place.image(tracee)
         names = " or ".join(short_name(image.symbol(entry)) for entry in functions)
         raise TargetError(place.name, f"never calls {names}")
@@ -191,7 +191,7 @@ def require_counts(place: AttackPlace, profile: TargetProfile, rng: np.random.Ge
         if run.reached[index] < run.counts[index]:
             continue
         count, address = int(run.counts[index]), int(run.addresses[index])
-        with _started(place) as tracee:
+        with started(place) as tracee:
             stages = run.stages(index, count, profile.image.locate)
             reached = all(
                 tracee.run_to(profile.image.address(each.location), each.count, each.detour)
@@ -213,14 +213,14 @@ def function_of(place: AttackPlace, name: str) -> Location:
     Raises:
         UnknownName: there is no function of that name; names the nearest.
     """
-    with _started(place) as tracee:
+    with started(place) as tracee:
         image = place.image(tracee)
         return image.function(name, place.scope(image).objects)
 
 
 @contextmanager
-def _started(place: AttackPlace) -> Iterator[Tracee]:
-    """A run of the place, which is killed afterwards."""
+def started(place: AttackPlace) -> Iterator[Tracee]:
+    """A run of a place, which is killed afterwards."""
     tracee = place.start()
     try:
         yield tracee
@@ -235,7 +235,7 @@ def _profile(place: AttackPlace, strata: Iterable[Stratum], begun: float) -> Tar
 
 
 def _code(place: AttackPlace) -> tuple[Image, tuple[tuple[int, bytes], ...], Scope]:
-    with _started(place) as tracee:
+    with started(place) as tracee:
         image = place.image(tracee)
         scope = place.scope(image)
         code = tuple((s.start, tracee.memory.read(s.start, len(s) + 16)) for s in scope.spans)
@@ -256,7 +256,7 @@ class _Stepper:
     def count(self) -> int:
         """Count the windows of a run."""
         assert self.marker is not None
-        with _started(self.place) as tracee:
+        with started(self.place) as tracee:
             return tracee.count_to_end(self.place.image(tracee).address(self.marker))
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
@@ -271,7 +271,7 @@ class _Stepper:
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:
         """Step windows of one run, until one lies inside the window before it."""
-        with _started(self.place) as tracee, self.guard(tracee):
+        with started(self.place) as tracee, self.guard(tracee):
             image = self.place.image(tracee)
             address = -1 if self.marker is None else image.address(self.marker)
             passed = 0

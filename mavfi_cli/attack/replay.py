@@ -1,4 +1,4 @@
-"""Repeats recorded runs of kernels bit by bit."""
+"""Repeats recorded runs of kernels and programs bit by bit."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from mavfi_cli.attack.journal import read_plan, read_runs
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.inputs import INPUTS
 from mavfi_cli.attack.kernels.target import KernelTarget
+from mavfi_cli.attack.profile import started
+from mavfi_cli.attack.program import ProgramTarget
+from mavfi_cli.attack.target import AttackTarget, places_of
 from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.fi.tracer import record
 
 # A replay must repeat these entries; durations are not among them.
 _COMPARED = (
-    "outcome", "signal", "error", "magnitude", "within_tolerance", "output_sha256",
+    "outcome", "signal", "exit_code", "error", "magnitude", "within_tolerance", "output_sha256",
     "not_injected_reason", "activation",
 )  # fmt: skip
 _INJECTION = ("applied", "reason", "address", "before", "after")
@@ -28,7 +31,7 @@ _INJECTION = ("applied", "reason", "address", "before", "after")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Replay:
-    kernel: str
+    target: str  # name of the kernel or program
     run: int
     differs: tuple[str, ...]  # keys of the record that differ; empty if it is identical
     record: dict[str, Any]
@@ -39,38 +42,58 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
 
     Args:
         kernels: names of the kernels; all of ours if none is named.
-        runs: number of runs of each kernel, from the first; 0 for all.
+        runs: number of runs of each kernel, or of the program, from the first; 0 for all.
 
     Raises:
-        RecordError: the folder has no kernel runs that can be repeated.
+        RecordError: the folder has no runs that can be repeated.
         BuildMismatch: a record is of another build; says what differs.
     """
-    plan = read_plan(folder)
-    if "inputs_sha256" not in plan:
-        raise RecordError(f"{folder}: holds runs of a program; only our kernels' can be repeated")
-    if plan.get("sources") != own_digest():  # other code has another memory layout
-        raise BuildMismatch(["our own code"])
-    found = False
-    for kernel in catalogue.select(kernels):
-        name = catalogue.find(kernel).name
-        records = [e for e in read_runs(folder) if e.get("kernel") == name and e["trigger"]]
+    plan, found = read_plan(folder), False
+    for target in _targets(plan, folder, kernels):
+        of_it = [e for e in read_runs(folder) if (e.get("kernel"),) == (target.stream or (None,))]
+        records = [entry for entry in of_it if entry["trigger"]]
         if not records:
             continue
         found = True
-        tolerance = float(plan["tolerance"])
-        target = KernelTarget(kernel=kernel, inputs=folder / INPUTS, tolerance=tolerance)
         with one_processor(), closing(target.open()) as place:
-            attackers = [Attacker(place=each, golden=golden_run(each)) for each in place.inputs]
+            places = places_of(place)
+            attackers = [Attacker(place=each, golden=golden_run(each)) for each in places]
+            with started(places[0]) as tracee:
+                image = places[0].image(tracee)
             for entry in records[: runs or None]:
-                record.require_same_build(entry, place.layout.image)
+                record.require_same_build(entry, image)
                 yield _replay(attackers[entry.get("input", 0)], entry)
     if not found:
         raise RecordError(f"{folder}: no runs that can be repeated")
 
 
+def _targets(
+    plan: dict[str, Any], folder: Path, kernels: tuple[str, ...]
+) -> Iterator[AttackTarget]:
+    if "program" in plan:
+        if kernels:
+            raise RecordError(f"{folder}: holds runs of a program, not of {' and '.join(kernels)}")
+        try:
+            target = ProgramTarget.of_plan(plan)
+        except KeyError as missing:
+            problem = f"the plan of an older version, without {missing}, cannot be repeated"
+            raise RecordError(f"{folder}: {problem}") from None
+        yield target
+        return
+    if "inputs_sha256" not in plan:
+        raise RecordError(f"{folder}: holds no runs of kernels or of a program")
+    if plan.get("sources") != own_digest():  # other code has another memory layout
+        raise BuildMismatch(["our own code"])
+    for kernel in catalogue.select(kernels):
+        tolerance = float(plan["tolerance"])
+        yield KernelTarget(kernel=kernel, inputs=folder / INPUTS, tolerance=tolerance)
+
+
 def _replay(attacker: Attacker, entry: dict[str, Any]) -> _Replay:
     again = completed(entry, attacker.run(record.fault_of(entry)))
-    differs = [name for name in _COMPARED if again[name] != entry[name]]
+    differs = [name for name in _COMPARED if again.get(name) != entry.get(name)]
     was, now = entry["injection"], again["injection"]
     differs += [name for name in _INJECTION if now.get(name) != was.get(name)]
-    return _Replay(kernel=entry["kernel"], run=entry["run"], differs=tuple(differs), record=again)
+    return _Replay(
+        target=attacker.place.name, run=entry["run"], differs=tuple(differs), record=again
+    )

@@ -79,7 +79,7 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
        help="Relative error still counted as benign.")  # fmt: skip
 @_runs("--replay", type=click.Path(path_type=Path, file_okay=False),
        help="Repeat the recorded runs in this folder and compare them. --kernel selects kernels, "
-            "--runs limits the runs per kernel.")  # fmt: skip
+            "--runs limits the runs of each.")  # fmt: skip
 @_output("--out", type=click.Path(path_type=Path, file_okay=False),
          help="Folder for records, JSON, CSV and plot. Recorded runs are not "
               "repeated.")  # fmt: skip
@@ -258,6 +258,6 @@ def _replay_folder(folder: Path, kernels: tuple[str, ...], runs: int) -> bool:
         total += 1
         equal += not result.differs
         if result.differs:
-            click.echo(f"{result.kernel} {result.run}: differs in {', '.join(result.differs)}")
+            click.echo(f"{result.target} {result.run}: differs in {', '.join(result.differs)}")
     click.echo(f"{equal} of {total} replays identical")
     return equal == total

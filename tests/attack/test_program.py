@@ -284,6 +284,43 @@ def test_a_record_survives_and_gives_the_fault_back(target, tmp_path):
         assert again == entry
 
 
+@pytest.fixture
+def replayed(native_program, tmp_path):
+    """A campaign's folder, and what `mavfi kernels --replay` prints about it."""
+    from mavfi_cli.cli.kernels import kernels
+
+    folder = tmp_path / "out"
+    line = ["--program", str(native_program("counting")), "--args", "9000", "--runs", "12"]
+    done = CliRunner().invoke(kernels, [*line, "--out", str(folder)])
+    assert done.exit_code == 0, done.output
+    return folder, lambda *options: CliRunner().invoke(kernels, ["--replay", str(folder), *options])
+
+
+def test_the_runs_of_a_program_are_repeated_bit_by_bit(replayed):
+    folder, replay = replayed
+    assert replay().output == "12 of 12 replays identical\n"
+    assert replay("--runs", "5").output == "5 of 5 replays identical\n"
+    runs = folder / "runs.jsonl"
+    entries = [json.loads(line) for line in runs.read_text().splitlines()]
+    entries[3]["injection"]["before"] = "0x17"
+    entries[3]["output_sha256"] = "0"
+    runs.write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    done = replay()
+    assert done.exit_code == 1
+    assert done.output == (
+        "counting 3: differs in output_sha256, before\n11 of 12 replays identical\n"
+    )
+
+
+def test_runs_that_cannot_be_repeated_are_refused(replayed):
+    folder, replay = replayed
+    assert "holds runs of a program, not of octomap" in str(replay("--kernel", "octomap").exception)
+    plan = json.loads((folder / "plan.json").read_text())
+    del plan["environment"]
+    (folder / "plan.json").write_text(json.dumps(plan))
+    assert "the plan of an older version, without 'environment'" in str(replay().exception)
+
+
 def test_a_campaign_that_was_cut_off_goes_on(target, tmp_path):
     def go_on(runs, seed=9):
         return attacked(target("counting", "30"), folder=tmp_path, runs=runs, seed=seed).records

@@ -1,0 +1,54 @@
+"""Campaigns that run at the same time do not share a processor while another is free."""
+
+import contextlib
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mavfi_cli.attack.campaign import one_processor
+
+HOLDER = """
+import os, sys
+from mavfi_cli.attack.campaign import one_processor
+with one_processor():
+    print(*os.sched_getaffinity(0), flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextlib.contextmanager
+def another_campaign():
+    """The processors of another process, while that is attacking."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        yield set(map(int, process.stdout.readline().split()))
+    finally:
+        process.communicate("")
+
+
+def test_two_campaigns_stay_on_different_processors():
+    before = os.sched_getaffinity(0)
+    if len(before) < 2:
+        pytest.skip("one processor")
+    with another_campaign() as theirs, one_processor():
+        ours = os.sched_getaffinity(0)
+        assert len(ours) == 1 or ours == before  # all claimed by other campaigns
+        assert len(ours) > 1 or ours != theirs
+    assert os.sched_getaffinity(0) == before
+
+
+def test_a_processor_is_claimed_once_and_given_up(monkeypatch):
+    bound = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {10**6})  # nobody else has that
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, processors: bound.append(processors))
+    with one_processor():
+        assert bound == [[10**6]]
+        with one_processor():
+            assert len(bound) == 1  # claimed: this one is not bound
+    bound.clear()
+    with one_processor():
+        assert bound == [[10**6]]
