@@ -119,12 +119,6 @@ def test_recorded_runs_repeat(control_copy):
     assert replay.differs == ("output_sha256",)
 
 
-def test_runs_of_a_program_are_not_replayed_as_kernels(tmp_path):
-    write_json(tmp_path / "plan.json", {"program": ["a.out"]})
-    with pytest.raises(RecordError, match="runs of a program"):
-        list(replay_runs(tmp_path))
-
-
 def test_runs_of_other_code_are_not_replayed(control_copy):
     plan = json.loads((control_copy / "plan.json").read_text())
     write_json(control_copy / "plan.json", plan | {"sources": "of another version"})
