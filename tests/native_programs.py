@@ -148,6 +148,11 @@ int main(int c, char **v) {
     puts("done");
     return 0;
 }""",
+    # A place for one instruction, and memory around its operand.
+    "probe": """
+char page[1 << 17];
+__attribute__((naked, noinline)) void slot(void) { __asm__ volatile(".fill 32, 1, 0x90"); }
+int main(void) { slot(); return page[0]; }""",
     # Known outcomes: `victim` is the attacked function.
     "benign": """
 #include <stdio.h>

@@ -56,9 +56,10 @@ def draw_pinfi(
     jump, an instruction that also writes memory has a bit of its memory operand struck before it
     executes.
     """
-    if instruction.branches or not instruction.writes:
+    written = [use for use in instruction.writes if use.mask]
+    if instruction.branches or not written:
         return None
-    registers = [use for use in instruction.writes if site_of(use.register) is not Site.FLAGS]
+    registers = [use for use in written if site_of(use.register) is not Site.FLAGS]
     if registers:
         return _register_bit(registers[int(rng.integers(len(registers)))], rng)
     if following is not None and following.mnemonic in JUMP_FLAGS:

@@ -197,7 +197,7 @@ def _registers(
     merged: dict[str, _Operand] = {}
     for use in uses:
         site = site_of(use.register)
-        if site not in model.sites or not (use.explicit or model.implicit):
+        if not (use.mask and site in model.sites and (use.explicit or model.implicit)):
             continue
         mask, name = use.mask & _field_mask(instruction, model, site), use.operand
         if use.register in merged:  # the flags of one instruction are one operand
@@ -222,7 +222,7 @@ def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Op
     if Site.MEMORY not in model.sites or model.field is not Field.ANY:
         return []
     return [
-        _operand(Site.MEMORY, role, (1 << 8 * use.size) - 1, use.operand, memory_operand=index)
+        _operand(Site.MEMORY, role, use.mask, use.operand, memory_operand=index)
         for index, use in enumerate(instruction.memory)
         if (use.reads if role is Role.SOURCE else use.writes)
     ]

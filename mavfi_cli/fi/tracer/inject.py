@@ -248,7 +248,7 @@ def _touch_memory(
             if not (use.reads if reads else use.writes):
                 continue
             start = address_of(use, current, tracee.registers.read) - place
-            mask = (1 << 8 * use.size) - 1
+            mask = use.mask
             mask = mask << 8 * min(start, 64) if start >= 0 else mask >> min(-8 * start, 1024)
             if mask & remaining:
                 if reads:

@@ -26,7 +26,7 @@ from mavfi_cli.fi.tracer.fault import (
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
 
-VERSION = 1
+VERSION = 2  # 1 took whole registers for operands
 
 
 def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, Any]:

@@ -54,8 +54,10 @@ def test_zeroing_reads_nothing():
 
 
 def test_a_conditional_move_may_not_write():
-    (written,) = of("0f4cc3").writes  # cmovl eax, ebx
-    assert written.clears == 0
+    (written,) = of("480f4cc3").writes  # cmovl rax, rbx
+    assert (written.mask, written.clears) == (FULL, 0)
+    (half,) = of("0f4cc3").writes  # cmovl eax, ebx: clears the upper half anyway
+    assert (half.mask, half.clears) == (0xFFFF_FFFF, FULL ^ 0xFFFF_FFFF)
 
 
 def test_vex_clears_the_rest_and_legacy_scalar_keeps_it():

@@ -11,8 +11,8 @@ class RegisterUse:
     """Bits of a full register that an instruction reads or writes."""
 
     register: str
-    mask: int  # the operand's bits
-    clears: int  # for a write: every bit that gets a new value
+    mask: int  # bits that the instruction reads, or that hold a part of its result
+    clears: int  # for a write: every bit that always gets a new value
     explicit: bool
     operand: str  # as the assembler names it: eax, xmm1, zf
 
@@ -27,6 +27,7 @@ class MemoryUse:
     displacement: int
     segment: str | None
     size: int
+    mask: int  # bits of it that are read or written
     reads: bool
     writes: bool
 

@@ -102,6 +102,13 @@ TRAITS = Traits(
 )
 
 
+@functools.lru_cache(maxsize=1)
+def widest_vector() -> str:
+    """The name of the full vector registers of this processor."""
+    components = xsave_components()
+    return "zmm" if ZMM_HIGH in components else "ymm" if AVX in components else "xmm"
+
+
 @dataclass(frozen=True, slots=True)
 class _Span:
     """Bytes of the extended state that hold part of a register, with the component's number."""
@@ -271,8 +278,7 @@ def all_registers() -> tuple[str, ...]:
     """Every full register of this processor that can be flipped."""
     components = xsave_components()
     names = [*GENERAL, "rflags", "rip", *(f"st{i}" for i in range(8))]
-    widest = "zmm" if ZMM_HIGH in components else "ymm" if AVX in components else "xmm"
-    names += [f"{widest}{i}" for i in range(32 if ZMM_UPPER in components else 16)]
+    names += [f"{widest_vector()}{i}" for i in range(32 if ZMM_UPPER in components else 16)]
     if OPMASK in components:
         names += [f"k{i}" for i in range(8)]
     return tuple(names)
