@@ -36,14 +36,12 @@ class Watched:
         written: absolute paths that it wrote, made, renamed or removed, in order.
         terminal: whether it asked for a terminal.
         lacked_memory: whether it was refused memory.
-        ended: whether it ended in time.
     """
 
     company: str
     written: tuple[str, ...]
     terminal: bool
     lacked_memory: bool
-    ended: bool
 
 
 def watch(tracee: Tracee, *, wall_s: float) -> Watched:
@@ -51,7 +49,7 @@ def watch(tracee: Tracee, *, wall_s: float) -> Watched:
     written: dict[str, None] = {}
     terminal = lacked = False
     entering, company, number = True, "", 0
-    with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
+    with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
         while True:
             tracee.registers.forget()
             linux.request(linux.SYSCALL, tracee.pid, 0, number)
@@ -79,7 +77,6 @@ def watch(tracee: Tracee, *, wall_s: float) -> Watched:
         written=tuple(path for path in written if not path.startswith(_DEVICES)),
         terminal=terminal,
         lacked_memory=lacked,
-        ended=not alarm.fired,
     )
 
 
