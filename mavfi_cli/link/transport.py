@@ -1,15 +1,27 @@
-"""Transports, opened by URL, that carry bytes to and from one peer.
-
-This module chooses the class for a URL. `streams` and `datagrams` implement them.
-"""
+"""Transports, opened by URL, that carry bytes to and from one peer."""
 
 from __future__ import annotations
 
+import errno
+import ipaddress
+import math
+import select
+import socket
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.core.errors import LinkLost
-from mavfi_cli.link.endpoint import Endpoint, UrlScheme, check_reach, parse_endpoint, resolve
+from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.link.endpoint import LISTENING, Endpoint, parse_endpoint
+
+MAX_PEERS = 64
+MAX_WAITING = 4096  # maximum unread datagrams per peer; the oldest are dropped first
+_CONNECT_TIMEOUT_S = 5.0
+_SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
+_MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
+_CHUNK = 1 << 16
+_MARKERS = (0xFD, 0xFE)
 
 
 class Transport(Protocol):
@@ -43,10 +55,6 @@ class Transport(Protocol):
 class Listener(Protocol):
     """Peers of one URL: every client of a listening URL, the single peer of any other."""
 
-    @property
-    def url(self) -> str:
-        """URL of the endpoint, for error messages."""
-
     def accept_ready(self) -> Sequence[Transport]:
         """Return the peers that appeared since the last call, without waiting."""
 
@@ -70,69 +78,469 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
         EndpointError: The URL is malformed, its scheme is unknown, its port is in use, nobody
             listens, the device does not exist, or an unsigned link reaches beyond this machine.
     """
-    # Each scheme's module is imported on first use to keep the import of this module cheap.
     endpoint = parse_endpoint(url)
-    if endpoint.scheme is UrlScheme.SERIAL:
-        from mavfi_cli.link.streams import SerialPort
-
-        return SerialPort(endpoint)
-    if endpoint.scheme in (UrlScheme.UDP_IN, UrlScheme.UDP_OUT):
-        from mavfi_cli.link import datagrams
-
-        opened = datagrams.bound if endpoint.scheme is UrlScheme.UDP_IN else datagrams.connected
-        return opened(endpoint, _reachable(endpoint, signed, allow_unsigned))
-    from mavfi_cli.link import streams
-
-    if endpoint.scheme is UrlScheme.FD:
-        return streams.inherited(endpoint)
-    address = _reachable(endpoint, signed, allow_unsigned)
-    if endpoint.scheme is UrlScheme.TCP:
-        return streams.connected(endpoint, address)
-    return streams.TcpServerEnd(streams.TcpListener(endpoint, address))
+    if endpoint.scheme == "serial":
+        return _SerialPort(endpoint)
+    if endpoint.scheme == "fd":
+        return _StreamTransport(_inherited(endpoint), url)
+    opened = _open_socket(endpoint, beyond=signed or allow_unsigned)
+    if opened.type == socket.SOCK_DGRAM:
+        return _UdpTransport(opened, url, follows=endpoint.scheme == "udpin")
+    if endpoint.scheme == "tcp":
+        return _StreamTransport(opened, url)
+    return _FirstClient(_TcpListener(opened, url))
 
 
 def open_listener(url: str, *, signed: bool = False, allow_unsigned: bool = False) -> Listener:
     """Open an endpoint that serves several peers. Arguments and errors as in `open_transport`."""
     endpoint = parse_endpoint(url)
-    if endpoint.scheme is UrlScheme.UDP_IN:
-        from mavfi_cli.link.datagrams import UdpListener
-
-        return UdpListener(endpoint, _reachable(endpoint, signed, allow_unsigned))
-    if endpoint.scheme is UrlScheme.TCP_IN:
-        from mavfi_cli.link.streams import TcpListener
-
-        return TcpListener(endpoint, _reachable(endpoint, signed, allow_unsigned))
-    return _OnePeer(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
+    if endpoint.scheme not in LISTENING:
+        return _OnePeer(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
+    opened = _open_socket(endpoint, beyond=signed or allow_unsigned)
+    return (_UdpListener if endpoint.scheme == "udpin" else _TcpListener)(opened, url)
 
 
-def _reachable(endpoint: Endpoint, signed: bool, allow_unsigned: bool) -> tuple[int, str]:
-    import socket
+def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
+    """Return both ends of a new link in memory; error messages name it by its URL."""
+    ours, theirs = _MemoryTransport(url), _MemoryTransport(url)
+    ours._peer, theirs._peer = theirs, ours
+    return ours, theirs
 
-    datagram = endpoint.scheme in (UrlScheme.UDP_IN, UrlScheme.UDP_OUT)
+
+# Opening -----------------------------------------------------------------------------------------
+
+
+def _open_socket(endpoint: Endpoint, *, beyond: bool) -> socket.socket:
+    """Open the bound or connected socket of a network URL, `beyond` this machine if allowed."""
+    datagram = endpoint.scheme.startswith("udp")
     kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
-    family, address = resolve(endpoint, kind)
-    check_reach(endpoint, address, signed=signed, allow_unsigned=allow_unsigned)
-    return family, address
+    try:
+        found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)
+    except (OSError, UnicodeError):
+        raise EndpointError(endpoint.url, f"no such host {endpoint.host!r}") from None
+    found.sort(key=lambda entry: entry[0] != socket.AF_INET)  # IPv4 first
+    family, address = found[0][0], str(found[0][4][0])
+    if not (beyond or ipaddress.ip_address(address.partition("%")[0]).is_loopback):
+        raise EndpointError(
+            endpoint.url,
+            f"{address} is beyond this machine, where MAVLink signing is required: "
+            "give a signing passphrase, or allow unsigned links by name",
+        )
+    opened = socket.socket(family, kind)
+    try:
+        if endpoint.scheme in LISTENING:
+            if not datagram:
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            opened.bind((address, endpoint.port))
+            if not datagram:
+                opened.listen()
+        else:
+            opened.settimeout(_CONNECT_TIMEOUT_S)
+            opened.connect((address, endpoint.port))
+            if not datagram:
+                opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    except OSError as error:
+        opened.close()
+        raise EndpointError(endpoint.url, _refusal(error, endpoint, address)) from None
+    return opened
+
+
+def _refusal(error: OSError, endpoint: Endpoint, address: str) -> str:
+    """Return why a socket cannot be bound or connected."""
+    text = error.strerror or str(error)
+    if endpoint.scheme not in LISTENING:
+        refused = "connection refused, nothing listens there"
+        return f"cannot connect: {refused if error.errno == errno.ECONNREFUSED else text.lower()}"
+    return {
+        errno.EADDRINUSE: f"port {endpoint.port} is in use",
+        errno.EADDRNOTAVAIL: f"{address} is not an address of this machine",
+        errno.EACCES: f"port {endpoint.port} needs privileges",
+    }.get(error.errno or 0, text)
+
+
+def _inherited(endpoint: Endpoint) -> socket.socket:
+    """Return the connected stream socket that the parent process left open."""
+    try:
+        connection = socket.socket(fileno=endpoint.fd)
+    except OSError as error:
+        problem = "not a socket" if error.errno == errno.ENOTSOCK else "not an open descriptor"
+        raise EndpointError(endpoint.url, problem) from None
+    problem = "" if connection.type == socket.SOCK_STREAM else "not a stream socket"
+    try:
+        connection.getpeername()
+    except OSError:
+        problem = "not a connected socket"
+    if problem:
+        connection.detach()
+        raise EndpointError(endpoint.url, problem)
+    return connection
+
+
+def _wait_for(descriptor: int, event: int, timeout_s: float) -> bool:
+    """Return True if a poll event or an error occurs within `timeout_s`; inf never times out."""
+    poller = select.poll()
+    poller.register(descriptor, event)
+    return bool(poller.poll(None if math.isinf(timeout_s) else timeout_s * 1e3))
+
+
+class _Receiver:
+    """An end that waits on its descriptor while nothing can be pulled."""
+
+    url: str
+    datagram = False
+
+    def receive(self, timeout_s: float) -> bytes:
+        """See `Transport`."""
+        data = self._pull()
+        if data or timeout_s <= 0.0:
+            return data
+        deadline_s = time.monotonic() + timeout_s
+        while not data and (left_s := deadline_s - time.monotonic()) > 0.0:
+            if not _wait_for(self.fileno(), select.POLLIN, left_s):
+                break
+            data = self._pull()
+        return data
+
+    def fileno(self) -> int:
+        """See `Transport`."""
+        raise NotImplementedError
+
+    def _pull(self) -> bytes:
+        """Return waiting bytes, or b"" if there are none. Raises LinkLost."""
+        raise NotImplementedError
+
+    def _lost(self, why: object) -> NoReturn:
+        raise LinkLost(f"{self.url}: {why}") from None
+
+
+class _SocketOwner:
+    """Owner of a socket that never blocks."""
+
+    def __init__(self, opened: socket.socket, url: str) -> None:
+        opened.settimeout(0.0)
+        self._socket = opened
+        self.url = url
+
+    @property
+    def port(self) -> int:
+        """Local port. The system chooses it if the URL says 0."""
+        return int(self._socket.getsockname()[1])
+
+    def fileno(self) -> int:
+        """See `Transport`."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """See `Transport`."""
+        self._socket.close()
+
+
+# Streams -----------------------------------------------------------------------------------------
+
+
+class _StreamTransport(_SocketOwner, _Receiver):
+    """A connected stream socket with one peer.
+
+    A patient one waits for a slow reader. Any other drops what does not fit the reader's buffer,
+    whole sends at a time, as autopilots do to a slow telemetry link.
+    """
+
+    def __init__(self, connection: socket.socket, url: str, *, patient: bool = True) -> None:
+        super().__init__(connection, url)
+        self._patient = patient
+        self._unsent = b""
+
+    def send(self, data: bytes) -> None:
+        if self._unsent:
+            self._unsent = self._push(self._unsent)
+            if self._unsent:
+                return
+        unsent = self._push(data)
+        if self._patient:
+            while unsent:
+                if not _wait_for(self.fileno(), select.POLLOUT, _SEND_TIMEOUT_S):
+                    self._lost(f"the peer read nothing for {_SEND_TIMEOUT_S:g} s")
+                unsent = self._push(unsent)
+        elif len(unsent) < len(data):
+            self._unsent = unsent
+
+    def _push(self, data: bytes) -> bytes:
+        """Send as much as fits and return the rest."""
+        try:
+            return data[self._socket.send(data) :]
+        except BlockingIOError:
+            return data
+        except OSError as error:
+            self._lost(error.strerror or error)
+
+    def _pull(self) -> bytes:
+        try:
+            data = self._socket.recv(_CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            self._lost(error.strerror or error)
+        if not data:
+            self._lost("the peer closed the connection")
+        return data
+
+
+class _TcpListener(_SocketOwner):
+    """A port on which every TCP client becomes a peer. Slow readers among them lose frames."""
+
+    def accept_ready(self, *, patient: bool = False) -> list[_StreamTransport]:
+        """See `Listener`; see `_StreamTransport` for `patient`."""
+        clients: list[_StreamTransport] = []
+        while True:
+            try:
+                connection = self._socket.accept()[0]
+            except OSError:  # no client is waiting, or it has disconnected already
+                return clients
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            clients.append(_StreamTransport(connection, self.url, patient=patient))
+
+
+class _FirstClient(_Receiver):
+    """The first client of a TCP port. Data sent before it connects is lost."""
+
+    def __init__(self, listener: _TcpListener) -> None:
+        self._listener = listener
+        self._client: _StreamTransport | None = None
+        self.url, self.port = listener.url, listener.port
+
+    def _serve(self) -> _StreamTransport | None:
+        if self._client is None:
+            for client in self._listener.accept_ready(patient=True):
+                if self._client is None:
+                    self._client = client
+                else:
+                    client.close()
+        return self._client
+
+    def send(self, data: bytes) -> None:
+        client = self._serve()
+        if client is not None:
+            client.send(data)
+
+    def _pull(self) -> bytes:
+        client = self._serve()
+        return b"" if client is None else client._pull()
+
+    def fileno(self) -> int:
+        return (self._client or self._listener).fileno()
+
+    def close(self) -> None:
+        self._listener.close()
+        if self._client is not None:
+            self._client.close()
+
+
+class _SerialPort(_Receiver):
+    """A serial line to one peer, 8N1 without flow control."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        import serial
+
+        self.url = endpoint.url
+        self._failures: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+        try:
+            self._port: Any = serial.Serial(
+                endpoint.device, endpoint.baud, timeout=0, write_timeout=_SEND_TIMEOUT_S,
+                exclusive=True,
+            )  # fmt: skip
+        except (*self._failures, ValueError) as error:
+            raise EndpointError(endpoint.url, _serial_reason(error, endpoint.device)) from None
+
+    def send(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except self._failures as error:
+            self._lost(f"the serial device failed: {error}")
+
+    def _pull(self) -> bytes:
+        try:
+            return bytes(self._port.read(_CHUNK))
+        except self._failures as error:
+            self._lost(f"the serial device failed: {error}")
+
+    def fileno(self) -> int:
+        return int(self._port.fileno())
+
+    def close(self) -> None:
+        self._port.close()
+
+
+def _serial_reason(error: Exception, device: str) -> str:
+    in_use = f"{device} is in use"
+    known = {
+        **dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV), f"no such device {device}"),
+        errno.EACCES: f"no permission to open {device}",
+        **dict.fromkeys((errno.EBUSY, errno.EAGAIN), in_use),
+        errno.ENOTTY: f"{device} is not a serial device",
+    }
+    return known.get(
+        getattr(error, "errno", None) or 0, in_use if "lock" in str(error) else str(error)
+    )
+
+
+# Datagrams ---------------------------------------------------------------------------------------
+
+
+class _UdpTransport(_SocketOwner, _Receiver):
+    """A UDP socket with one peer.
+
+    A connected socket receives from that peer only. One that `follows` sends to the last sender of
+    MAVLink. Before the first one, everything it sends is lost.
+    """
+
+    datagram = True
+
+    def __init__(self, opened: socket.socket, url: str, *, follows: bool) -> None:
+        super().__init__(opened, url)
+        self._follows = follows
+        self._peer: Any = None
+
+    def send(self, data: bytes) -> None:
+        if self._peer is not None or not self._follows:
+            _send_datagrams(self._socket, data, self._peer)
+
+    def _pull(self) -> bytes:
+        data, sender = _receive_datagram(self._socket)
+        if self._follows and data and data[0] in _MARKERS:
+            self._peer = sender
+        return data
+
+
+def _receive_datagram(opened: socket.socket) -> tuple[bytes, Any]:
+    """Return a datagram and its sender, or b"" and None if there is none.
+
+    ECONNREFUSED means that nobody listens at the other end of a connected socket. It is not an
+    error for UDP, because the peer may start later.
+    """
+    try:
+        return opened.recvfrom(_CHUNK)
+    except OSError:
+        return b"", None
+
+
+def _send_datagrams(opened: socket.socket, data: bytes, peer: Any) -> None:
+    """Send to `peer`, or to the connected address. Data that cannot be sent is lost."""
+    for datagram in _split_frames(data):
+        for _attempt in range(2):  # the first may report the refusal of an earlier datagram
+            try:
+                if peer is None:
+                    opened.send(datagram)
+                else:
+                    opened.sendto(datagram, peer)
+                break
+            except OSError:
+                continue
+
+
+def _split_frames(data: bytes) -> list[bytes]:
+    """Combine well-formed frames into datagrams that fit an Ethernet packet."""
+    if len(data) <= _MTU_PAYLOAD:
+        return [data]
+    datagrams, start, position = [], 0, 0
+    while position < len(data):
+        length = data[position + 1] + 8
+        if data[position] == 0xFD:
+            length += 4 + (13 if data[position + 2] & 1 else 0)
+        if position > start and position + length - start > _MTU_PAYLOAD:
+            datagrams.append(data[start:position])
+            start = position
+        position += length
+    datagrams.append(data[start:])
+    return datagrams
+
+
+class _UdpListener(_SocketOwner):
+    """A port on which every sender of MAVLink becomes a peer. All peers share one socket.
+
+    There are at most MAX_PEERS. A further peer replaces the one that has been silent longest.
+    """
+
+    def __init__(self, opened: socket.socket, url: str) -> None:
+        super().__init__(opened, url)
+        self.peers: dict[Any, _UdpPeer] = {}  # by address; the one silent longest comes first
+        self._fresh: list[_UdpPeer] = []
+
+    def accept_ready(self) -> list[_UdpPeer]:
+        self.pump()
+        fresh, self._fresh = [peer for peer in self._fresh if not peer.lost], []
+        return fresh
+
+    def pump(self) -> None:
+        """Distribute all waiting datagrams to their peers."""
+        for _ in range(MAX_WAITING):
+            data, sender = _receive_datagram(self._socket)
+            if sender is None:
+                return
+            peer = self.peers.pop(sender, None)
+            if peer is None:
+                if not data or data[0] not in _MARKERS:
+                    continue
+                peer = self._welcome(sender)
+            self.peers[sender] = peer
+            peer.waiting.append(data)
+
+    def _welcome(self, sender: Any) -> _UdpPeer:
+        if len(self.peers) >= MAX_PEERS:
+            self.peers.pop(next(iter(self.peers))).lost = True
+        peer = _UdpPeer(self, sender)
+        self._fresh.append(peer)
+        return peer
+
+    def send_to(self, data: bytes, address: Any) -> None:
+        """Send frames to one peer's address."""
+        _send_datagrams(self._socket, data, address)
+
+    def close(self) -> None:
+        for peer in self.peers.values():
+            peer.lost = True
+        super().close()
+
+
+class _UdpPeer(_Receiver):
+    datagram = True
+
+    def __init__(self, listener: _UdpListener, address: Any) -> None:
+        self._listener = listener
+        self._address = address
+        self.url = listener.url
+        self.waiting: deque[bytes] = deque(maxlen=MAX_WAITING)
+        self.lost = False
+
+    def send(self, data: bytes) -> None:
+        if self.lost:
+            self._lost("this peer was dropped")
+        self._listener.send_to(data, self._address)
+
+    def _pull(self) -> bytes:
+        if not self.waiting:
+            if self.lost:
+                self._lost("this peer was dropped")
+            self._listener.pump()
+        return self.waiting.popleft() if self.waiting else b""
+
+    def fileno(self) -> int:
+        return self._listener.fileno()
+
+    def close(self) -> None:
+        self.lost = True
+        self._listener.peers.pop(self._address, None)
 
 
 class _OnePeer:
     """Listener for an endpoint with exactly one peer, which exists from the start."""
 
     def __init__(self, transport: Transport) -> None:
-        self._transport = transport
         self._fresh = [transport]
-        self.url = transport.url
+        self.fileno, self.close = transport.fileno, transport.close
 
     def accept_ready(self) -> list[Transport]:
-        """Return the peer on the first call, nothing afterwards."""
         fresh, self._fresh = self._fresh, []
         return fresh
-
-    def fileno(self) -> int:
-        return self._transport.fileno()
-
-    def close(self) -> None:
-        self._transport.close()
 
 
 class _MemoryTransport:
@@ -140,9 +548,6 @@ class _MemoryTransport:
 
     Nobody else runs while one end waits. So an end that has nothing to receive first has its
     `on_wait` called, in which the other end can act, and never sleeps.
-
-    Attributes:
-        on_wait: called when `receive` finds nothing, before it returns.
     """
 
     datagram = False
@@ -174,10 +579,3 @@ class _MemoryTransport:
         if self._peer is not None:
             self._peer._peer = None
             self._peer = None
-
-
-def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
-    """Both ends of a new link; messages to people name it by its URL."""
-    ours, theirs = _MemoryTransport(url), _MemoryTransport(url)
-    ours._peer, theirs._peer = theirs, ours
-    return ours, theirs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import socket
 import threading
 import tty
@@ -92,8 +93,6 @@ _OPEN_TERMINALS: list[int] = []
 
 
 def _carry(left: int, right: int, stop: int) -> None:
-    import select
-
     while True:
         ready, _, _ = select.select([left, right, stop], [], [])
         if stop in ready:
@@ -104,9 +103,7 @@ def _carry(left: int, right: int, stop: int) -> None:
 
 
 def _wait_readable(descriptor: int) -> bool:
-    from mavfi_cli.link.endpoint import readable
-
-    return readable(descriptor, WAIT_S)
+    return bool(select.select([descriptor], [], [], WAIT_S)[0])
 
 
 MAKERS: dict[str, Callable[[], Iterator[Pair]]] = {
@@ -252,7 +249,7 @@ def test_several_clients_of_one_listener_are_kept_apart() -> None:
 
 
 def test_a_flood_of_udp_callers_pushes_out_the_silent_ones_only() -> None:
-    from mavfi_cli.link.datagrams import MAX_PEERS
+    from mavfi_cli.link.transport import MAX_PEERS
 
     listener = open_listener("udpin:127.0.0.1:0")
     url = f"udpout:127.0.0.1:{listener.port}"  # type: ignore[attr-defined]

@@ -5,25 +5,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.core.errors import EndpointError
-from mavfi_cli.link.endpoint import UrlScheme, parse_endpoint
+from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import open_listener, open_transport
 
 
 @pytest.mark.parametrize(
     ("url", "scheme", "host", "port"),
     [
-        ("udpin:127.0.0.1:14540", UrlScheme.UDP_IN, "127.0.0.1", 14540),
-        ("udpin:14540", UrlScheme.UDP_IN, "127.0.0.1", 14540),
-        ("udpin::14540", UrlScheme.UDP_IN, "127.0.0.1", 14540),
-        ("udp://:14540", UrlScheme.UDP_IN, "127.0.0.1", 14540),
-        ("udpin://0.0.0.0:14540", UrlScheme.UDP_IN, "0.0.0.0", 14540),
-        ("udpout://localhost:14580", UrlScheme.UDP_OUT, "localhost", 14580),
-        ("tcp:10.0.0.7:5760", UrlScheme.TCP, "10.0.0.7", 5760),
-        ("tcpout://10.0.0.7:5760", UrlScheme.TCP, "10.0.0.7", 5760),
-        ("tcpin:[::1]:5760", UrlScheme.TCP_IN, "::1", 5760),
+        ("udpin:127.0.0.1:14540", "udpin", "127.0.0.1", 14540),
+        ("udpin:14540", "udpin", "127.0.0.1", 14540),
+        ("udpin::14540", "udpin", "127.0.0.1", 14540),
+        ("udp://:14540", "udpin", "127.0.0.1", 14540),
+        ("udpin://0.0.0.0:14540", "udpin", "0.0.0.0", 14540),
+        ("udpout://localhost:14580", "udpout", "localhost", 14580),
+        ("tcp:10.0.0.7:5760", "tcp", "10.0.0.7", 5760),
+        ("tcpout://10.0.0.7:5760", "tcp", "10.0.0.7", 5760),
+        ("tcpin:[::1]:5760", "tcpin", "::1", 5760),
     ],
 )
-def test_network_urls(url: str, scheme: UrlScheme, host: str, port: int) -> None:
+def test_network_urls(url: str, scheme: str, host: str, port: int) -> None:
     endpoint = parse_endpoint(url)
     assert (endpoint.scheme, endpoint.host, endpoint.port) == (scheme, host, port)
 
@@ -43,7 +43,7 @@ def test_network_urls(url: str, scheme: UrlScheme, host: str, port: int) -> None
 )
 def test_serial_urls(url: str, device: str, baud: int) -> None:
     endpoint = parse_endpoint(url)
-    assert (endpoint.scheme, endpoint.device, endpoint.baud) == (UrlScheme.SERIAL, device, baud)
+    assert (endpoint.scheme, endpoint.device, endpoint.baud) == ("serial", device, baud)
 
 
 @pytest.mark.parametrize(
