@@ -111,7 +111,7 @@ def time_to_collision(
         trajectory, farthest_m = _castable(trajectory), math.inf
     points = np.empty((MAX_SAMPLES, 3))
     times_s = np.empty(MAX_SAMPLES)
-    count, unflyable_s = sample_ahead(
+    count, unflyable_s = _sample_ahead(
         trajectory.waypoints,
         trajectory.durations_s,
         time_s,
@@ -217,7 +217,7 @@ def _first_contact(
 
 
 @compiled
-def sample_ahead(
+def _sample_ahead(
     waypoints: FloatArray,
     durations_s: FloatArray,
     time_s: float,

@@ -29,7 +29,7 @@ class MotionLimits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Polyline:
+class _Polyline:
     """Vertices (n, 3) without consecutive duplicates, and quantities derived from them."""
 
     vertices: FloatArray  # (n, 3)
@@ -39,7 +39,7 @@ class Polyline:
     half_sines: FloatArray  # (n,) sin of half the turn at each vertex; 0 at the ends
 
 
-def polyline(vertices: FloatArray, limits: MotionLimits) -> Polyline:
+def polyline(vertices: FloatArray, limits: MotionLimits) -> _Polyline:
     """Compute the geometry of a path (n, 3) without points within 1 mm of their predecessor."""
     kept = [vertices[0]]
     for vertex in vertices[1:]:
@@ -52,7 +52,7 @@ def polyline(vertices: FloatArray, limits: MotionLimits) -> Polyline:
     half_sines = np.zeros(len(points))
     # |u_2 - u_1| = 2 sin(theta / 2)
     half_sines[1:-1] = 0.5 * np.linalg.norm(np.diff(directions, axis=0), axis=1)
-    return Polyline(
+    return _Polyline(
         vertices=points,
         lengths=lengths,
         directions=directions,
@@ -72,7 +72,7 @@ def _speed_cap(rise: float, limits: MotionLimits) -> float:
 
 
 def squared_corner_speeds(
-    line: Polyline, start_speed_mps: float, caps: FloatArray, acceleration_mps2: float
+    line: _Polyline, start_speed_mps: float, caps: FloatArray, acceleration_mps2: float
 ) -> FloatArray:
     """Return the highest squared speeds at the vertices (n,) that caps and lengths allow.
 
@@ -161,7 +161,7 @@ class _Phases:
 
 
 def motion(
-    line: Polyline,
+    line: _Polyline,
     q: FloatArray,
     dwells_s: FloatArray,
     acceleration_mps2: float,

@@ -71,7 +71,7 @@ def build(snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> O
     if blocked.size and len(leaves):
         occupied = np.zeros_like(blocked)
         _rasterise(leaves, low, occupied)
-        _dilate(occupied, run_half_widths(radius_m, resolution), blocked)
+        _dilate(occupied, _run_half_widths(radius_m, resolution), blocked)
     return ObstacleGrid(
         blocked=blocked,
         origin_enu_m=low.astype(np.float64) * resolution,
@@ -98,7 +98,7 @@ def _extent(
     return low, size
 
 
-def run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
+def _run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
     """Return half the dilation's height in z for each column offset (dx, dy), (w, w); -1 for none.
 
     An offset of k between two voxels leaves a gap of max(|k| - 1, 0) voxels between them.

@@ -122,7 +122,7 @@ class Counters:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Directive:
+class _Directive:
     """Decision of one tick: the inputs of control, and a request if a plan is needed."""
 
     mode: PilotMode
@@ -312,7 +312,7 @@ class Pilot:
             self.counters.look_rounds += 1
 
     @np.errstate(over="ignore", invalid="ignore")  # waypoints may be corrupted
-    def update(self, stamp_s: float, state: VehicleState) -> Directive:
+    def update(self, stamp_s: float, state: VehicleState) -> _Directive:
         """Run one control tick: advance along the trajectory and return the directive."""
         step_s = stamp_s - self._stamp_s if self._stamp_s else 0.0
         self._stamp_s = stamp_s
@@ -332,7 +332,7 @@ class Pilot:
                 self.active.stand()
         plan = self._plan_request(stamp_s, state)
         assert self._hold is not None
-        return Directive(
+        return _Directive(
             mode=self.mode,
             tracking=TrackingInputs(
                 stamp_s=stamp_s,

@@ -112,7 +112,7 @@ class SmoothingParams:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Smoothed:
+class _Smoothed:
     """A trajectory, and a flag that is True if all of it lies in free space."""
 
     trajectory: Trajectory
@@ -124,7 +124,7 @@ def smooth(
     grid: ObstacleGrid | None,
     departure: Departure,
     params: SmoothingParams,
-) -> Smoothed:
+) -> _Smoothed:
     """Compute the trajectory along a free path (n, 3) from its first to its last point.
 
     It begins with the departure's velocity, limited to v_max. A trajectory that begins in motion
@@ -143,7 +143,7 @@ def smooth(
             break
         caps[blamed] = np.where(q[blamed] > SLOWEST_SQUARED, 0.25 * q[blamed], 0.0)
     free = free and bool(_piecewise_free(spline, grid).all())
-    return Smoothed(trajectory=_waypoints(spline, departure, params), free=free)
+    return _Smoothed(trajectory=_waypoints(spline, departure, params), free=free)
 
 
 class _Flight:

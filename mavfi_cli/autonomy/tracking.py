@@ -22,6 +22,7 @@ are followed within the limits. The output is always finite and within its limit
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,7 +110,9 @@ def step(
     track(*law, params.v_max_mps, *limits, out)
     stretch = 1.0
     if params.stretches_clock:
-        stretch = max(1.0, demanded_mps(*law, *limits) / params.v_max_mps)
+        demanded = np.empty(10)
+        track(*law, math.inf, *limits, demanded)
+        stretch = max(1.0, _length(demanded[0:3].tolist()) / params.v_max_mps)
     yaw_rad = float(out[9])
     command = Command(
         stamp_s=inputs.stamp_s,
@@ -123,6 +126,15 @@ def step(
         TrackingState(integral_mps=out[6:9].copy(), yaw_rad=yaw_rad, stamp_s=inputs.stamp_s),
         command,
     )
+
+
+def _length(vector: Sequence[float]) -> float:
+    """Return the length of a vector (3,). Safe if its square overflows; inf on overflow."""
+    largest = max(map(abs, vector))
+    if largest == 0.0:
+        return 0.0
+    x, y, z = (component / largest for component in vector)
+    return largest * math.sqrt(x * x + y * y + z * z)
 
 
 @compiled
@@ -149,66 +161,35 @@ def track(
     step_s = elapsed_s if elapsed_s > 0.0 else 0.0
     step_s = min(step_s, step_max_s)
     for axis in range(3):
-        v_planned = finite_or(target[4 + axis], 0.0)
-        v_ref = finite_or(rate * v_planned, 0.0)
-        a_ref = finite_or(rate * rate * finite_or(target[7 + axis], 0.0), 0.0)
-        error = finite_or(target[axis] - position[axis], 0.0)
+        v_planned = _finite_or(target[4 + axis], 0.0)
+        v_ref = _finite_or(rate * v_planned, 0.0)
+        a_ref = _finite_or(rate * rate * _finite_or(target[7 + axis], 0.0), 0.0)
+        error = _finite_or(target[axis] - position[axis], 0.0)
         damping = kd * (v_ref - velocity[axis])
-        out[axis] = finite_or(v_ref + kp * error + integral[axis] + damping, v_ref)
-        out[3 + axis] = finite_or(a_ref + rate_change_per_s * v_planned, a_ref)
-        grown = finite_or(integral[axis] + ki * error * step_s, 0.0)
+        out[axis] = _finite_or(v_ref + kp * error + integral[axis] + damping, v_ref)
+        out[3 + axis] = _finite_or(a_ref + rate_change_per_s * v_planned, a_ref)
+        grown = _finite_or(integral[axis] + ki * error * step_s, 0.0)
         out[6 + axis] = min(max(grown, -integral_max), integral_max)
-    if limit_norm(out, 0, v_max):
+    if _limit_norm(out, 0, v_max):
         # Anti-windup: the integral may only shrink while the output is at its limit.
         for axis in range(3):
             if abs(out[6 + axis]) > abs(integral[axis]):
                 out[6 + axis] = integral[axis]
-    limit_norm(out, 3, a_max)
-    last_yaw = finite_or(last_yaw, 0.0)
-    turn = finite_or(angle_between(last_yaw, target[3]), 0.0)
+    _limit_norm(out, 3, a_max)
+    last_yaw = _finite_or(last_yaw, 0.0)
+    turn = _finite_or(angle_between(last_yaw, target[3]), 0.0)
     reach = yaw_rate_max * step_s
     out[9] = angle_between(0.0, last_yaw + min(max(turn, -reach), reach))
 
 
 @compiled
-def demanded_mps(
-    target: FloatArray,
-    rate: float,
-    rate_change_per_s: float,
-    position: FloatArray,
-    velocity: FloatArray,
-    integral: FloatArray,
-    last_yaw: float,
-    elapsed_s: float,
-    kp: float,
-    ki: float,
-    kd: float,
-    integral_max: float,
-    a_max: float,
-    yaw_rate_max: float,
-    step_max_s: float,
-) -> float:
-    """Return the commanded speed before the speed limit, m/s; inf on overflow."""
-    out = np.empty(10)
-    track(
-        target, rate, rate_change_per_s, position, velocity, integral, last_yaw, elapsed_s,
-        kp, ki, kd, integral_max, math.inf, a_max, yaw_rate_max, step_max_s, out,
-    )  # fmt: skip
-    largest = max(abs(out[0]), abs(out[1]), abs(out[2]))
-    if largest == 0.0:
-        return 0.0
-    x, y, z = out[0] / largest, out[1] / largest, out[2] / largest
-    return float(largest * math.sqrt(x * x + y * y + z * z))
-
-
-@compiled
-def finite_or(value: float, fallback: float) -> float:
+def _finite_or(value: float, fallback: float) -> float:
     """Return the value, or the fallback if the value is NaN or infinite."""
     return value if math.isfinite(value) else fallback
 
 
 @compiled
-def limit_norm(vectors: FloatArray, start: int, limit: float) -> bool:
+def _limit_norm(vectors: FloatArray, start: int, limit: float) -> bool:
     """Limit the norm of the three components from `start`. Return True if they were scaled.
 
     Safe for components whose squares overflow.

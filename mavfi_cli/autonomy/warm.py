@@ -9,7 +9,7 @@ import numpy as np
 from mavfi_cli.autonomy import collision, planning, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
 from mavfi_cli.autonomy.pilot import PlanRequest
-from mavfi_cli.autonomy.planners import find, names
+from mavfi_cli.autonomy.planners.ompl import OMPL_PLANNERS
 from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.types import DepthFrame, Trajectory
 
@@ -21,19 +21,18 @@ def run_every_kernel() -> None:
     snapshot = _see_a_wall()
     start, goal = np.array([0.0, 0.0, 5.0]), np.array([9.0, 0.0, 5.0])
     trajectory: Trajectory | None = None
-    for name in ("rrtstar", "rrt", "rrtconnect"):
-        assert name in names()
-        request = PlanRequest(
-            stamp_s=0.0,
-            position_enu_m=start,
-            velocity_enu_mps=np.array([0.0, 1.0, 0.0]),
-            yaw_rad=0,
-            goal_enu_m=goal,
-            attempt=1,
-        )
-        params = planning.StageParams()
+    request = PlanRequest(
+        stamp_s=0.0,
+        position_enu_m=start,
+        velocity_enu_mps=np.array([0.0, 1.0, 0.0]),
+        yaw_rad=0,
+        goal_enu_m=goal,
+        attempt=1,
+    )
+    params = planning.StageParams()
+    for planner in OMPL_PLANNERS:
         found = planning.plan(
-            find(name), request, snapshot, bounds_enu_m=_BOUNDS, seed=1, params=params
+            planner, request, snapshot, bounds_enu_m=_BOUNDS, seed=1, params=params
         )
         trajectory = found if isinstance(found, Trajectory) else None
     _check_and_track(snapshot, trajectory)

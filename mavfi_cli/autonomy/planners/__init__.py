@@ -1,8 +1,6 @@
 """Path planners by name: ours, and those that other packages register under `mavfi.planners`."""
 
-from collections.abc import Callable
-
-from mavfi_cli.autonomy import OUR_PLANNERS, canonical_planner
+from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.autonomy.planners.base import (
     Planner,
     PlanningParams,
@@ -10,7 +8,7 @@ from mavfi_cli.autonomy.planners.base import (
     PlanResult,
     pose_problem,
 )
-from mavfi_cli.autonomy.planners.ompl import RRT, RRTConnect, RRTStar
+from mavfi_cli.autonomy.planners.ompl import OMPL_PLANNERS
 from mavfi_cli.core.plug_ins import installed, load_plug_in
 
 __all__ = [
@@ -25,9 +23,7 @@ __all__ = [
 
 _ENTRY_POINT_GROUP = "mavfi.planners"
 
-_OURS: dict[str, Callable[[], Planner]] = dict(
-    zip(OUR_PLANNERS, (RRTStar, RRT, RRTConnect), strict=True)
-)
+_OURS = {planner.name: planner for planner in OMPL_PLANNERS}
 
 
 def names() -> list[str]:
@@ -47,6 +43,6 @@ def find(name: str) -> Planner:
     """
     plain = canonical_planner(name)
     if plain in _OURS:
-        return _OURS[plain]()
+        return _OURS[plain]
     planner: Planner = load_plug_in(_ENTRY_POINT_GROUP, "planner", name, names())()
     return planner

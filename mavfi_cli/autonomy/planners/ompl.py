@@ -8,10 +8,11 @@ The search stops after a number of iterations, never after a time.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from ompl import base as ob
@@ -27,11 +28,60 @@ MAX_SEED = 0x7FFF_FFFF
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Search:
-    """Settings of an OMPL search."""
+    """One search of a planner."""
 
-    make: Callable[[Any], Any]  # space information -> configured OMPL planner
     iterations: int
+    range_m: float  # longest step of the tree
     optimise: bool = False  # continue after the first solution until the iterations are used up
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OmplPlanner:
+    """One of OMPL's planners. It searches again, as the next search says, while there is no path.
+
+    A straight line from start to goal is the path if it is free.
+    """
+
+    name: str
+    kind: Any  # class of `ompl.geometric`
+    settings: Mapping[str, float]  # argument of each of its setters
+    searches: tuple[_Search, ...]
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
+        """See `Planner.plan`."""
+        result = refuse(problem)
+        if result is not None:
+            return result
+        start, goal = problem.start_enu_m, problem.goal_enu_m
+        if problem.grid.segment_free(start, goal):
+            return PlanResult(found=True, path_enu_m=np.vstack([start, goal]))
+        for search in self.searches:
+            result = self._search(problem, seed, search)
+            if result.found:
+                break
+        assert result is not None
+        return result
+
+    def _search(self, problem: PlanningProblem, seed: int, search: _Search) -> PlanResult:
+        ou.setLogLevel(ou.LogLevel.LOG_NONE)
+        ou.RNG.setSeed(seed % MAX_SEED + 1)
+        space, information = _space(problem.grid)
+        definition = ob.ProblemDefinition(information)
+        ends = [_state(space, point) for point in (problem.start_enu_m, problem.goal_enu_m)]
+        definition.setStartAndGoalStates(*ends, 1e-6)
+        objective = ob.PathLengthOptimizationObjective(information)
+        if not search.optimise:
+            objective.setCostThreshold(ob.Cost(math.inf))
+        definition.setOptimizationObjective(objective)
+        planner = self.kind(information)
+        planner.setRange(search.range_m)
+        for setter, value in self.settings.items():
+            getattr(planner, setter)(value)
+        planner.setProblemDefinition(definition)
+        planner.setup()
+        asked = itertools.count(1)
+        planner.solve(ob.PlannerTerminationCondition(lambda: next(asked) > search.iterations))
+        return _result(problem, definition, next(asked) - 1)
 
 
 class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
@@ -45,43 +95,6 @@ class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
         """Return True if the straight motion from state a to state b is free."""
         free: bool = segment_free(*self._arguments, a[0], a[1], a[2], b[0], b[1], b[2])
         return free
-
-
-def _run(problem: PlanningProblem, seed: int, search: _Search) -> PlanResult:
-    """Search a path from start to goal. Return a straight line if that is free."""
-    refused = refuse(problem)
-    if refused is not None:
-        return refused
-    start, goal = problem.start_enu_m, problem.goal_enu_m
-    if problem.grid.segment_free(start, goal):
-        return PlanResult(found=True, path_enu_m=np.vstack([start, goal]))
-    ou.setLogLevel(ou.LogLevel.LOG_NONE)
-    ou.RNG.setSeed(seed % MAX_SEED + 1)
-    space, information = _space(problem.grid)
-    definition = ob.ProblemDefinition(information)
-    definition.setStartAndGoalStates(_state(space, start), _state(space, goal), 1e-6)
-    objective = ob.PathLengthOptimizationObjective(information)
-    if not search.optimise:
-        objective.setCostThreshold(ob.Cost(math.inf))
-    definition.setOptimizationObjective(objective)
-    planner = search.make(information)
-    planner.setProblemDefinition(definition)
-    planner.setup()
-    counter = _Counter(search.iterations)
-    planner.solve(ob.PlannerTerminationCondition(counter))
-    return _result(problem, definition, counter.count)
-
-
-class _Counter:
-    """Stop condition that becomes true after `limit` calls."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.count = 0
-
-    def __call__(self) -> bool:
-        self.count += 1
-        return self.count > self.limit
 
 
 def _space(grid: ObstacleGrid) -> tuple[Any, Any]:
@@ -131,87 +144,24 @@ def _result(problem: PlanningProblem, definition: Any, iterations: int) -> PlanR
     return PlanResult(found=True, path_enu_m=path, iterations=iterations)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RRT:
-    """RRT with OMPL's default goal bias, and a shorter maximum step for dense maps."""
+_GOAL_BIAS = {"setGoalBias": 0.05}  # OMPL's default
+_FIRST_SOLUTION = _Search(
+    iterations=5000, range_m=10.0
+)  # a shorter step than OMPL's, for dense maps
 
-    name: ClassVar[str] = "rrt"
-
-    iterations: int = 5000
-    range_m: float = 10.0
-    goal_bias: float = 0.05
-
-    def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
-        """See `Planner.plan`."""
-        return _run(problem, seed, _Search(make=self._make, iterations=self.iterations))
-
-    def _make(self, information: Any) -> Any:
-        planner = og.RRT(information)
-        planner.setRange(self.range_m)
-        planner.setGoalBias(self.goal_bias)
-        return planner
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RRTConnect:
-    """RRTConnect, which grows two trees towards each other."""
-
-    name: ClassVar[str] = "rrtconnect"
-
-    iterations: int = 5000
-    range_m: float = 10.0
-
-    def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
-        """See `Planner.plan`."""
-        return _run(problem, seed, _Search(make=self._make, iterations=self.iterations))
-
-    def _make(self, information: Any) -> Any:
-        planner = og.RRTConnect(information)
-        planner.setRange(self.range_m)
-        return planner
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RRTStar:
-    """RRT* with OMPL's default goal bias and rewiring factor.
-
-    After the first solution it samples only states that could shorten the path (Gammell et al.
-    2014). 300 iterations with this restriction give shorter paths than 500 without, at half the
-    cost.
-
-    If the iterations end without a solution, a second search takes shorter steps and up to
-    `patience` iterations, and stops at its first solution. Only hard maps incur this cost.
-    """
-
-    name: ClassVar[str] = "rrtstar"
-
-    iterations: int = 300
-    range_m: float = 25.0
-    patience: int = 2000
-    patient_range_m: float = 5.0
-    goal_bias: float = 0.05
-    rewire_factor: float = 1.1
-
-    def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
-        """See `Planner.plan`."""
-        best = _Search(
-            make=lambda information: self._make(information, self.range_m),
-            iterations=self.iterations,
-            optimise=True,
-        )
-        result = _run(problem, seed, best)
-        if result.found or result.iterations == 0:
-            return result
-        any_at_all = _Search(
-            make=lambda information: self._make(information, self.patient_range_m),
-            iterations=self.patience,
-        )
-        return _run(problem, seed, any_at_all)
-
-    def _make(self, information: Any, range_m: float) -> Any:
-        planner = og.RRTstar(information)
-        planner.setRange(range_m)
-        planner.setGoalBias(self.goal_bias)
-        planner.setRewireFactor(self.rewire_factor)
-        planner.setInformedSampling(True)
-        return planner
+OMPL_PLANNERS = (
+    # After the first solution, RRT* samples only states that could shorten the path (Gammell et al.
+    # 2014). 300 iterations with this restriction give shorter paths than 500 without, at half the
+    # cost. Only hard maps incur the cost of the second search.
+    OmplPlanner(
+        name="rrtstar",
+        kind=og.RRTstar,
+        settings={**_GOAL_BIAS, "setRewireFactor": 1.1, "setInformedSampling": True},
+        searches=(
+            _Search(iterations=300, range_m=25.0, optimise=True),
+            _Search(iterations=2000, range_m=5.0),
+        ),
+    ),
+    OmplPlanner(name="rrt", kind=og.RRT, settings=_GOAL_BIAS, searches=(_FIRST_SOLUTION,)),
+    OmplPlanner(name="rrtconnect", kind=og.RRTConnect, settings={}, searches=(_FIRST_SOLUTION,)),
+)
