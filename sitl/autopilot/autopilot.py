@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,17 +21,16 @@ from sitl.autopilot.commander import (
 )
 from sitl.autopilot.commands import acknowledge, execute
 from sitl.autopilot.flight_modes import (
-    External,
     Guidance,
     Hold,
     Land,
     Return,
-    Situation,
-    Sticks,
     Takeoff,
     climbs,
+    follow_companion,
+    follow_sticks,
 )
-from sitl.autopilot.parameters import Parameters
+from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.setpoint import (
     Setpoint,
     SetpointRefused,
@@ -45,7 +44,6 @@ from sitl.geodesy import Origin
 from sitl.vehicle.vehicle import Truth
 
 COMPONENT = 1
-_BUTTONS_CENTRED = (0, 0, 500, 0)
 _STRAIGHT_DOWN_MPS = 0.3
 
 
@@ -76,22 +74,10 @@ class Autopilot:
         self.setpoint: Setpoint = no_setpoint()
         self.motors_on = False
         self._links: list[Link] = []
-        self._handlers: dict[int, Callable[[Any, Link], None]] = {
-            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: self._on_local_target,
-            dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: self._on_global_target,
-            dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
-            dialect.MAVLINK_MSG_ID_COMMAND_LONG: self._on_command,
-            dialect.MAVLINK_MSG_ID_COMMAND_INT: self._on_command,
-            dialect.MAVLINK_MSG_ID_SET_MODE: self._on_set_mode,
-            dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: self._on_manual_control,
-        }
-        self._offboard: Setpoint = no_setpoint()
-        self._sticks = _BUTTONS_CENTRED
         self._takeoff_down_m = math.nan
         self._hold: Hold | None = None  # guidance of the next entry into LOITER
         self._flown: FlightMode | None = None
-        self._guidance: Guidance = Hold()
-        self._elapsed_s = 0.0
+        self._guidance: Guidance = Hold().fly
         self._text_id = 0
 
     # Links.
@@ -132,15 +118,10 @@ class Autopilot:
     def handle(self, message: Any, link: Link) -> None:
         """Handle a message of a client. Messages for other systems are ignored."""
         number = message.get_msgId()
-        if number in self._handlers:
-            self._handlers[number](message, link)
-        elif number in services.ANY_TARGET or (
-            number in services.ADDRESSED and self._is_for_me(message)
-        ):
-            service = services.ANY_TARGET.get(number) or services.ADDRESSED[number]
-            service(self, message, link)
-        else:
-            return
+        if number in _ANY_TARGET:
+            _ANY_TARGET[number](self, message, link)
+        elif number in _ADDRESSED and self._is_for_me(message):
+            _ADDRESSED[number](self, message, link)
         self._flush_texts()
 
     def enter_mode(self, mode: FlightMode | None) -> Result:
@@ -178,7 +159,7 @@ class Autopilot:
         """Change a REAL32 parameter internally and broadcast it."""
         index = self.parameters.index(name)
         assert index is not None
-        self.parameters.write(name, value, 9)
+        self.parameters.write(name, value, TYPE_REAL32)
         self.broadcast(self.parameters.message(index))
 
     # Updates over time.
@@ -186,12 +167,12 @@ class Autopilot:
     def observe(self, stamp_us: int, truth: Truth) -> None:
         """Take the vehicle's state at a stamp and update the commander."""
         now = self.snapshot
-        self._elapsed_s = elapsed_s = (stamp_us - now.stamp_us) * 1e-6
+        now.elapsed_s = (stamp_us - now.stamp_us) * 1e-6
         has_fix_now = stamp_us >= GPS_FIX_US > now.stamp_us
         now.stamp_us, now.truth = stamp_us, truth
         if has_fix_now:
             self.set_home(np.array(truth.position_ned_m))
-        now.consumed_mah += max(truth.battery_current_a, 0.0) * elapsed_s / 3.6
+        now.consumed_mah += max(truth.battery_current_a, 0.0) * now.elapsed_s / 3.6
         wants_up = self.motors_on and climbs(self.setpoint, truth)
         self.commander.update(stamp_us, truth, wants_up=wants_up)
         self._flush_texts()
@@ -215,17 +196,8 @@ class Autopilot:
         if commander.mode is not self._flown:
             self._guidance = self._enter(commander.mode)
             self._flown = commander.mode
-        spool_up_s = self.parameters.effective("COM_SPOOLUP_TIME")
-        spooled_up = commander.armed_for_s >= spool_up_s
-        self._guidance.fly(
-            Situation(
-                truth=truth, dt_s=self._elapsed_s, parameters=self.parameters,
-                landed=commander.landed, spooled_up=spooled_up,
-                home_ned_m=self.snapshot.home_ned_m, heading_rad=self.snapshot.euler_rad[2],
-            ),
-            out,
-        )  # fmt: skip
-        lifts_off = spooled_up and climbs(out, truth)
+        self._guidance(self.snapshot, out)
+        lifts_off = self.snapshot.spooled_up and climbs(out, truth)
         flies = not commander.landed or lifts_off
         self._command(out, motors_on=flies and not commander.terminated)
         self._flush_texts()
@@ -237,17 +209,17 @@ class Autopilot:
     def _enter(self, mode: FlightMode) -> Guidance:
         """Create the guidance of a mode at its entry."""
         if mode is FlightMode.OFFBOARD:
-            return External(lambda: self._offboard)
+            return follow_companion
         if mode is FlightMode.POSCTL:
-            return Sticks(lambda: self._sticks)
+            return follow_sticks
         if mode is FlightMode.TAKEOFF:
             return self._begin_takeoff()
         if mode is FlightMode.LAND:
-            return Land()
+            return Land().fly
         if mode is FlightMode.RTL:
-            return Return(self._announce_return)
+            return Return(self._announce_return).fly
         hold, self._hold = self._hold or Hold(), None
-        return hold
+        return hold.fly
 
     def _begin_takeoff(self) -> Guidance:
         down = self._takeoff_down_m
@@ -262,7 +234,7 @@ class Autopilot:
             self._hold = Hold(place)
             self.commander.takeoff_finished()
 
-        return Takeoff(down, finished)
+        return Takeoff(down, finished).fly
 
     def _announce_return(self, height_m: float) -> None:
         amsl = self.snapshot.amsl_m(float(self.snapshot.home_ned_m[2])) + height_m
@@ -291,34 +263,31 @@ class Autopilot:
 
     # Messages.
 
-    def _is_for_me(self, message: Any, *, anybody: bool = True) -> bool:
-        systems = (self.system_id, 0) if anybody else (self.system_id,)
+    def _is_for_me(self, message: Any) -> bool:
+        systems = (self.system_id, 0)
         return message.target_system in systems and message.target_component in (COMPONENT, 0)
 
     def _on_local_target(self, message: Any, _link: Link) -> None:
-        if self._is_for_me(message):
-            heading = self.snapshot.euler_rad[2]
-            self._take_setpoint(lambda: local_setpoint(message, heading))
+        heading = self.snapshot.euler_rad[2]
+        self._take_setpoint(lambda: local_setpoint(message, heading))
 
     def _on_global_target(self, message: Any, _link: Link) -> None:
-        if self._is_for_me(message):
-            home_down = float(self.snapshot.home_ned_m[2])
-            self._take_setpoint(lambda: global_setpoint(message, self.snapshot.origin, home_down))
+        home_down = float(self.snapshot.home_ned_m[2])
+        self._take_setpoint(lambda: global_setpoint(message, self.snapshot.origin, home_down))
 
     def _take_setpoint(self, read: Callable[[], Setpoint]) -> None:
         try:
-            self._offboard = read()
+            self.snapshot.offboard = read()
         except SetpointRefused as refusal:
             self.commander.say(Severity.CRITICAL, str(refusal))
             return
         self.commander.offboard_setpoint_arrived()
 
-    def _on_attitude_target(self, message: Any, _link: Link) -> None:
-        if self._is_for_me(message):
-            self.commander.say(Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported")
+    def _on_attitude_target(self, _message: Any, _link: Link) -> None:
+        self.commander.say(Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported")
 
     def _on_command(self, message: Any, link: Link) -> None:
-        if self._is_for_me(message, anybody=False):
+        if message.target_system == self.system_id:
             execute(self, message, link)
 
     def _on_set_mode(self, message: Any, link: Link) -> None:
@@ -331,5 +300,20 @@ class Autopilot:
 
     def _on_manual_control(self, message: Any, _link: Link) -> None:
         if message.target == self.system_id:
-            self._sticks = (message.x, message.y, message.z, message.r)
+            self.snapshot.sticks = (message.x, message.y, message.z, message.r)
             self.commander.sticks_arrived()
+
+
+_ANY_TARGET: Mapping[int, services.Service] = {
+    **services.ANY_TARGET,
+    dialect.MAVLINK_MSG_ID_SET_MODE: Autopilot._on_set_mode,
+    dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: Autopilot._on_manual_control,
+}
+_ADDRESSED: Mapping[int, services.Service] = {
+    **services.ADDRESSED,
+    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: Autopilot._on_local_target,
+    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: Autopilot._on_global_target,
+    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: Autopilot._on_attitude_target,
+    dialect.MAVLINK_MSG_ID_COMMAND_LONG: Autopilot._on_command,
+    dialect.MAVLINK_MSG_ID_COMMAND_INT: Autopilot._on_command,
+}

@@ -17,13 +17,8 @@ READY_US = 4_000_000  # pre-arm checks pass
 _CONTROL_BACK_US = 1_000_000  # time for which a lost setpoint source must be back
 _STILL_MPS = 0.5
 
-# MAV_MODE_FLAG.
-_CUSTOM_MODE_ENABLED = 0x01
-_AUTO_ENABLED = 0x04
-_GUIDED_ENABLED = 0x08
-_STABILIZE_ENABLED = 0x10
-_MANUAL_INPUT_ENABLED = 0x40
-_SAFETY_ARMED = 0x80
+_STABILIZE: int = dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
+_AUTO: int = _STABILIZE | dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
 
 
 class FlightMode(Enum):
@@ -63,13 +58,16 @@ class FlightMode(Enum):
 
     def base_mode(self, *, armed: bool) -> int:
         """Return HEARTBEAT.base_mode as in PX4 v1.17."""
-        flags = _CUSTOM_MODE_ENABLED | (_SAFETY_ARMED if armed else 0)
+        flags: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        if armed:
+            flags |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
         if self.main == FlightMode.LOITER.main:
-            return flags | _AUTO_ENABLED | _GUIDED_ENABLED | _STABILIZE_ENABLED
-        if self is FlightMode.OFFBOARD:
-            return flags | _STABILIZE_ENABLED
-        stabilized = _STABILIZE_ENABLED if self is FlightMode.POSCTL else 0
-        return flags | _MANUAL_INPUT_ENABLED | stabilized
+            return flags | _AUTO
+        if self in (FlightMode.OFFBOARD, FlightMode.POSCTL):
+            flags |= _STABILIZE
+        if self is not FlightMode.OFFBOARD:
+            flags |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+        return flags
 
 
 class Severity(IntEnum):
@@ -79,30 +77,6 @@ class Severity(IntEnum):
     CRITICAL = 2
     WARNING = 4
     INFO = 6
-
-
-class _LandDetector:
-    """Detects landing, with PX4's LNDMC_TRIG_TIME as hysteresis."""
-
-    __slots__ = ("_settled_since_us", "landed")
-
-    def __init__(self) -> None:
-        self.landed = True
-        self._settled_since_us: int | None = None
-
-    def update(self, stamp_us: int, truth: Truth, *, wants_up: bool, trigger_s: float) -> bool:
-        """Take the newest state. Return True if `landed` has changed."""
-        if self.landed:
-            self.landed = truth.on_ground
-            self._settled_since_us = None
-            return not self.landed
-        if not truth.on_ground or wants_up or not _is_still(truth):
-            self._settled_since_us = None
-            return False
-        if self._settled_since_us is None:
-            self._settled_since_us = stamp_us
-        self.landed = stamp_us - self._settled_since_us >= trigger_s * 1e6
-        return self.landed
 
 
 def _is_still(truth: Truth) -> bool:
@@ -132,17 +106,19 @@ class Commander:
     Attributes:
         mode: Active mode: the user's choice, or the failsafe's.
         armed: True while armed.
+        landed: True if the vehicle stands on the ground.
         terminated: True once flight termination has stopped the motors permanently.
         texts: Pending status texts with their severities; the owner removes them.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
-        self._detector = _LandDetector()
         self.stamp_us = 0
         self.user_mode = FlightMode.LOITER
         self.failsafe: FlightMode | None = None
         self.armed = False
+        self.landed = True
+        self._settled_us: int | None = None  # since when it has stood still on the ground
         self.terminated = False
         self.texts: list[tuple[Severity, str]] = []
         self._armed_us = 0
@@ -157,11 +133,6 @@ class Commander:
     def mode(self) -> FlightMode:
         """Active mode."""
         return self.failsafe or self.user_mode
-
-    @property
-    def landed(self) -> bool:
-        """True if the vehicle stands on the ground."""
-        return self._detector.landed
 
     @property
     def armed_for_s(self) -> float:
@@ -292,9 +263,7 @@ class Commander:
             wants_up: True if the active setpoint climbs.
         """
         self.stamp_us = stamp_us
-        trigger = self._parameters.effective("LNDMC_TRIG_TIME")
-        if self._detector.update(stamp_us, truth, wants_up=wants_up, trigger_s=trigger):
-            self._note_landing()
+        self._detect_landing(truth, wants_up=wants_up)
         if self.armed:
             self._watch_control()
             self._auto_disarm()
@@ -305,7 +274,18 @@ class Commander:
         if self.mode is FlightMode.TAKEOFF:
             self.user_mode = FlightMode.LOITER
 
-    def _note_landing(self) -> None:
+    def _detect_landing(self, truth: Truth, *, wants_up: bool) -> None:
+        """Update `landed`, with PX4's LNDMC_TRIG_TIME as hysteresis."""
+        before = self.landed
+        if self.landed or not truth.on_ground or wants_up or not _is_still(truth):
+            self.landed = self.landed and truth.on_ground
+            self._settled_us = None
+        else:
+            self._settled_us = self.stamp_us if self._settled_us is None else self._settled_us
+            trigger_us = self._parameters.effective("LNDMC_TRIG_TIME") * 1e6
+            self.landed = self.stamp_us - self._settled_us >= trigger_us
+        if self.landed == before:
+            return
         self._landed_us = self.stamp_us
         if not self.landed:
             self._flown_since_arming = True

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Protocol
 
 import numpy as np
 
 from mavfi_cli.core.frames import Vector
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint
+from sitl.autopilot.telemetry import Snapshot
 from sitl.vehicle.vehicle import Truth
 
 _POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4
@@ -33,24 +32,9 @@ _ARRIVED_M = 0.5
 _STICK_INVALID = 32767
 
 
-@dataclass(slots=True, kw_only=True)
-class Situation:
-    """Inputs of a flight mode at one tick."""
-
-    truth: Truth
-    dt_s: float
-    parameters: Parameters
-    landed: bool
-    spooled_up: bool  # armed for long enough to take off
-    home_ned_m: Vector  # (3,)
-    heading_rad: float
-
-
-class Guidance(Protocol):
-    """Guidance of a flight mode from one entry to its end."""
-
-    def fly(self, now: Situation, out: Setpoint) -> None:
-        """Write the setpoint of this tick into `out`, which holds NaN."""
+# Guidance of a flight mode from one entry to its end: writes the setpoint of this tick into an
+# array that holds NaN.
+Guidance = Callable[[Snapshot, Setpoint], None]
 
 
 def climbs(out: Setpoint, truth: Truth) -> bool:
@@ -93,7 +77,7 @@ class _Anchor:
         self._axes = axes
         self._place = place
 
-    def hold(self, now: Situation, out: Setpoint) -> None:
+    def hold(self, now: Snapshot, out: Setpoint) -> None:
         """Write position, or zero velocity while braking, for the anchor's axes."""
         axes = self._axes
         if self._place is None:
@@ -113,7 +97,7 @@ class Hold:
         self._yaw_rad = yaw_rad
         self._anchor = _Anchor(_ALL_AXES, target_ned_m)
 
-    def fly(self, now: Situation, out: Setpoint) -> None:
+    def fly(self, now: Snapshot, out: Setpoint) -> None:
         """Fly straight to a distant position, otherwise hold."""
         out[9] = self._yaw_rad
         if self._target is not None:
@@ -133,17 +117,17 @@ class Takeoff:
         self._anchor = _Anchor(_HORIZONTAL)
         self._climbing_s = 0.0
 
-    def fly(self, now: Situation, out: Setpoint) -> None:
+    def fly(self, now: Snapshot, out: Setpoint) -> None:
         """Climb at a speed that ramps up over MPC_TKO_RAMP_T."""
         self._anchor.hold(now, out)
         delta = self._target_down_m - float(now.truth.position_ned_m[2])
-        if not now.landed and delta > -_TAKEOFF_NEAR_M:
+        if not now.commander.landed and delta > -_TAKEOFF_NEAR_M:
             out[2] = self._target_down_m
             self._finished()
             return
         if now.spooled_up:
-            self._climbing_s += now.dt_s
-        ramp_s = max(now.parameters.effective("MPC_TKO_RAMP_T"), now.dt_s)
+            self._climbing_s += now.elapsed_s
+        ramp_s = max(now.parameters.effective("MPC_TKO_RAMP_T"), now.elapsed_s)
         fastest = now.parameters.effective("MPC_TKO_SPEED") * min(1.0, self._climbing_s / ramp_s)
         out[5] = -min(max(fastest, _TAKEOFF_FIRST_MPS), max(-delta, _TAKEOFF_FIRST_MPS))
 
@@ -154,7 +138,7 @@ class Land:
     def __init__(self, over: Vector | None = None) -> None:
         self._anchor = _Anchor(_HORIZONTAL, over)
 
-    def fly(self, now: Situation, out: Setpoint) -> None:
+    def fly(self, now: Snapshot, out: Setpoint) -> None:
         """Descend at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2."""
         self._anchor.hold(now, out)
         value = now.parameters.effective
@@ -179,11 +163,11 @@ class Return:
         self._leg: _Leg | None = None
         self._down_m = 0.0
         self._anchor = _Anchor(_HORIZONTAL)
-        self._landing: Land | None = None
+        self._landing = Land()
 
-    def fly(self, now: Situation, out: Setpoint) -> None:
+    def fly(self, now: Snapshot, out: Setpoint) -> None:
         """Fly the present leg and begin the next at its end."""
-        if now.landed:
+        if now.commander.landed:
             out[5] = now.parameters.effective("MPC_LAND_SPEED")
             return
         if self._leg is None:
@@ -202,9 +186,9 @@ class Return:
                 self._leg = _Leg.LAND
                 self._landing = Land(np.array(now.home_ned_m[:2]))
         else:
-            self._come_down(now, out)
+            self._landing.fly(now, out)
 
-    def _begin(self, now: Situation) -> None:
+    def _begin(self, now: Snapshot) -> None:
         """Choose the height: a cone round home when near, RTL_RETURN_ALT when far."""
         value = now.parameters.effective
         away = now.truth.position_ned_m - now.home_ned_m
@@ -219,51 +203,36 @@ class Return:
         self._leg = _Leg.CLIMB
         self._announce(height)
 
-    def _come_down(self, now: Situation, out: Setpoint) -> None:
-        assert self._landing is not None
-        self._landing.fly(now, out)
+
+def follow_companion(now: Snapshot, out: Setpoint) -> None:
+    """OFFBOARD: the newest accepted setpoint; an axis that it leaves free stands still."""
+    out[:] = now.offboard
+    for axis in range(3):
+        if math.isnan(out[axis]) and math.isnan(out[3 + axis]):
+            out[3 + axis] = 0.0
+    _limit_velocity(out, now.parameters)
 
 
-class External:
-    """OFFBOARD: follows the companion's setpoints."""
-
-    def __init__(self, newest: Callable[[], Setpoint]) -> None:
-        self._newest = newest
-
-    def fly(self, now: Situation, out: Setpoint) -> None:
-        """The newest accepted setpoint; an axis that it leaves free stands still."""
-        out[:] = self._newest()
-        for axis in range(3):
-            if math.isnan(out[axis]) and math.isnan(out[3 + axis]):
-                out[3 + axis] = 0.0
-        _limit_velocity(out, now.parameters)
-
-
-class Sticks:
-    """POSCTL: velocity and yaw rate from MANUAL_CONTROL."""
-
-    def __init__(self, newest: Callable[[], tuple[int, int, int, int]]) -> None:
-        self._newest = newest
-
-    def fly(self, now: Situation, out: Setpoint) -> None:
-        """Sticks -1000..1000 to velocity in the heading frame; throttle 500 keeps the height."""
-        x, y, z, r = self._newest()
-        value = now.parameters.effective
-        forward, right = (_stick(s) * value("MPC_VEL_MANUAL") for s in (x, y))
-        cosine, sine = math.cos(now.heading_rad), math.sin(now.heading_rad)
-        out[3] = cosine * forward - sine * right
-        out[4] = sine * forward + cosine * right
-        lift = 0.0 if z == _STICK_INVALID else _stick(2 * z - 1000)
-        out[5] = -lift * value("MPC_Z_VEL_MAX_UP" if lift > 0.0 else "MPC_Z_VEL_MAX_DN")
-        out[10] = _stick(r) * math.radians(value("MPC_MAN_Y_MAX"))
-        _limit_velocity(out, now.parameters)
+def follow_sticks(now: Snapshot, out: Setpoint) -> None:
+    """POSCTL: sticks -1000..1000 are velocity in the heading frame; throttle 500 keeps height."""
+    x, y, z, r = now.sticks
+    value = now.parameters.effective
+    forward, right = (_stick(s) * value("MPC_VEL_MANUAL") for s in (x, y))
+    heading_rad = now.euler_rad[2]
+    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+    out[3] = cosine * forward - sine * right
+    out[4] = sine * forward + cosine * right
+    lift = 0.0 if z == _STICK_INVALID else _stick(2 * z - 1000)
+    out[5] = -lift * value("MPC_Z_VEL_MAX_UP" if lift > 0.0 else "MPC_Z_VEL_MAX_DN")
+    out[10] = _stick(r) * math.radians(value("MPC_MAN_Y_MAX"))
+    _limit_velocity(out, now.parameters)
 
 
 def _stick(value: int) -> float:
     return 0.0 if value == _STICK_INVALID else min(max(value / 1000.0, -1.0), 1.0)
 
 
-def _go(now: Situation, out: Setpoint, delta: Vector) -> None:
+def _go(now: Snapshot, out: Setpoint, delta: Vector) -> None:
     value = now.parameters.effective
     out[3:5] = _approach(
         delta[:2], speed_mps=value("MPC_XY_CRUISE"), acceleration_mps2=value("MPC_ACC_HOR")
@@ -271,7 +240,7 @@ def _go(now: Situation, out: Setpoint, delta: Vector) -> None:
     _go_vertical(now, out, float(delta[2]))
 
 
-def _go_vertical(now: Situation, out: Setpoint, delta_m: float) -> None:
+def _go_vertical(now: Snapshot, out: Setpoint, delta_m: float) -> None:
     name = "MPC_Z_V_AUTO_UP" if delta_m < 0.0 else "MPC_Z_V_AUTO_DN"
     limit = now.parameters.effective(name)
     out[5] = _approach(np.array([delta_m]), speed_mps=limit, acceleration_mps2=3.0)[0]

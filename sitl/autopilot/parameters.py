@@ -10,27 +10,24 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 from mavfi_cli.link.codec import dialect
 
-TYPE_UINT32 = 5
-TYPE_INT32 = 6
-TYPE_REAL32 = 9
+TYPE_INT32: int = dialect.MAV_PARAM_TYPE_INT32
+TYPE_REAL32: int = dialect.MAV_PARAM_TYPE_REAL32
 HASH_NAME = "_HASH_CHECK"
 HASH_INDEX = 65535
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Parameter:
+class _Parameter(NamedTuple):
     """One parameter: name of up to 16 characters, default and usable range."""
 
     name: str
     default: float | int  # the type of the default is the type of the parameter
-    low: float = float("-inf")
-    high: float = float("inf")
+    low: float = -math.inf
+    high: float = math.inf
     read_only: bool = False
 
     @property
@@ -38,78 +35,81 @@ class _Parameter:
         """True for an INT32, False for a REAL32."""
         return isinstance(self.default, int)
 
+    @property
+    def wire_type(self) -> int:
+        """MAV_PARAM_TYPE."""
+        return TYPE_INT32 if self.is_integer else TYPE_REAL32
 
-def _row(
-    name: str, default: float, low: float = float("-inf"), high: float = float("inf")
-) -> _Parameter:
-    return _Parameter(name=name, default=default, low=low, high=high)
+    def packed(self, value: float) -> bytes:
+        """Return a value's four bytes on the wire."""
+        return struct.pack("<i" if self.is_integer else "<f", value)
 
 
 _ACTING = (
-    _row("BAT_CRIT_THR", 0.07, 0.0, 0.5),
-    _row("BAT_LOW_THR", 0.15, 0.0, 0.5),
-    _row("COM_DISARM_LAND", 2.0, -1.0, 60.0),
-    _row("COM_DISARM_PRFLT", 10.0, -1.0, 600.0),
-    _row("COM_OBL_RC_ACT", 3, 0, 7),
-    _row("COM_OF_LOSS_T", 1.0, 0.1, 60.0),
-    _row("COM_RC_LOSS_T", 0.5, 0.1, 35.0),
-    _row("COM_SPOOLUP_TIME", 1.0, 0.0, 30.0),
-    _row("LNDMC_TRIG_TIME", 1.0, 0.1, 10.0),
-    _row("MIS_TAKEOFF_ALT", 2.5, 0.5, 500.0),
-    _row("MPC_ACC_HOR", 3.0, 0.5, 15.0),
-    _row("MPC_LAND_ALT1", 10.0, 0.0, 1000.0),
-    _row("MPC_LAND_ALT2", 5.0, 0.0, 1000.0),
-    _row("MPC_LAND_SPEED", 0.7, 0.2, 5.0),
-    _row("MPC_MAN_Y_MAX", 150.0, 1.0, 400.0),
-    _row("MPC_TKO_RAMP_T", 3.0, 0.0, 5.0),
-    _row("MPC_TKO_SPEED", 1.5, 0.5, 5.0),
-    _row("MPC_VEL_MANUAL", 10.0, 0.5, 20.0),
-    _row("MPC_XY_CRUISE", 5.0, 0.5, 20.0),
-    _row("MPC_XY_VEL_MAX", 12.0, 0.1, 20.0),
-    _row("MPC_Z_VEL_MAX_DN", 1.5, 0.2, 10.0),
-    _row("MPC_Z_VEL_MAX_UP", 3.0, 0.2, 10.0),
-    _row("MPC_Z_V_AUTO_DN", 1.5, 0.2, 10.0),
-    _row("MPC_Z_V_AUTO_UP", 3.0, 0.2, 10.0),
-    _row("NAV_ACC_RAD", 2.0, 0.1, 200.0),
-    _row("NAV_MC_ALT_RAD", 0.8, 0.05, 200.0),
-    _row("RTL_CONE_ANG", 45, 0, 90),
-    _row("RTL_DESCEND_ALT", 30.0, 0.0, 1000.0),
-    _row("RTL_MIN_DIST", 10.0, 0.5, 100.0),
-    _row("RTL_RETURN_ALT", 60.0, 0.0, 1000.0),
+    _Parameter("BAT_CRIT_THR", 0.07, 0.0, 0.5),
+    _Parameter("BAT_LOW_THR", 0.15, 0.0, 0.5),
+    _Parameter("COM_DISARM_LAND", 2.0, -1.0, 60.0),
+    _Parameter("COM_DISARM_PRFLT", 10.0, -1.0, 600.0),
+    _Parameter("COM_OBL_RC_ACT", 3, 0, 7),
+    _Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0),
+    _Parameter("COM_RC_LOSS_T", 0.5, 0.1, 35.0),
+    _Parameter("COM_SPOOLUP_TIME", 1.0, 0.0, 30.0),
+    _Parameter("LNDMC_TRIG_TIME", 1.0, 0.1, 10.0),
+    _Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 500.0),
+    _Parameter("MPC_ACC_HOR", 3.0, 0.5, 15.0),
+    _Parameter("MPC_LAND_ALT1", 10.0, 0.0, 1000.0),
+    _Parameter("MPC_LAND_ALT2", 5.0, 0.0, 1000.0),
+    _Parameter("MPC_LAND_SPEED", 0.7, 0.2, 5.0),
+    _Parameter("MPC_MAN_Y_MAX", 150.0, 1.0, 400.0),
+    _Parameter("MPC_TKO_RAMP_T", 3.0, 0.0, 5.0),
+    _Parameter("MPC_TKO_SPEED", 1.5, 0.5, 5.0),
+    _Parameter("MPC_VEL_MANUAL", 10.0, 0.5, 20.0),
+    _Parameter("MPC_XY_CRUISE", 5.0, 0.5, 20.0),
+    _Parameter("MPC_XY_VEL_MAX", 12.0, 0.1, 20.0),
+    _Parameter("MPC_Z_VEL_MAX_DN", 1.5, 0.2, 10.0),
+    _Parameter("MPC_Z_VEL_MAX_UP", 3.0, 0.2, 10.0),
+    _Parameter("MPC_Z_V_AUTO_DN", 1.5, 0.2, 10.0),
+    _Parameter("MPC_Z_V_AUTO_UP", 3.0, 0.2, 10.0),
+    _Parameter("NAV_ACC_RAD", 2.0, 0.1, 200.0),
+    _Parameter("NAV_MC_ALT_RAD", 0.8, 0.05, 200.0),
+    _Parameter("RTL_CONE_ANG", 45, 0, 90),
+    _Parameter("RTL_DESCEND_ALT", 30.0, 0.0, 1000.0),
+    _Parameter("RTL_MIN_DIST", 10.0, 0.5, 100.0),
+    _Parameter("RTL_RETURN_ALT", 60.0, 0.0, 1000.0),
 )
 
 _PRESENT = (
-    _row("BAT1_CAPACITY", -1.0),
-    _row("BAT1_N_CELLS", 4),
-    _row("BAT_EMERGEN_THR", 0.05),
-    _row("CAL_ACC0_ID", 1310988),
-    _row("CAL_GYRO0_ID", 1310988),
-    _row("CAL_MAG0_ID", 197388),
-    _row("CBRK_SUPPLY_CHK", 0),
-    _row("COM_FLTMODE1", -1),
-    _row("COM_LOW_BAT_ACT", 0),
-    _row("COM_RC_IN_MODE", 3),
-    _row("EKF2_HGT_REF", 1),
-    _row("GF_ACTION", 2),
-    _row("MAV_PROTO_VER", 2),
-    _row("MAV_TYPE", 2),
-    _row("NAV_DLL_ACT", 0),
-    _row("NAV_RCL_ACT", 2),
-    _row("RTL_LAND_DELAY", 0.0),
-    _row("RTL_TYPE", 0),
-    _row("SYS_AUTOSTART", 10040),
-    _row("SYS_AUTOCONFIG", 0),
-    _row("SYS_HAS_BARO", 1),
-    _row("SYS_HAS_GPS", 1),
-    _row("SYS_HAS_MAG", 1),
+    _Parameter("BAT1_CAPACITY", -1.0),
+    _Parameter("BAT1_N_CELLS", 4),
+    _Parameter("BAT_EMERGEN_THR", 0.05),
+    _Parameter("CAL_ACC0_ID", 1310988),
+    _Parameter("CAL_GYRO0_ID", 1310988),
+    _Parameter("CAL_MAG0_ID", 197388),
+    _Parameter("CBRK_SUPPLY_CHK", 0),
+    _Parameter("COM_FLTMODE1", -1),
+    _Parameter("COM_LOW_BAT_ACT", 0),
+    _Parameter("COM_RC_IN_MODE", 3),
+    _Parameter("EKF2_HGT_REF", 1),
+    _Parameter("GF_ACTION", 2),
+    _Parameter("MAV_PROTO_VER", 2),
+    _Parameter("MAV_TYPE", 2),
+    _Parameter("NAV_DLL_ACT", 0),
+    _Parameter("NAV_RCL_ACT", 2),
+    _Parameter("RTL_LAND_DELAY", 0.0),
+    _Parameter("RTL_TYPE", 0),
+    _Parameter("SYS_AUTOSTART", 10040),
+    _Parameter("SYS_AUTOCONFIG", 0),
+    _Parameter("SYS_HAS_BARO", 1),
+    _Parameter("SYS_HAS_GPS", 1),
+    _Parameter("SYS_HAS_MAG", 1),
 )
 
 
 def _parameter_table(system_id: int) -> tuple[_Parameter, ...]:
     """Return all parameters in index order, which is alphabetical."""
     fixed = (
-        _Parameter(name="MAV_COMP_ID", default=1, read_only=True),
-        _Parameter(name="MAV_SYS_ID", default=system_id, read_only=True),
+        _Parameter("MAV_COMP_ID", 1, read_only=True),
+        _Parameter("MAV_SYS_ID", system_id, read_only=True),
     )
     return tuple(sorted((*_ACTING, *_PRESENT, *fixed), key=lambda row: row.name))
 
@@ -158,10 +158,12 @@ class Parameters:
         read-only parameter is rejected, too.
         """
         number = self._index.get(name)
-        if number is None or wire_type != _wire_type(self._table[number]):
+        if number is None or wire_type != self._table[number].wire_type:
             return SetResult.IGNORED
         row = self._table[number]
-        value: float | int = _int_of_float(wire_value) if row.is_integer else wire_value
+        value: float | int = wire_value
+        if row.is_integer:
+            (value,) = struct.unpack("<i", struct.pack("<f", wire_value))
         if row.read_only or not math.isfinite(value) or value == self._values[number]:
             return SetResult.UNCHANGED
         self._values[number] = _stored(row, value)
@@ -169,41 +171,28 @@ class Parameters:
 
     def message(self, index: int) -> Any:
         """Return the PARAM_VALUE of a valid index."""
-        row, value = self._table[index], self._values[index]
-        wire = _float_of_bytes(struct.pack("<i", value)) if row.is_integer else value
-        return _value_message(row.name, wire, _wire_type(row), len(self), index)
+        row = self._table[index]
+        wire = _float_of_bytes(row.packed(self._values[index]))
+        return _value_message(row.name, wire, row.wire_type, len(self), index)
 
     def hash_message(self) -> Any:
         """Return the PARAM_VALUE of the hash, with which a client validates its cache."""
         digest = 0
         for row, value in zip(self._table, self._values, strict=True):
-            packed = struct.pack("<i" if row.is_integer else "<f", value)
-            digest = zlib.crc32(row.name.encode() + packed, digest)
+            digest = zlib.crc32(row.name.encode() + row.packed(value), digest)
         wire = _float_of_bytes(struct.pack("<I", digest))
-        return _value_message(HASH_NAME, wire, TYPE_UINT32, len(self), HASH_INDEX)
+        return _value_message(HASH_NAME, wire, dialect.MAV_PARAM_TYPE_UINT32, len(self), HASH_INDEX)
 
 
 def _value_message(name: str, wire: float, kind: int, count: int, index: int) -> Any:
     return dialect.MAVLink_param_value_message(name.encode(), wire, kind, count, index)
 
 
-def _wire_type(row: _Parameter) -> int:
-    return TYPE_INT32 if row.is_integer else TYPE_REAL32
-
-
 def _stored(row: _Parameter, value: float) -> float | int:
     """Return the value rounded to the wire's precision."""
-    if row.is_integer:
-        return int(value)
-    single: float = struct.unpack("<f", struct.pack("<f", value))[0]
-    return single
+    return int(value) if row.is_integer else _float_of_bytes(row.packed(value))
 
 
 def _float_of_bytes(data: bytes) -> float:
     value: float = struct.unpack("<f", data)[0]
     return value
-
-
-def _int_of_float(value: float) -> int:
-    number: int = struct.unpack("<i", struct.pack("<f", value))[0]
-    return number

@@ -17,9 +17,6 @@ _PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
 
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
-_MISSION_ACCEPTED = 0
-_MISSION_UNSUPPORTED = 3
-_MISSION_INVALID_SEQUENCE = 13
 
 
 def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
@@ -74,23 +71,13 @@ def _mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> No
     )
 
 
-def _mission_count(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Accept an empty upload, which clears the mission, and reject any other."""
-    empty = message.count == 0
-    _mission_ack(message, link, _MISSION_ACCEPTED if empty else _MISSION_UNSUPPORTED)
-
-
-def _mission_clear_all(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Acknowledge, as there is nothing to clear."""
-    _mission_ack(message, link, _MISSION_ACCEPTED)
-
-
-def _mission_request(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer that the item does not exist."""
-    _mission_ack(message, link, _MISSION_INVALID_SEQUENCE)
-
-
-def _mission_ack(message: Any, link: Link, result: int) -> None:
+def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Accept to clear the mission, also by an empty upload. No item and no upload exists."""
+    result = dialect.MAV_MISSION_ACCEPTED
+    if message.get_type().startswith("MISSION_REQUEST"):
+        result = dialect.MAV_MISSION_INVALID_SEQUENCE
+    elif getattr(message, "count", 0):
+        result = dialect.MAV_MISSION_UNSUPPORTED
     link.send(
         dialect.MAVLink_mission_ack_message(
             message.get_srcSystem(), message.get_srcComponent(), result, message.mission_type
@@ -139,10 +126,10 @@ ADDRESSED: Mapping[int, Service] = {
     dialect.MAVLINK_MSG_ID_PARAM_REQUEST_READ: _param_request_read,
     dialect.MAVLINK_MSG_ID_PARAM_SET: _param_set,
     dialect.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: _mission_request_list,
-    dialect.MAVLINK_MSG_ID_MISSION_COUNT: _mission_count,
-    dialect.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: _mission_clear_all,
-    dialect.MAVLINK_MSG_ID_MISSION_REQUEST: _mission_request,
-    dialect.MAVLINK_MSG_ID_MISSION_REQUEST_INT: _mission_request,
+    dialect.MAVLINK_MSG_ID_MISSION_COUNT: _mission_ack,
+    dialect.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: _mission_ack,
+    dialect.MAVLINK_MSG_ID_MISSION_REQUEST: _mission_ack,
+    dialect.MAVLINK_MSG_ID_MISSION_REQUEST_INT: _mission_ack,
     dialect.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: _file_transfer,
     dialect.MAVLINK_MSG_ID_LOG_REQUEST_LIST: _log_request_list,
 }

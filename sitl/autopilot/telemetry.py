@@ -30,9 +30,17 @@ class Snapshot:
     stamp_us: int = 0
     setpoint: Setpoint = field(default_factory=no_setpoint)
     motors_on: bool = False
+    offboard: Setpoint = field(default_factory=no_setpoint)  # newest one of the companion
+    sticks: tuple[int, int, int, int] = (0, 0, 500, 0)  # newest x, y, z, r of MANUAL_CONTROL
+    elapsed_s: float = 0.0  # since the tick before
     consumed_mah: float = 0.0
     _euler: tuple[float, float, float] = (0.0, 0.0, 0.0)
     _euler_us: int = -1
+
+    @property
+    def spooled_up(self) -> bool:
+        """True once an armed vehicle's motors turn fast enough to take off."""
+        return self.commander.armed_for_s >= self.parameters.effective("COM_SPOOLUP_TIME")
 
     @property
     def boot_ms(self) -> int:
@@ -89,10 +97,7 @@ def int32(value: float) -> int:
 
 
 _ZERO_MASKS = ((0, 0x007), (3, 0x038))
-_LOCAL_NED = 1
-_BODY_FRD = 12
 _UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
-_ESTIMATOR_AUTOPILOT = 8
 _STANDARD_PRESSURE_HPA = 1013.25
 _GRAVITY_MPS2 = 9.80665
 
@@ -178,10 +183,10 @@ def _odometry(s: Snapshot) -> Any:
     """Return ODOMETRY: pose in local NED, velocity in the body's FRD."""
     quaternion = s.truth.quaternion_frd_ned.tolist()
     return dialect.MAVLink_odometry_message(
-        s.stamp_us, _LOCAL_NED, _BODY_FRD, *s.truth.position_ned_m.tolist(), quaternion,
+        s.stamp_us, dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD, *s.truth.position_ned_m.tolist(), quaternion,
         *_in_body(quaternion, s.truth.velocity_ned_mps.tolist()),
         *s.truth.rates_frd_radps.tolist(),
-        _UNKNOWN_COVARIANCE, _UNKNOWN_COVARIANCE, 0, _ESTIMATOR_AUTOPILOT, 100,
+        _UNKNOWN_COVARIANCE, _UNKNOWN_COVARIANCE, 0, dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, 100,
     )  # fmt: skip
 
 
@@ -206,7 +211,7 @@ def _position_target_local_ned(s: Snapshot) -> Any:
     sent = [0.0 if math.isnan(value) else value for value in values]
     if math.isnan(values[9]):
         sent[9] = s.euler_rad[2]
-    return dialect.MAVLink_position_target_local_ned_message(s.boot_ms, _LOCAL_NED, mask, *sent)
+    return dialect.MAVLink_position_target_local_ned_message(s.boot_ms, dialect.MAV_FRAME_LOCAL_NED, mask, *sent)
 
 
 def _attitude_target(s: Snapshot) -> Any:
@@ -229,24 +234,23 @@ def _servo_output_raw(s: Snapshot) -> Any:
     )
 
 
-_QUADROTOR = 2
-_PX4 = 12
-_PREARM_CHECK = 1 << 28
-_GPS = 0x20
+_GPS = dialect.MAV_SYS_STATUS_SENSOR_GPS
 _PRESENT = 0x0300402F  # as in PX4 v1.17 SITL
 _ENABLED = 0x0301402F
 _HEALTH = 0x0320C83F
 
-# Implemented MAV_PROTOCOL_CAPABILITY: MISSION_INT, COMMAND_INT, PARAM_ENCODE_BYTEWISE,
-# SET_POSITION_TARGET_GLOBAL_INT, SET_POSITION_TARGET_LOCAL_NED, FLIGHT_TERMINATION, MAVLINK2.
-_CAPABILITIES = 4 | 8 | 16 | 256 | 128 | 2048 | 8192
+_CAPABILITIES = (
+    dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_GLOBAL_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+    | dialect.MAV_PROTOCOL_CAPABILITY_FLIGHT_TERMINATION
+    | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+)
 _FLIGHT_VERSION = 0x011100FF  # 1.17.0 official
 _UNIQUE_ID = 0x4D41564649  # "MAVFI"
 
-_BATTERY_LIPO = 1
-_BATTERY_ALL = 1
-_CHARGE_OK = 1
-_MISSION_NO_MISSION = 1
 _ESTIMATOR_GOOD = 0x33F
 _ESTIMATOR_NO_POSITION = 0x027
 
@@ -255,7 +259,7 @@ def _heartbeat(s: Snapshot) -> Any:
     commander = s.commander
     mode = commander.mode
     return dialect.MAVLink_heartbeat_message(
-        _QUADROTOR, _PX4, mode.base_mode(armed=commander.armed), mode.custom_mode,
+        dialect.MAV_TYPE_QUADROTOR, dialect.MAV_AUTOPILOT_PX4, mode.base_mode(armed=commander.armed), mode.custom_mode,
         commander.system_status, 3,
     )  # fmt: skip
 
@@ -265,7 +269,7 @@ def _sys_status(s: Snapshot) -> Any:
     gps = _GPS if s.commander.has_gps_fix else 0
     health = _HEALTH & ~_GPS | gps
     if s.commander.can_arm:
-        health |= _PREARM_CHECK
+        health |= dialect.MAV_SYS_STATUS_PREARM_CHECK
     truth = s.truth
     return dialect.MAVLink_sys_status_message(
         _PRESENT & ~_GPS | gps, _ENABLED, health, 250, _uint16(truth.battery_voltage_v * 1e3),
@@ -284,9 +288,9 @@ def _battery_status(s: Snapshot) -> Any:
     cells = min(max(int(s.parameters.value("BAT1_N_CELLS")), 1), 10)
     each = _uint16(truth.battery_voltage_v / cells * 1e3)
     return dialect.MAVLink_battery_status_message(
-        0, _BATTERY_ALL, _BATTERY_LIPO, 32767, [each] * cells + [65535] * (10 - cells),
+        0, dialect.MAV_BATTERY_FUNCTION_ALL, dialect.MAV_BATTERY_TYPE_LIPO, 32767, [each] * cells + [65535] * (10 - cells),
         _int16(truth.battery_current_a * 100.0), _clip(s.consumed_mah, 0, 2**31 - 1), -1,
-        _clip(truth.battery_remaining * 100.0, 0, 100), 0, _CHARGE_OK,
+        _clip(truth.battery_remaining * 100.0, 0, 100), 0, dialect.MAV_BATTERY_CHARGE_STATE_OK,
     )  # fmt: skip
 
 
@@ -332,7 +336,7 @@ def _ping(s: Snapshot) -> Any:
 
 
 def _mission_current(_: Snapshot) -> Any:
-    return dialect.MAVLink_mission_current_message(0, 0, _MISSION_NO_MISSION, 0)
+    return dialect.MAVLink_mission_current_message(0, 0, dialect.MISSION_STATE_NO_MISSION, 0)
 
 
 def _estimator_status(s: Snapshot) -> Any:
