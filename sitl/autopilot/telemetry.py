@@ -183,7 +183,8 @@ def _odometry(s: Snapshot) -> Any:
     """Return ODOMETRY: pose in local NED, velocity in the body's FRD."""
     quaternion = s.truth.quaternion_frd_ned.tolist()
     return dialect.MAVLink_odometry_message(
-        s.stamp_us, dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD, *s.truth.position_ned_m.tolist(), quaternion,
+        s.stamp_us, dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD,
+        *s.truth.position_ned_m.tolist(), quaternion,
         *_in_body(quaternion, s.truth.velocity_ned_mps.tolist()),
         *s.truth.rates_frd_radps.tolist(),
         _UNKNOWN_COVARIANCE, _UNKNOWN_COVARIANCE, 0, dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, 100,
@@ -211,7 +212,9 @@ def _position_target_local_ned(s: Snapshot) -> Any:
     sent = [0.0 if math.isnan(value) else value for value in values]
     if math.isnan(values[9]):
         sent[9] = s.euler_rad[2]
-    return dialect.MAVLink_position_target_local_ned_message(s.boot_ms, dialect.MAV_FRAME_LOCAL_NED, mask, *sent)
+    return dialect.MAVLink_position_target_local_ned_message(
+        s.boot_ms, dialect.MAV_FRAME_LOCAL_NED, mask, *sent
+    )
 
 
 def _attitude_target(s: Snapshot) -> Any:
@@ -259,8 +262,8 @@ def _heartbeat(s: Snapshot) -> Any:
     commander = s.commander
     mode = commander.mode
     return dialect.MAVLink_heartbeat_message(
-        dialect.MAV_TYPE_QUADROTOR, dialect.MAV_AUTOPILOT_PX4, mode.base_mode(armed=commander.armed), mode.custom_mode,
-        commander.system_status, 3,
+        dialect.MAV_TYPE_QUADROTOR, dialect.MAV_AUTOPILOT_PX4,
+        mode.base_mode(armed=commander.armed), mode.custom_mode, commander.system_status, 3,
     )  # fmt: skip
 
 
@@ -288,7 +291,8 @@ def _battery_status(s: Snapshot) -> Any:
     cells = min(max(int(s.parameters.value("BAT1_N_CELLS")), 1), 10)
     each = _uint16(truth.battery_voltage_v / cells * 1e3)
     return dialect.MAVLink_battery_status_message(
-        0, dialect.MAV_BATTERY_FUNCTION_ALL, dialect.MAV_BATTERY_TYPE_LIPO, 32767, [each] * cells + [65535] * (10 - cells),
+        0, dialect.MAV_BATTERY_FUNCTION_ALL, dialect.MAV_BATTERY_TYPE_LIPO, 32767,
+        [each] * cells + [65535] * (10 - cells),
         _int16(truth.battery_current_a * 100.0), _clip(s.consumed_mah, 0, 2**31 - 1), -1,
         _clip(truth.battery_remaining * 100.0, 0, 100), 0, dialect.MAV_BATTERY_CHARGE_STATE_OK,
     )  # fmt: skip

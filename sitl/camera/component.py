@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.frames import Vector, flu_enu_from_frd_ned, rotation_matrix
 from mavfi_cli.link.codec import dialect
-from sitl.camera.depth import CameraPose, Image, Optics, camera_pose, render_depth
+from sitl.autopilot.telemetry import int32
+from sitl.camera.depth import Optics, render_depth
 from sitl.geodesy import Origin
 
 _SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding errors
@@ -38,7 +39,6 @@ _LEGACY_REQUESTS: dict[int, int] = {
 _PAYLOAD_BYTES = 253
 _PIXEL_PITCH_MM = 0.01  # arbitrary: field of view = 2 atan(sensor / 2 / focal length)
 _UNKNOWN = 0x7FFF_FFFF
-_IMAGE_MODE = 0
 
 
 @dataclass(slots=True, kw_only=True)
@@ -112,7 +112,7 @@ class Camera:
         self._default_interval_s = 1.0 / rate_hz
         # Load the compiled renderer now, so that the first frame does not stall a real-time flight.
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
-        self._pose: CameraPose | None = None
+        self._pose: tuple[Vector, Vector] | None = None  # optical centre (3,) and attitude (4,)
         self._stamp_s = 0.0
         self._heartbeat = PeriodicSchedule(interval_s=_HEARTBEAT_S)
         self._frames: PeriodicSchedule | None = None
@@ -157,14 +157,15 @@ class Camera:
         if stamp_s < self._stamp_s - 1.0:
             self._reboot()
         self._stamp_s = stamp_s
-        self._pose = camera_pose(self.optics, stamp_s, position_enu_m, quaternion_flu_enu)
+        offset_m = rotation_matrix(quaternion_flu_enu) @ np.array(self.optics.mount_offset_flu_m)
+        self._pose = position_enu_m + offset_m, quaternion_flu_enu
         due = [_heartbeat()] if self._heartbeat.due(stamp_s) else []
         for message_id, stream in self._streams.items():
             answer = self._request(message_id) if stream.due(stamp_s) else None
             if answer is not None:
                 due.append(answer)
         if self._frames is not None and self._frames.due(stamp_s):
-            due += self._take_frame(self._pose)
+            due += self._take_frame(*self._pose)
         return due
 
     def idle(self) -> list[Message]:
@@ -176,23 +177,40 @@ class Camera:
         for schedule in [*self._streams.values(), *([self._frames] if self._frames else [])]:
             schedule.restart()
 
-    def _take_frame(self, pose: CameraPose) -> list[Message]:
-        optics = self.optics
-        image = render_depth(
-            self._boxes,
-            pose.position_enu_m,
-            pose.quaternion_flu_enu,
-            optics.columns,
-            optics.rows,
-            optics.hfov_rad,
-        )
-        frame = _frame_messages(image, self.images, pose, self._origin)
+    def _take_frame(self, position_enu_m: Vector, quaternion_flu_enu: Vector) -> list[Message]:
+        """Return the messages of one frame in the order of sending.
+
+        CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels), DATA_TRANSMISSION_HANDSHAKE
+        (size) and ENCAPSULATED_DATA (253 bytes each). This is MAVLink's image transmission protocol
+        (https://mavlink.io/en/services/image_transmission.html).
+        """
+        rows, columns = self.optics.rows, self.optics.columns
+        pixels = render_depth(
+            self._boxes, position_enu_m, quaternion_flu_enu, columns, rows, self.optics.hfov_rad
+        ).tobytes()
+        captured = dialect.MAVLink_camera_image_captured_message(
+            self._boot_ms, 0, 0, *self._geodetic_e7_mm(position_enu_m),
+            int32(position_enu_m[2] * 1e3), flu_enu_from_frd_ned(quaternion_flu_enu).tolist(),
+            self.images, 1, b"depth8:crc32=%08x" % zlib.crc32(pixels),
+        )  # fmt: skip
+        packets = -(-len(pixels) // _PAYLOAD_BYTES)
+        handshake = dialect.MAVLink_data_transmission_handshake_message(
+            dialect.MAVLINK_DATA_STREAM_IMG_RAW8U, len(pixels), columns, rows, packets,
+            _PAYLOAD_BYTES, 100,
+        )  # fmt: skip
+        padded = pixels.ljust(packets * _PAYLOAD_BYTES, b"\0")
+        data = [
+            dialect.MAVLink_encapsulated_data_message(
+                number, padded[number * _PAYLOAD_BYTES : (number + 1) * _PAYLOAD_BYTES]
+            )
+            for number in range(packets)
+        ]
         self.images += 1
         if self._frames_left:
             self._frames_left -= 1
             if not self._frames_left:
                 self._frames = None
-        return frame
+        return [captured, handshake, *data]
 
     def _command(self, message: Message) -> list[Message]:
         """Return the answer to a command: requested messages, then the acknowledgement."""
@@ -213,19 +231,57 @@ class Camera:
 
     def _request(self, message_id: int | None) -> Message | None:
         """Return the present message with an id; None if the camera does not send it."""
-        stamp_s = self._stamp_s
-        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION:
-            return _information(self.optics, stamp_s)
-        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS:
-            return _settings(stamp_s)
-        if message_id == dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION:
-            return _storage_information(stamp_s)
-        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS:
-            interval_s = None if self._frames is None else self._frames.interval_s
-            return _capture_status(stamp_s, interval_s=interval_s, images=self.images)
-        if message_id == dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS and self._pose is not None:
-            return _fov_status(self.optics, self._pose, self._origin)
-        return None
+        build = _BUILDERS.get(message_id)
+        return None if build is None else build(self)
+
+    def _information(self) -> Message:
+        """Return CAMERA_INFORMATION. Focal length and sensor size give the field of view."""
+        optics = self.optics
+        sensor_mm = (optics.columns * _PIXEL_PITCH_MM, optics.rows * _PIXEL_PITCH_MM)
+        return dialect.MAVLink_camera_information_message(
+            self._boot_ms, list(b"mavfi".ljust(32, b"\0")), list(b"depth8".ljust(32, b"\0")), 1,
+            optics.focal_px * _PIXEL_PITCH_MM, *sensor_mm, optics.columns, optics.rows, 0,
+            dialect.CAMERA_CAP_FLAGS_CAPTURE_IMAGE, 0, b"",
+        )  # fmt: skip
+
+    def _settings(self) -> Message:
+        """Return CAMERA_SETTINGS: photo mode, no zoom, no focus."""
+        mode = dialect.CAMERA_MODE_IMAGE
+        return dialect.MAVLink_camera_settings_message(self._boot_ms, mode, math.nan, math.nan)
+
+    def _storage_information(self) -> Message:
+        """Return STORAGE_INFORMATION without storage, as frames are sent at once."""
+        return dialect.MAVLink_storage_information_message(
+            self._boot_ms, 1, 0, dialect.STORAGE_STATUS_NOT_SUPPORTED, 0.0, 0.0, 0.0, 0.0, 0.0
+        )
+
+    def _capture_status(self) -> Message:
+        """Return CAMERA_CAPTURE_STATUS: idle, or capturing at an interval."""
+        status, interval_s = (0, 0.0) if self._frames is None else (3, self._frames.interval_s)
+        return dialect.MAVLink_camera_capture_status_message(
+            self._boot_ms, status, 0, interval_s, 0, 0.0, self.images
+        )
+
+    def _fov_status(self) -> Message | None:
+        """Return CAMERA_FOV_STATUS. The geographic position of the image centre is unknown."""
+        if self._pose is None:
+            return None
+        position_enu_m, quaternion_flu_enu = self._pose
+        return dialect.MAVLink_camera_fov_status_message(
+            self._boot_ms, *self._geodetic_e7_mm(position_enu_m), _UNKNOWN, _UNKNOWN, _UNKNOWN,
+            flu_enu_from_frd_ned(quaternion_flu_enu).tolist(), math.degrees(self.optics.hfov_rad),
+            math.degrees(self.optics.vfov_rad),
+        )  # fmt: skip
+
+    @property
+    def _boot_ms(self) -> int:
+        return round(self._stamp_s * 1000.0) & 0xFFFF_FFFF
+
+    def _geodetic_e7_mm(self, position_enu_m: Vector) -> tuple[int, int, int]:
+        east, north, up = position_enu_m.tolist()
+        latitude, longitude = self._origin.geodetic(north, east)
+        altitude = int32((self._origin.altitude_amsl_m + up) * 1e3)
+        return int32(latitude * 1e7), int32(longitude * 1e7), altitude
 
     def _start_capture(self, message: Message) -> int:
         """Handle IMAGE_START_CAPTURE: param2 is the interval, s (0: default), param3 the count."""
@@ -268,95 +324,17 @@ def _whole(value: float) -> int | None:
     return round(value) if abs(value) < 2**31 else None
 
 
-_VENDOR, _MODEL = b"mavfi", b"depth8"
-
-
-def _boot_ms(stamp_s: float) -> int:
-    """Convert a stamp to MAVLink's milliseconds since boot."""
-    return round(stamp_s * 1000.0) & 0xFFFF_FFFF
-
-
 def _heartbeat() -> Message:
     return dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_CAMERA, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
     )
 
 
-def _information(optics: Optics, stamp_s: float) -> Message:
-    """Return CAMERA_INFORMATION. Focal length and sensor size give the exact field of view."""
-    sensor_mm = (optics.columns * _PIXEL_PITCH_MM, optics.rows * _PIXEL_PITCH_MM)
-    return dialect.MAVLink_camera_information_message(
-        _boot_ms(stamp_s), list(_VENDOR.ljust(32, b"\0")), list(_MODEL.ljust(32, b"\0")), 1,
-        optics.focal_px * _PIXEL_PITCH_MM, *sensor_mm, optics.columns, optics.rows, 0,
-        dialect.CAMERA_CAP_FLAGS_CAPTURE_IMAGE, 0, b"",
-    )  # fmt: skip
-
-
-def _settings(stamp_s: float) -> Message:
-    """Return CAMERA_SETTINGS: photo mode, no zoom, no focus."""
-    return dialect.MAVLink_camera_settings_message(
-        _boot_ms(stamp_s), _IMAGE_MODE, math.nan, math.nan
-    )
-
-
-def _storage_information(stamp_s: float) -> Message:
-    """Return STORAGE_INFORMATION without storage, as frames are sent at once."""
-    return dialect.MAVLink_storage_information_message(
-        _boot_ms(stamp_s), 1, 0, dialect.STORAGE_STATUS_NOT_SUPPORTED, 0.0, 0.0, 0.0, 0.0, 0.0
-    )
-
-
-def _capture_status(stamp_s: float, *, interval_s: float | None, images: int) -> Message:
-    """Return CAMERA_CAPTURE_STATUS. An interval of None means idle."""
-    image_status = 0 if interval_s is None else 3  # idle, or interval set and capturing
-    return dialect.MAVLink_camera_capture_status_message(
-        _boot_ms(stamp_s), image_status, 0, interval_s or 0.0, 0, 0.0, images
-    )
-
-
-def _fov_status(optics: Optics, pose: CameraPose, origin: Origin) -> Message:
-    """Return CAMERA_FOV_STATUS. The geographic position of the image centre is unknown."""
-    return dialect.MAVLink_camera_fov_status_message(
-        _boot_ms(pose.stamp_s), *_geodetic_e7_mm(pose, origin), _UNKNOWN, _UNKNOWN, _UNKNOWN,
-        pose.quaternion_frd_ned, math.degrees(optics.hfov_rad), math.degrees(optics.vfov_rad),
-    )  # fmt: skip
-
-
-def _frame_messages(image: Image, index: int, pose: CameraPose, origin: Origin) -> list[Message]:
-    """Return the messages of one frame (rows, columns) in the order of sending.
-
-    CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels), DATA_TRANSMISSION_HANDSHAKE
-    (size) and ENCAPSULATED_DATA (253 bytes each). This is MAVLink's image transmission protocol
-    (https://mavlink.io/en/services/image_transmission.html).
-    """
-    rows, columns = image.shape
-    pixels = image.tobytes()
-    captured = dialect.MAVLink_camera_image_captured_message(
-        _boot_ms(pose.stamp_s), 0, 0, *_geodetic_e7_mm(pose, origin),
-        _int32(pose.position_enu_m[2] * 1e3), pose.quaternion_frd_ned, index, 1,
-        b"depth8:crc32=%08x" % zlib.crc32(pixels),
-    )  # fmt: skip
-    packets = -(-len(pixels) // _PAYLOAD_BYTES)
-    handshake = dialect.MAVLink_data_transmission_handshake_message(
-        dialect.MAVLINK_DATA_STREAM_IMG_RAW8U, len(pixels), columns, rows, packets, _PAYLOAD_BYTES,
-        100,
-    )  # fmt: skip
-    padded = pixels.ljust(packets * _PAYLOAD_BYTES, b"\0")
-    data = [
-        dialect.MAVLink_encapsulated_data_message(
-            number, padded[number * _PAYLOAD_BYTES : (number + 1) * _PAYLOAD_BYTES]
-        )
-        for number in range(packets)
-    ]
-    return [captured, handshake, *data]
-
-
-def _geodetic_e7_mm(pose: CameraPose, origin: Origin) -> tuple[int, int, int]:
-    east, north, up = (float(c) for c in pose.position_enu_m)
-    latitude, longitude = origin.geodetic(north, east)
-    altitude = _int32((origin.altitude_amsl_m + up) * 1e3)
-    return _int32(latitude * 1e7), _int32(longitude * 1e7), altitude
-
-
-def _int32(value: float) -> int:
-    return max(-(2**31), min(2**31 - 1, round(float(value))))
+_BUILDERS: dict[int | None, Callable[[Camera], Message | None]] = {
+    dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION: Camera._information,
+    dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS: Camera._settings,
+    dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: Camera._storage_information,
+    dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS: Camera._capture_status,
+    dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: Camera._fov_status,
+}
+"""Messages that can be streamed or requested, by their ids."""

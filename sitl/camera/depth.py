@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.frames import Vector, flu_enu_from_frd_ned, rotation_matrix
+from mavfi_cli.core.frames import Vector, rotation_matrix
 
 MAX_SIDE_PX = 2048
 
@@ -72,33 +72,6 @@ class Optics:
         return 2.0 * math.atan(self.rows / 2.0 / self.focal_px)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraPose:
-    """Pose of the camera at one stamp."""
-
-    stamp_s: float
-    position_enu_m: Vector  # (3,) optical centre
-    quaternion_flu_enu: Vector  # (4,) w x y z
-
-    @property
-    def quaternion_frd_ned(self) -> list[float]:
-        """Attitude in MAVLink's frames, w x y z."""
-        values: list[float] = flu_enu_from_frd_ned(self.quaternion_flu_enu).tolist()
-        return values
-
-
-def camera_pose(
-    optics: Optics, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
-) -> CameraPose:
-    """Return the camera's pose on a vehicle at a position (3,) with an attitude (4,)."""
-    offset = rotation_matrix(quaternion_flu_enu) @ np.array(optics.mount_offset_flu_m)
-    return CameraPose(
-        stamp_s=stamp_s,
-        position_enu_m=position_enu_m + offset,
-        quaternion_flu_enu=quaternion_flu_enu,
-    )
-
-
 Image = NDArray[np.uint8]
 
 
@@ -128,18 +101,13 @@ def render_depth(
     """
     if columns < 1 or rows < 1 or not 0.0 < hfov_rad < math.pi:
         raise ValueError(f"no camera has {columns} x {rows} pixels and {hfov_rad} rad")
-    focal_px = _focal_length_px(columns, hfov_rad)
+    focal_px = columns / 2.0 / math.tan(hfov_rad / 2.0)
     depth = np.empty((rows, columns))
     image = np.empty((rows, columns), dtype=np.uint8)
     boxes = np.ascontiguousarray(boxes_enu_m, dtype=np.float64)
     rotation = rotation_matrix(quaternion_flu_enu)
     _render(boxes, position_enu_m, rotation, focal_px, max_range_m, _EDGES, depth, image)
     return image
-
-
-def _focal_length_px(columns: int, hfov_rad: float) -> float:
-    """Return the focal length in pixels of a camera with square pixels."""
-    return columns / 2.0 / math.tan(hfov_rad / 2.0)
 
 
 @compiled

@@ -202,11 +202,7 @@ class Station:
                     0,
                     float(message_id),
                     _POSE_INTERVAL_US,
-                    0.0,
-                    0.0,
-                    0.0,
-                    0.0,
-                    0.0,
+                    *[0.0] * 5,
                 )
                 for message_id in missing
             ]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import open_listener, open_transport
 from sitl.autopilot.streams import Preset
+from sitl.command_line import exit_code, stop_on_signals
 from sitl.server.client import Client
 from sitl.server.loops import Door, EmbeddedVehicle, Realtime, run_lockstep
 from sitl.server.options import ServerOptions, parse
@@ -42,19 +42,14 @@ def _write_briefing(simulation: Simulation, folder: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m sitl`; return the exit code. A known error is one line on stderr."""
-    options = parse(sys.argv[1:] if arguments is None else arguments)
-    try:
-        _serve(options)
-    except MavfiError as error:
-        print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the one boundary
-        return error.exit_code
-    return 0
+    """Run `python -m sitl`. Return its exit code."""
+    given = sys.argv[1:] if arguments is None else arguments
+    return exit_code(lambda: _serve(parse(given)))
 
 
 def _serve(options: ServerOptions) -> None:
     """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
-    stopped = _stop_on_signals()
+    stopped = stop_on_signals()
     simulation = _simulation(options)
     if options.truth is not None:
         _write_briefing(simulation, options.truth)
@@ -104,13 +99,6 @@ def _simulation(options: ServerOptions) -> Simulation:
         camera_rows=rows,
         camera_rate_hz=options.camera_rate_hz,
     )
-
-
-def _stop_on_signals() -> Callable[[], bool]:
-    seen: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda signum, _frame: seen.append(signum))
-    return lambda: bool(seen)
 
 
 def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:

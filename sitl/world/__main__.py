@@ -12,31 +12,13 @@ from typing import Any
 
 import click
 
-from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_svg, write_atomically, write_text
+from sitl.command_line import CONTEXT, Place, Triple, exit_code
 from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
 from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, read_scene, scene_toml, world_names
 from sitl.world.world import GeneratorParams, World, show
 
 _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a TOML file."
-
-
-class _Place(click.ParamType[tuple[float, ...]]):
-    """Parameter type of three comma-separated numbers: east, north, up in m."""
-
-    name = "x,y,z"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        """Return three finite numbers (3,), or fail with a usage error."""
-        try:
-            place = tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            place = ()
-        if len(place) != 3 or not all(math.isfinite(c) for c in place):
-            self.fail(f"{value!r}: expected x,y,z in m, such as 30,40,5", param, ctx)
-        return place
 
 
 def _on_world(command: Callable[..., None]) -> Callable[..., None]:
@@ -47,8 +29,8 @@ def _on_world(command: Callable[..., None]) -> Callable[..., None]:
         *,
         name: str,
         seed: int,
-        start: tuple[float, ...] | None,
-        goal: tuple[float, ...] | None,
+        start: Triple | None,
+        goal: Triple | None,
         **given: Any,
     ) -> None:
         command(load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal), **given)
@@ -56,10 +38,10 @@ def _on_world(command: Callable[..., None]) -> Callable[..., None]:
     decorators = [
         click.argument("name", metavar="WORLD"),
         click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True),
-        click.option("--start", type=_Place(), help="Start of flights, ENU m. See --goal."),
+        click.option("--start", type=Place(), help="Start of flights, ENU m. See --goal."),
         click.option(
             "--goal",
-            type=_Place(),
+            type=Place(),
             help="Goal of flights, ENU m. A generated world is built round start and goal: a "
             "change moves the bounds, and towers within 3 m of start and goal are left out.",
         ),
@@ -71,7 +53,7 @@ def _on_world(command: Callable[..., None]) -> Callable[..., None]:
     return decorated
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(context_settings=CONTEXT)
 def _world() -> None:
     """List, make, check and draw worlds: boxes on flat ground, a start and a goal.
 
@@ -225,18 +207,10 @@ def _check_json(found: WorldCheck) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Return 0 if done, 1 for a known error, 2 for wrong usage."""
-    try:
-        _world.main(args=arguments, prog_name="mavfi world", standalone_mode=False)
-    except click.ClickException as error:
-        error.show()
-        return error.exit_code
-    except click.Abort:
-        return 1
-    except MavfiError as error:
-        click.echo(f"error: {error}", err=True)
-        return error.exit_code
-    return 0
+    """Run the command line. Return its exit code."""
+    return exit_code(
+        lambda: _world.main(args=arguments, prog_name="mavfi world", standalone_mode=False)
+    )
 
 
 if __name__ == "__main__":

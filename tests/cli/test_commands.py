@@ -40,7 +40,7 @@ def test_help_names_every_command(command_line):
 
 
 def test_the_vehicle_s_help_has_the_command_s_name(command_line):
-    assert command_line("sitl", "--help")[1].startswith("usage: mavfi sitl ")
+    assert command_line("sitl", "--help")[1].startswith("Usage: mavfi sitl ")
 
 
 @pytest.mark.parametrize("command", [("fly",), ("world", "make"), ("sitl",)])

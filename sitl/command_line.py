@@ -1,0 +1,90 @@
+"""What the programs of the vehicle's side share: types of options, signals and exit codes."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from mavfi_cli.core.errors import MavfiError
+
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+Triple = tuple[float, ...]
+
+
+class Place(click.ParamType[Triple]):
+    """Three comma-separated numbers, such as east, north and up in m."""
+
+    name = "x,y,z"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Triple:
+        """Return three finite numbers (3,), or fail with a usage error."""
+        try:
+            place = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            place = ()
+        if len(place) != 3 or not all(math.isfinite(c) for c in place):
+            self.fail(f"{value!r}: expected x,y,z in m, such as 30,40,5", param, ctx)
+        return place
+
+
+class Size(click.ParamType[tuple[int, int]]):
+    """Columns and rows of an image."""
+
+    name = "COLSxROWS"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
+        """Return two positive numbers of pixels, or fail with a usage error."""
+        if isinstance(value, tuple):
+            return value
+        columns, _, rows = str(value).partition("x")
+        if not (columns.isdecimal() and rows.isdecimal() and int(columns) and int(rows)):
+            self.fail(f"{value!r}: expected columns x rows, such as 64x48", param, ctx)
+        return int(columns), int(rows)
+
+
+class Positive(click.ParamType[float]):
+    """A finite number above 0."""
+
+    name = "X"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        """Return the number, or fail with a usage error."""
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not 0.0 < number < math.inf:
+            self.fail(f"{value!r} is not a number above 0", param, ctx)
+        return number
+
+
+def stop_on_signals() -> Callable[[], bool]:
+    """Return a function that tells whether SIGINT or SIGTERM has arrived from now on."""
+    seen: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda signum, _frame: seen.append(signum))
+    return lambda: bool(seen)
+
+
+def exit_code(program: Callable[[], object]) -> int:
+    """Run a program. Return 0, or the code of a known error or wrong usage, told in one line."""
+    try:
+        program()
+    except click.exceptions.Exit as left:
+        return left.exit_code
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return error.exit_code
+    except click.ClickException as error:
+        click.echo(f"error: {error.format_message()}", err=True)
+        return error.exit_code
+    except click.Abort:
+        return 1
+    except MavfiError as error:
+        click.echo(f"error: {error}", err=True)
+        return error.exit_code
+    return 0
