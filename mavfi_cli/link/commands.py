@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 from enum import Enum
 from typing import NoReturn
 
@@ -23,14 +24,8 @@ REFUSAL_PAUSE_S = 1.0
 _MAX_WAITING = 64
 
 _RESULTS = {
-    dialect.MAV_RESULT_ACCEPTED: "accepted",
-    dialect.MAV_RESULT_TEMPORARILY_REJECTED: "temporarily rejected",
-    dialect.MAV_RESULT_DENIED: "denied",
-    dialect.MAV_RESULT_UNSUPPORTED: "unsupported",
-    dialect.MAV_RESULT_FAILED: "failed",
-    dialect.MAV_RESULT_IN_PROGRESS: "in progress",
-    dialect.MAV_RESULT_COMMAND_LONG_ONLY: "only as COMMAND_LONG",
-    dialect.MAV_RESULT_COMMAND_INT_ONLY: "only as COMMAND_INT",
+    number: entry.name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
+    for number, entry in dialect.enums["MAV_RESULT"].items()
 }
 # Refusals that may be temporary.
 _PASSING = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_FAILED)
@@ -51,26 +46,19 @@ class _CommandState(Enum):
     UNANSWERED = "no answer"
 
 
-class Ticket:
-    """A submitted command. `verdict` is its state, `result` the peer's answer in words."""
+@dataclass(slots=True, kw_only=True)
+class _Ticket:
+    """A submitted command."""
 
-    __slots__ = (
-        "command", "component", "due_s", "parameters", "refusals_left", "result", "sent",
-        "sent_since_answer", "verdict",
-    )  # fmt: skip
-
-    def __init__(
-        self, command: int, parameters: tuple[float, ...], component: int, refusals: int
-    ) -> None:
-        self.command = command
-        self.component = component
-        self.parameters = parameters
-        self.refusals_left = refusals
-        self.verdict = _CommandState.PENDING
-        self.result = _CommandState.UNANSWERED.value
-        self.sent = 0
-        self.sent_since_answer = 0
-        self.due_s = -1.0
+    command: int
+    component: int
+    parameters: tuple[float, ...]
+    refusals_left: int
+    verdict: _CommandState = _CommandState.PENDING
+    result: str = _CommandState.UNANSWERED.value  # the peer's answer in words
+    sent: int = 0
+    sent_since_answer: int = 0
+    due_s: float = -1.0
 
     @property
     def pending(self) -> bool:
@@ -88,7 +76,7 @@ class CommandChannel:
 
     def __init__(self, system: int, component: int) -> None:
         self._own = (system, component)
-        self._lanes: dict[tuple[int, int], deque[Ticket]] = {}
+        self._lanes: dict[tuple[int, int], deque[_Ticket]] = {}
         self._now_s = 0.0
 
     def submit(
@@ -98,7 +86,7 @@ class CommandChannel:
         component: int = dialect.MAV_COMP_ID_AUTOPILOT1,
         unused: float = 0.0,
         refusals: int = 0,
-    ) -> Ticket:
+    ) -> _Ticket:
         """Queue a COMMAND_LONG.
 
         Args:
@@ -109,7 +97,9 @@ class CommandChannel:
             refusals: Number of temporary refusals after which the command is repeated, 1 s later.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
-        ticket = Ticket(command, padded, component, refusals)
+        ticket = _Ticket(
+            command=command, component=component, parameters=padded, refusals_left=refusals
+        )
         lane = self._lanes.setdefault((component, command), deque())
         if len(lane) >= _MAX_WAITING:
             ticket.verdict = _CommandState.UNANSWERED
@@ -152,7 +142,7 @@ class CommandChannel:
                 self._close(lane, _CommandState.UNANSWERED)
         return due
 
-    def _send(self, ticket: Ticket, system: int) -> Message:
+    def _send(self, ticket: _Ticket, system: int) -> Message:
         confirmation = min(ticket.sent, 255)
         ticket.sent += 1
         ticket.sent_since_answer += 1
@@ -162,7 +152,7 @@ class CommandChannel:
         )
 
     @staticmethod
-    def _close(lane: deque[Ticket], verdict: _CommandState) -> None:
+    def _close(lane: deque[_Ticket], verdict: _CommandState) -> None:
         lane.popleft().verdict = verdict
 
 
@@ -181,15 +171,12 @@ class Requests:
         self._commands = commands
         self._telemetry = telemetry
         self.now_s = 0.0
-        self._look: Ticket | None = None
-        self._next_look_s = -math.inf
-        self._home: Ticket | None = None
-        self._next_home_s = -math.inf
+        self._asked: dict[int, tuple[_Ticket, float]] = {}  # message id -> request, next one's time
         self.begin()
 
     def begin(self) -> None:
         """Begin a phase and forget the requests of the last one."""
-        self._ticket: Ticket | None = None  # the command that the phase depends on
+        self._ticket: _Ticket | None = None  # the command that the phase depends on
         self._decided_s: float | None = None
         self._mode_since_s, self._mode_tries = -math.inf, 0
         self._texts_before = self._telemetry.texts.total
@@ -263,19 +250,19 @@ class Requests:
 
     def look_at_heartbeat(self) -> None:
         """Request a HEARTBEAT now instead of waiting up to a second for the next."""
-        if self.now_s >= self._next_look_s and not (self._look and self._look.pending):
-            self._next_look_s = self.now_s + _LOOK_INTERVAL_S
-            self._look = self._commands.submit(
-                dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HEARTBEAT
-            )
+        self._ask_for(dialect.MAVLINK_MSG_ID_HEARTBEAT, _LOOK_INTERVAL_S)
 
     def home(self) -> None:
         """Request HOME_POSITION once a second."""
-        if self.now_s >= self._next_home_s and not (self._home and self._home.pending):
-            self._next_home_s = self.now_s + _HOME_INTERVAL_S
-            self._home = self._commands.submit(
-                dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HOME_POSITION
-            )
+        self._ask_for(dialect.MAVLINK_MSG_ID_HOME_POSITION, _HOME_INTERVAL_S)
+
+    def _ask_for(self, message_id: int, interval_s: float) -> None:
+        if message_id in self._asked:
+            ticket, next_s = self._asked[message_id]
+            if ticket.pending or self.now_s < next_s:
+                return
+        ticket = self._commands.submit(dialect.MAV_CMD_REQUEST_MESSAGE, message_id)
+        self._asked[message_id] = ticket, self.now_s + interval_s
 
     def streams(self, state_rate_hz: float) -> None:
         """Request the message streams of a flight: the state at this rate, the others slower."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mavfi_cli.core.frames import rotation_matrix
 from mavfi_cli.core.types import DepthFrame, FloatArray, VehicleState
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.commands import CommandChannel, Ticket
+from mavfi_cli.link.commands import CommandChannel
 
 _CAMERA = dialect.MAV_COMP_ID_CAMERA
 
@@ -65,18 +65,12 @@ class CameraClient:
                 component=_CAMERA,
             )
 
-    def start(self, interval_s: float) -> Ticket:
-        """Request a frame every `interval_s` without end. The ticket holds the answer."""
-        return self._commands.submit(
+    def start(self, interval_s: float) -> None:
+        """Request a frame every `interval_s` without end."""
+        self._commands.submit(
             dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
             component=_CAMERA, unused=math.nan, refusals=3,
         )  # fmt: skip
-
-    def stop(self) -> Ticket:
-        """Request the end of the frames."""
-        return self._commands.submit(
-            dialect.MAV_CMD_IMAGE_STOP_CAPTURE, 0.0, component=_CAMERA, unused=math.nan
-        )
 
 
 def _hfov_of(message: Message) -> float | None:

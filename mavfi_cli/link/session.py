@@ -17,7 +17,7 @@ from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.commands import CommandChannel, Requests
 from mavfi_cli.link.images import CameraClient
-from mavfi_cli.link.telemetry import LandedState, Telemetry
+from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.texts import text_messages
 
 _IGNORED = (
@@ -44,9 +44,9 @@ _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the 
 class _Target:
     """A setpoint for the autopilot. The default holds position and heading."""
 
-    velocity_enu_mps: tuple[float, ...] = (0.0, 0.0, 0.0)
+    velocity_enu_mps: Sequence[float] = (0.0, 0.0, 0.0)
     yaw_enu_rad: float | None = None  # None: keep the heading
-    acceleration_enu_mps2: tuple[float, ...] | None = None  # feed-forward
+    acceleration_enu_mps2: Sequence[float] | None = None  # feed-forward
 
     def message(self, stamp_s: float, system: int, component: int) -> Message:
         """Return the message for one stamp.
@@ -220,11 +220,10 @@ class OffboardSession:
             yaw_enu_rad: Yaw, counter-clockwise from east; None keeps the heading.
             acceleration_enu_mps2: Feed-forward acceleration (3,), m/s^2; None for none.
         """
-        acceleration = acceleration_enu_mps2
         self._target = _Target(
-            velocity_enu_mps=tuple(velocity_enu_mps),
+            velocity_enu_mps=velocity_enu_mps,
             yaw_enu_rad=yaw_enu_rad,
-            acceleration_enu_mps2=None if acceleration is None else tuple(acceleration),
+            acceleration_enu_mps2=acceleration_enu_mps2,
         )
 
     def hold(self) -> None:
@@ -382,7 +381,7 @@ class OffboardSession:
             unused = telemetry.autopilot.unused
             requests.insist("landing", dialect.MAV_CMD_NAV_LAND, unused=unused)
             requests.look_at_heartbeat()
-        elif telemetry.landed_state is LandedState.ON_GROUND:
+        elif telemetry.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND:
             self._disarm_late()
         timeout_s = self._settings.land_timeout_s
         if self._elapsed_s() >= timeout_s:

@@ -11,7 +11,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 
@@ -158,32 +157,22 @@ def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> Vehic
     quaternion = quaternion / norm if norm > 0.0 else before.quaternion
     return VehicleState(
         stamp_s=stamp_s,
-        position_enu_m=_mix(before.position_enu_m, after.position_enu_m, share),
-        velocity_enu_mps=_mix(before.velocity_enu_mps, after.velocity_enu_mps, share),
+        position_enu_m=(1.0 - share) * before.position_enu_m + share * after.position_enu_m,
+        velocity_enu_mps=(1.0 - share) * before.velocity_enu_mps + share * after.velocity_enu_mps,
         quaternion=quaternion,
         yaw_rad=yaw_from_quaternion(quaternion),
     )
-
-
-def _mix(
-    before: np.typing.NDArray[np.float64], after: np.typing.NDArray[np.float64], share: float
-) -> np.typing.NDArray[np.float64]:
-    mixed: np.typing.NDArray[np.float64] = (1.0 - share) * before + share * after
-    return mixed
 
 
 HEARTBEAT_LOSS_S = 3.0
 _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 
-class LandedState(IntEnum):
-    """EXTENDED_SYS_STATE.landed_state."""
-
-    UNDEFINED = dialect.MAV_LANDED_STATE_UNDEFINED
-    ON_GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
-    IN_AIR = dialect.MAV_LANDED_STATE_IN_AIR
-    TAKEOFF = dialect.MAV_LANDED_STATE_TAKEOFF
-    LANDING = dialect.MAV_LANDED_STATE_LANDING
+_IN_AIR = (
+    dialect.MAV_LANDED_STATE_IN_AIR,
+    dialect.MAV_LANDED_STATE_TAKEOFF,
+    dialect.MAV_LANDED_STATE_LANDING,
+)
 
 
 class Telemetry:
@@ -197,7 +186,7 @@ class Telemetry:
         state: Position, velocity and attitude in ENU; None before both are known.
         armed: Armed flag in HEARTBEAT.
         mode: Name of the flight mode; "" before the first HEARTBEAT.
-        landed_state: Landed state in EXTENDED_SYS_STATE.
+        landed_state: Landed state in EXTENDED_SYS_STATE, a known MAV_LANDED_STATE.
         ready: True if SYS_STATUS reports that the pre-arm checks pass.
         home_amsl_m: Altitude of home above sea level, m; None if unknown.
         battery_remaining: Remaining charge, 0..1; None if unknown.
@@ -213,7 +202,7 @@ class Telemetry:
         self.state: VehicleState | None = None
         self.armed = False
         self.mode = ""
-        self.landed_state = LandedState.UNDEFINED
+        self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED
         self.ready = False
         self.home_amsl_m: float | None = None
         self.battery_remaining: float | None = None
@@ -237,11 +226,7 @@ class Telemetry:
     @property
     def in_air(self) -> bool:
         """True if the autopilot reports that it is in the air."""
-        return self.landed_state in (
-            LandedState.IN_AIR,
-            LandedState.TAKEOFF,
-            LandedState.LANDING,
-        )
+        return self.landed_state in _IN_AIR
 
     def handle(self, message: Message) -> bool:
         """Handle a message. Return False if it is not the autopilot's."""
@@ -303,8 +288,8 @@ class Telemetry:
             self.battery_remaining = message.battery_remaining / 100.0
 
     def _extended_sys_state(self, message: Message) -> None:
-        if 0 <= message.landed_state <= max(LandedState):
-            self.landed_state = LandedState(message.landed_state)
+        if message.landed_state <= dialect.MAV_LANDED_STATE_LANDING:
+            self.landed_state = message.landed_state
 
     def _home(self, message: Message) -> None:
         self.home_amsl_m = message.altitude / 1e3

@@ -10,7 +10,6 @@ import contextlib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.link.codec import Codec, Message
@@ -86,17 +85,6 @@ class TlogWriter:
             os.close(self._descriptor)
             self._descriptor = None
 
-    def __enter__(self) -> TlogWriter:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
     def _error(self, error: OSError) -> RecordError:
         return RecordError(f"{self._path}: cannot write: {error.strerror or error}")
 
@@ -124,7 +112,7 @@ class RecordedLink:
         Raises:
             RecordError: The file cannot be written, now or at any later message.
         """
-        with TlogWriter(path) as self._tlog:
+        with contextlib.closing(TlogWriter(path)) as self._tlog:
             for stamp_s, frame in self._early:
                 self._tlog.write(stamp_s, frame)
             self._early.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import subprocess
@@ -31,7 +32,7 @@ def _frames(count: int) -> list[bytes]:
 
 
 def _write(path: Path, frames: list[bytes]) -> None:
-    with TlogWriter(path) as log:
+    with contextlib.closing(TlogWriter(path)) as log:
         for number, frame in enumerate(frames):
             log.write(number // 2 * 0.02, frame)
 
