@@ -66,22 +66,30 @@ _MIDDLE = 0.3
 PHYSICS_DT_S = 0.004
 
 
+class _Scalar:
+    """An attribute of `Truth` that is one number of its array."""
+
+    def __init__(self, index: int) -> None:
+        self._index = index
+
+    def __get__(self, truth: Truth, owner: type) -> float:
+        return float(truth.flat[self._index])
+
+
 class Truth:
     """Read-only view of the newest state. It is updated in place, so copy values to keep them.
 
     The position is that of the centre of mass in the NED frame at the world origin on the ground.
     """
 
-    __slots__ = (
-        "acceleration_ned_mps2",
-        "flat",
-        "motor_commands",
-        "motor_rpm",
-        "position_ned_m",
-        "quaternion_frd_ned",
-        "rates_frd_radps",
-        "velocity_ned_mps",
-    )
+    stamp_s = _Scalar(T_STAMP)  # since the creation of the vehicle
+    battery_voltage_v = _Scalar(T_VOLTAGE)  # at the terminals
+    battery_current_a = _Scalar(T_CURRENT)
+    battery_remaining = _Scalar(T_REMAINING)  # charge, 0..1
+    power_regression_w = _Scalar(T_POWER_REGRESSION)  # published regression; 0 while disarmed
+    power_propeller_w = _Scalar(T_POWER_PROPELLER)  # at the shafts of all rotors
+    energy_regression_j = _Scalar(T_ENERGY_REGRESSION)
+    energy_propeller_j = _Scalar(T_ENERGY_PROPELLER)
 
     def __init__(self, flat: Vector) -> None:
         view = flat.view()
@@ -96,49 +104,9 @@ class Truth:
         self.motor_rpm = view[T_RPM : T_RPM + 4]  # (4,)
 
     @property
-    def stamp_s(self) -> float:
-        """Simulated time since the creation of the vehicle, s."""
-        return float(self.flat[T_STAMP])
-
-    @property
     def on_ground(self) -> bool:
         """True if a landing leg carries weight."""
         return bool(self.flat[T_ON_GROUND] > 0.5)
-
-    @property
-    def battery_voltage_v(self) -> float:
-        """Voltage at the terminals, V."""
-        return float(self.flat[T_VOLTAGE])
-
-    @property
-    def battery_current_a(self) -> float:
-        """Battery current, A."""
-        return float(self.flat[T_CURRENT])
-
-    @property
-    def battery_remaining(self) -> float:
-        """Remaining charge, 0..1."""
-        return float(self.flat[T_REMAINING])
-
-    @property
-    def power_regression_w(self) -> float:
-        """Rotor power by the published regression, W; zero while disarmed."""
-        return float(self.flat[T_POWER_REGRESSION])
-
-    @property
-    def power_propeller_w(self) -> float:
-        """Shaft power of the propellers, W, summed over the rotors."""
-        return float(self.flat[T_POWER_PROPELLER])
-
-    @property
-    def energy_regression_j(self) -> float:
-        """Integral of `power_regression_w`, J."""
-        return float(self.flat[T_ENERGY_REGRESSION])
-
-    @property
-    def energy_propeller_j(self) -> float:
-        """Integral of `power_propeller_w`, J."""
-        return float(self.flat[T_ENERGY_PROPELLER])
 
 
 def wreck_of(truth: Truth) -> Truth:

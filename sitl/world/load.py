@@ -37,8 +37,7 @@ from sitl.world.world import (
     generate,
     inside,
     plan_distance_to_boxes,
-    refuse_bad_goal,
-    refuse_bad_start,
+    refuse_bad_place,
 )
 
 SCENE_FOLDER = Path(__file__).parent / "scenes"
@@ -207,13 +206,12 @@ def _world_of_scene(
     bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
     if (bounds[3:] <= bounds[:3]).any():
         raise WorldError(f"world {name!r}: bounds_enu_m has max <= min")
-    start = _given(start_enu_m, scene.start_enu_m)
-    goal = _given(goal_enu_m, scene.goal_enu_m)
+    start = _place("start", scene.start_enu_m) if start_enu_m is None else start_enu_m
+    goal = _place("goal", scene.goal_enu_m) if goal_enu_m is None else goal_enu_m
     if start is None or goal is None:
-        if start is not None:
-            refuse_bad_start(name, boxes, bounds, start)
-        if goal is not None:
-            refuse_bad_goal(name, boxes, bounds, goal)
+        for what, place in (("start", start), ("goal", goal)):
+            if place is not None:
+                refuse_bad_place(name, boxes, bounds, what, place)
         start, goal = _choose(scene, name, seed, boxes, bounds, start, goal)
     return World(
         name=name,
@@ -223,12 +221,6 @@ def _world_of_scene(
         start_enu_m=start,
         goal_enu_m=goal,
     )
-
-
-def _given(asked: Vector | None, own: list[float] | None) -> Vector | None:
-    if asked is not None:
-        return np.asarray(asked, dtype=np.float64)
-    return None if own is None else np.array(own, dtype=np.float64)
 
 
 def _choose(

@@ -58,8 +58,8 @@ class World:
             array.flags.writeable = False
             object.__setattr__(self, field, array)
         _refuse_bad_boxes(self)
-        refuse_bad_start(self.name, self.boxes_enu_m, self.bounds_enu_m, self.start_enu_m)
-        refuse_bad_goal(self.name, self.boxes_enu_m, self.bounds_enu_m, self.goal_enu_m)
+        for what, place in (("start", self.start_enu_m), ("goal", self.goal_enu_m)):
+            refuse_bad_place(self.name, self.boxes_enu_m, self.bounds_enu_m, what, place)
 
     def as_json(self) -> dict[str, Any]:
         """Return the world for a record, lengths in m."""
@@ -81,32 +81,27 @@ def _refuse_bad_boxes(world: World) -> None:
         raise WorldError(f"world {world.name!r}: box {int(flat.argmax())} has max <= min")
 
 
-def refuse_bad_start(name: str, boxes: Vector, bounds: Vector, start: Vector) -> None:
-    """Raise WorldError if a start (3,) is outside the bounds (6,) or too near a box (n, 6)."""
-    _refuse_outside(name, bounds, "start", start)
-    gaps = distance_to_boxes(boxes, start)
-    if gaps.size and gaps.min() < START_CLEAR_M:
-        raise WorldError(
-            f"world {name!r}: start {show(start)} is blocked: box {int(gaps.argmin())} is "
-            f"{gaps.min():.2f} m away, {START_CLEAR_M:g} m needed"
-        )
+def refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place: Vector) -> None:
+    """Raise WorldError if a "start" or "goal" (3,) is outside the bounds (6,) or blocked.
 
-
-def refuse_bad_goal(name: str, boxes: Vector, bounds: Vector, goal: Vector) -> None:
-    """Raise WorldError if a goal (3,) is outside the bounds (6,) or inside a box (n, 6)."""
-    _refuse_outside(name, bounds, "goal", goal)
-    gaps = distance_to_boxes(boxes, goal)
-    if gaps.size and gaps.min() <= 0.0:
-        raise WorldError(
-            f"world {name!r}: goal {show(goal)} is inside an obstacle (box {int(gaps.argmin())})"
-        )
-
-
-def _refuse_outside(name: str, bounds: Vector, what: str, place: Vector) -> None:
+    A start is blocked if a box (n, 6) is too near to stand there, a goal if it is inside a box.
+    """
     if not inside(bounds, place):
         raise WorldError(
             f"world {name!r}: {what} {show(place)} is outside the world, which reaches "
             f"from {show(bounds[:3])} to {show(bounds[3:])} m"
+        )
+    gaps = distance_to_boxes(boxes, place)
+    if not gaps.size:
+        return
+    if what == "start" and gaps.min() < START_CLEAR_M:
+        raise WorldError(
+            f"world {name!r}: start {show(place)} is blocked: box {int(gaps.argmin())} is "
+            f"{gaps.min():.2f} m away, {START_CLEAR_M:g} m needed"
+        )
+    if what == "goal" and gaps.min() <= 0.0:
+        raise WorldError(
+            f"world {name!r}: goal {show(place)} is inside an obstacle (box {int(gaps.argmin())})"
         )
 
 
