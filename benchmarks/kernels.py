@@ -16,8 +16,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from mavfi_cli import autonomy
-from mavfi_cli.autonomy import collision, planners, planning, point_cloud, tracking
+from mavfi_cli.autonomy import collision, planners, planning, point_cloud, tracking, warm
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.trajectory import reference_waypoint
@@ -167,7 +166,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=10)
     options = parser.parse_args()
     begin = time.perf_counter()
-    autonomy.warm_up()
+    warm.warm_up()
     print(f"warm-up {time.perf_counter() - begin:.2f} s")
     watch = Stopwatch()
     world = load_world(options.world, seed=options.seed)

@@ -11,13 +11,19 @@ from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyPar
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.planners.ompl import OMPL_PLANNERS
 from mavfi_cli.autonomy.trajectory import reference_waypoint
+from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.types import DepthFrame, Trajectory
 
 _BOUNDS = np.array([-5.0, -10.0, 0.0, 15.0, 10.0, 10.0])
 
 
-def run_every_kernel() -> None:
-    """Observe a wall, map it, plan round it, check the plan and track it."""
+def is_compiled() -> bool:
+    """Return True if all kernels are compiled. Otherwise `warm_up` takes many seconds."""
+    return in_cache(tracking.track)  # the last kernel that `warm_up` calls
+
+
+def warm_up() -> None:
+    """Run every kernel: observe a wall, map it, plan round it, check the plan and track it."""
     snapshot = _see_a_wall()
     start, goal = np.array([0.0, 0.0, 5.0]), np.array([9.0, 0.0, 5.0])
     trajectory: Trajectory | None = None

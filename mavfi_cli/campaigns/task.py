@@ -12,11 +12,11 @@ def prepare() -> None:
     import pyarrow.parquet  # noqa: F401  # only imported: its threads start at the first use
 
     import mavfi_cli.mission.run
-    from mavfi_cli import autonomy
+    from mavfi_cli.autonomy import warm
     from mavfi_cli.mission import vehicle
 
     assert mavfi_cli.mission.run
-    autonomy.warm_up()
+    warm.warm_up()
     vehicle.warm_up()
 
 

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.autonomy import is_compiled, planners, warm_up
+from mavfi_cli.autonomy import planners
+from mavfi_cli.autonomy.warm import is_compiled, warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError

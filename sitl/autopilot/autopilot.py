@@ -20,16 +20,7 @@ from sitl.autopilot.commander import (
     Severity,
 )
 from sitl.autopilot.commands import acknowledge, execute
-from sitl.autopilot.flight_modes import (
-    Guidance,
-    Hold,
-    Land,
-    Return,
-    Takeoff,
-    climbs,
-    follow_companion,
-    follow_sticks,
-)
+from sitl.autopilot.flight_modes import Guidance, begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.setpoint import (
     Setpoint,
@@ -75,9 +66,9 @@ class Autopilot:
         self.motors_on = False
         self._links: list[Link] = []
         self._takeoff_down_m = math.nan
-        self._hold: Hold | None = None  # guidance of the next entry into LOITER
+        self._hold: tuple[Vector, float] | None = None  # position and yaw of the next LOITER
         self._flown: FlightMode | None = None
-        self._guidance: Guidance = Hold().fly
+        self._guidance = self._enter(FlightMode.LOITER)
         self._text_id = 0
 
     # Links.
@@ -147,7 +138,7 @@ class Autopilot:
             return Result.DENIED
         result = self.enter_mode(FlightMode.LOITER)
         if result is Result.ACCEPTED:
-            self._hold = Hold(target_ned_m, yaw_rad)
+            self._hold = target_ned_m, yaw_rad
         return result
 
     def set_home(self, place_ned_m: Vector) -> None:
@@ -207,34 +198,17 @@ class Autopilot:
         self.motors_on = self.snapshot.motors_on = motors_on
 
     def _enter(self, mode: FlightMode) -> Guidance:
-        """Create the guidance of a mode at its entry."""
-        if mode is FlightMode.OFFBOARD:
-            return follow_companion
-        if mode is FlightMode.POSCTL:
-            return follow_sticks
-        if mode is FlightMode.TAKEOFF:
-            return self._begin_takeoff()
-        if mode is FlightMode.LAND:
-            return Land().fly
-        if mode is FlightMode.RTL:
-            return Return(self._announce_return).fly
-        hold, self._hold = self._hold or Hold(), None
-        return hold.fly
+        guidance = begin(
+            mode, self.snapshot, takeoff_down_m=self._takeoff_down_m, hold=self._hold,
+            finished=self._takeoff_finished, announce_return=self._announce_return,
+        )  # fmt: skip
+        if mode is FlightMode.LOITER:
+            self._hold = None
+        return guidance
 
-    def _begin_takeoff(self) -> Guidance:
-        down = self._takeoff_down_m
-        if math.isnan(down):
-            height = self.parameters.effective("MIS_TAKEOFF_ALT")
-            down = float(self.snapshot.home_ned_m[2]) - height
-
-        def finished() -> None:
-            """Hold at the requested height, but at most 0.5 m below the present one."""
-            place = np.array(self.snapshot.truth.position_ned_m)
-            place[2] = min(down, float(place[2]) + 0.5)
-            self._hold = Hold(place)
-            self.commander.takeoff_finished()
-
-        return Takeoff(down, finished).fly
+    def _takeoff_finished(self, place_ned_m: Vector) -> None:
+        self._hold = place_ned_m, math.nan
+        self.commander.takeoff_finished()
 
     def _announce_return(self, height_m: float) -> None:
         amsl = self.snapshot.amsl_m(float(self.snapshot.home_ned_m[2])) + height_m

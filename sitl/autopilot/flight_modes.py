@@ -13,6 +13,7 @@ from enum import Enum, auto
 import numpy as np
 
 from mavfi_cli.core.frames import Vector
+from sitl.autopilot.commander import FlightMode
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.setpoint import Setpoint
 from sitl.autopilot.telemetry import Snapshot
@@ -89,7 +90,7 @@ class _Anchor:
         out[0:3][axes] = self._place
 
 
-class Hold:
+class _Hold:
     """AUTO.LOITER: flies to a position, if given, and stays there."""
 
     def __init__(self, target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> None:
@@ -108,10 +109,10 @@ class Hold:
         self._anchor.hold(now, out)
 
 
-class Takeoff:
-    """AUTO.TAKEOFF: climbs straight to a height, then calls `finished`."""
+class _Takeoff:
+    """AUTO.TAKEOFF: climbs straight to a height, then has it held, but 0.5 m lower at most."""
 
-    def __init__(self, target_down_m: float, finished: Callable[[], None]) -> None:
+    def __init__(self, target_down_m: float, finished: Callable[[Vector], None]) -> None:
         self._target_down_m = target_down_m
         self._finished = finished
         self._anchor = _Anchor(_HORIZONTAL)
@@ -123,7 +124,9 @@ class Takeoff:
         delta = self._target_down_m - float(now.truth.position_ned_m[2])
         if not now.commander.landed and delta > -_TAKEOFF_NEAR_M:
             out[2] = self._target_down_m
-            self._finished()
+            place = np.array(now.truth.position_ned_m)
+            place[2] = min(self._target_down_m, float(place[2]) + 0.5)
+            self._finished(place)
             return
         if now.spooled_up:
             self._climbing_s += now.elapsed_s
@@ -132,7 +135,7 @@ class Takeoff:
         out[5] = -min(max(fastest, _TAKEOFF_FIRST_MPS), max(-delta, _TAKEOFF_FIRST_MPS))
 
 
-class Land:
+class _Land:
     """AUTO.LAND: descends straight, slower near the ground."""
 
     def __init__(self, over: Vector | None = None) -> None:
@@ -155,7 +158,7 @@ class _Leg(Enum):
     LAND = auto()
 
 
-class Return:
+class _Return:
     """AUTO.RTL: climbs, crosses, descends and lands at home."""
 
     def __init__(self, announce: Callable[[float], None]) -> None:
@@ -163,7 +166,7 @@ class Return:
         self._leg: _Leg | None = None
         self._down_m = 0.0
         self._anchor = _Anchor(_HORIZONTAL)
-        self._landing = Land()
+        self._landing = _Land()
 
     def fly(self, now: Snapshot, out: Setpoint) -> None:
         """Fly the present leg and begin the next at its end."""
@@ -184,7 +187,7 @@ class Return:
             _go(now, out, to_home)
             if math.hypot(to_home[0], to_home[1]) < _ARRIVED_M:
                 self._leg = _Leg.LAND
-                self._landing = Land(np.array(now.home_ned_m[:2]))
+                self._landing = _Land(np.array(now.home_ned_m[:2]))
         else:
             self._landing.fly(now, out)
 
@@ -204,7 +207,7 @@ class Return:
         self._announce(height)
 
 
-def follow_companion(now: Snapshot, out: Setpoint) -> None:
+def _follow_companion(now: Snapshot, out: Setpoint) -> None:
     """OFFBOARD: the newest accepted setpoint; an axis that it leaves free stands still."""
     out[:] = now.offboard
     for axis in range(3):
@@ -213,7 +216,7 @@ def follow_companion(now: Snapshot, out: Setpoint) -> None:
     _limit_velocity(out, now.parameters)
 
 
-def follow_sticks(now: Snapshot, out: Setpoint) -> None:
+def _follow_sticks(now: Snapshot, out: Setpoint) -> None:
     """POSCTL: sticks -1000..1000 are velocity in the heading frame; throttle 500 keeps height."""
     x, y, z, r = now.sticks
     value = now.parameters.effective
@@ -244,3 +247,38 @@ def _go_vertical(now: Snapshot, out: Setpoint, delta_m: float) -> None:
     name = "MPC_Z_V_AUTO_UP" if delta_m < 0.0 else "MPC_Z_V_AUTO_DN"
     limit = now.parameters.effective(name)
     out[5] = _approach(np.array([delta_m]), speed_mps=limit, acceleration_mps2=3.0)[0]
+
+
+def begin(
+    mode: FlightMode,
+    now: Snapshot,
+    *,
+    takeoff_down_m: float,
+    hold: tuple[Vector, float] | None,
+    finished: Callable[[Vector], None],
+    announce_return: Callable[[float], None],
+) -> Guidance:
+    """Return the guidance of a mode at its entry.
+
+    Args:
+        mode: Entered mode.
+        now: State of the autopilot.
+        takeoff_down_m: Height of a TAKEOFF; NaN is MIS_TAKEOFF_ALT above home.
+        hold: Position (3,), NED, and yaw of a LOITER; None stops here.
+        finished: Called with the position to hold (3,) at the end of a TAKEOFF.
+        announce_return: Called with the height of an RTL above home, m.
+    """
+    if mode is FlightMode.OFFBOARD:
+        return _follow_companion
+    if mode is FlightMode.POSCTL:
+        return _follow_sticks
+    if mode is FlightMode.TAKEOFF:
+        if math.isnan(takeoff_down_m):
+            height_m = now.parameters.effective("MIS_TAKEOFF_ALT")
+            takeoff_down_m = float(now.home_ned_m[2]) - height_m
+        return _Takeoff(takeoff_down_m, finished).fly
+    if mode is FlightMode.LAND:
+        return _Land().fly
+    if mode is FlightMode.RTL:
+        return _Return(announce_return).fly
+    return _Hold(*hold).fly if hold is not None else _Hold().fly

@@ -16,7 +16,7 @@ from sitl.autopilot.streams import TICK_US
 from sitl.camera.component import Camera
 from sitl.referee.referee import Referee
 from sitl.vehicle.profile import VehicleProfile
-from sitl.vehicle.vehicle import Quadrotor, Truth, wreck_of
+from sitl.vehicle.vehicle import Quadrotor, Truth
 from sitl.world import World
 
 STEPS_A_TICK = 5
@@ -137,7 +137,7 @@ class Simulation:
         if collision is not None:
             commander.terminate(collision.text)
         if self._wreck is None and commander.terminated and _has_come_down(truth):
-            self._wreck = wreck_of(truth)
+            self._wreck = truth.wreck()
         if not _is_believable(truth):
             raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")
 

@@ -12,7 +12,7 @@ import jsbsim
 
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.frames import Vector
-from sitl.vehicle.profile import GRAVITY_MPS2, Rotor, VehicleProfile
+from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
 
 # The ground falls below the tangent plane at its (latitude, longitude) origin by 0.05 mm at 100 m.
 PLANET_RADIUS_M = 1.0e8
@@ -39,7 +39,7 @@ def write_model(profile: VehicleProfile, root: Path) -> None:
 def _values(profile: VehicleProfile) -> dict[str, float | str]:
     """Return what the files of `model/` name with a dollar sign."""
     rotor, gear, drag = profile.rotor, profile.gear, profile.drag
-    radius_ft = PLANET_RADIUS_M / FOOT_M
+    radius_ft, ratio = PLANET_RADIUS_M / FOOT_M, rotor.zero_thrust_advance_ratio
     damping = 2.0 * gear.damping_ratio * gear.natural_frequency_radps * profile.total_mass_kg / 4.0
     linear = zip("xyz", drag.linear_nspm, strict=True)
     quadratic = zip("xyz", drag.quadratic_ns2pm2, strict=True)
@@ -62,17 +62,16 @@ def _values(profile: VehicleProfile) -> dict[str, float | str]:
         "motor_no_load_a": rotor.motor_no_load_current_a,
         "rotor_inertia_kgm2": rotor.inertia_kgm2,
         "rotor_diameter_m": rotor.diameter_m,
-        "thrust_table": _table(rotor, rotor.thrust_coefficient, thrust_share),
-        "power_table": _table(rotor, rotor.power_coefficient, power_share),
+        "thrust_table": _table(ratio, rotor.thrust_coefficient, thrust_share),
+        "power_table": _table(ratio, rotor.power_coefficient, power_share),
         **{f"drag_linear_{a}": value * FOOT_M / _NEWTON_PER_POUND for a, value in linear},
         **{f"drag_quadratic_{a}": v * FOOT_M**2 / _NEWTON_PER_POUND for a, v in quadratic},
     }
 
 
-def _table(rotor: Rotor, static: float, share: Callable[[float], float]) -> str:
-    """Return the rows of a coefficient over the advance ratio."""
+def _table(ratio: float, static: float, share: Callable[[float], float]) -> str:
+    """Return the rows of a coefficient over the advance ratio, up to 1.5 times `ratio`."""
     steps = [step / 20.0 for step in range(-20, 31)]
-    ratio = rotor.zero_thrust_advance_ratio
     return "\n".join(f"{each * ratio:.6f} {static * share(each):.9f}" for each in steps)
 
 

@@ -9,8 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mavfi_cli.core.config import read_toml, shipped_names, shipped_path, structure
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.frames import Vector
 
 AIR_DENSITY_KGPM3 = 1.225  # ISA at sea level
 GRAVITY_MPS2 = 9.80665
@@ -20,6 +23,10 @@ LARGEST_TILT_DEG = 60.0
 LEVEL_SHARE = 0.9  # controller's fraction of the acceleration that the tilt limit allows
 
 Triple = tuple[float, float, float]
+
+# The middle voltage of a lithium cell lies 30 % of the way from nominal to full: 3.85 V for an
+# ordinary 4.2 V cell.
+_MIDDLE = 0.3
 
 _ANY_SIGN = ("camera_mount_flu_m", "rotor.height_m", "energy.")
 _MAY_BE_ZERO = (
@@ -34,7 +41,7 @@ _MAY_BE_ZERO = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Rotor:
+class _Rotor:
     """Four equal rotors on the diagonals of an X frame, with their motors."""
 
     arm_m: float  # from the centre to each rotor axis
@@ -110,7 +117,7 @@ class _Gear:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Battery:
+class _Battery:
     """A lithium pack with the drive train up to the shafts."""
 
     cells: int
@@ -121,6 +128,16 @@ class Battery:
     resistance_ohm: float  # resistance of the whole pack
     drive_efficiency: float  # motor and speed controller, shaft power / electrical power
     avionics_w: float
+
+    def parameters(self) -> Vector:
+        """Return four open-circuit voltages, resistance, capacity C, efficiency and W (8,)."""
+        middle = self.cell_nominal_v + _MIDDLE * (self.cell_full_v - self.cell_nominal_v)
+        cells = (self.cell_empty_v, self.cell_nominal_v, middle, self.cell_full_v)
+        volts = [self.cells * voltage for voltage in cells]
+        capacity_c = self.capacity_ah * 3600.0
+        return np.array(
+            [*volts, self.resistance_ohm, capacity_c, self.drive_efficiency, self.avionics_w]
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,7 +152,7 @@ class _ControlLimits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EnergyRegression:
+class _EnergyRegression:
     """Coefficients of the published multiple regression of rotor power, with speeds in km/h.
 
     P = b1 v + b2 a + b3 v a + b4 vz + b5 az + b6 vz az + b7 m + b9, with horizontal v, a and
@@ -152,6 +169,11 @@ class EnergyRegression:
     b7: float
     b9: float
 
+    def coefficients(self, payload_kg: float) -> Vector:
+        """Return b1..b6 and the constant with a payload (7,)."""
+        constant = self.b9 + self.b7 * payload_kg * 1000.0
+        return np.array([self.b1, self.b2, self.b3, self.b4, self.b5, self.b6, constant])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleProfile:
@@ -164,12 +186,12 @@ class VehicleProfile:
     inertia_kgm2: Triple  # Ixx, Iyy, Izz
     body_box_m: Triple  # length, width, height round the centre of mass, propellers included
     camera_mount_flu_m: Triple  # forward, left, up of the centre of mass
-    rotor: Rotor
+    rotor: _Rotor
     drag: _Drag
     gear: _Gear
-    battery: Battery
+    battery: _Battery
     limits: _ControlLimits
-    energy: EnergyRegression
+    energy: _EnergyRegression
 
     def __post_init__(self) -> None:
         for key, value in _numbers(self):
@@ -335,7 +357,7 @@ class _StandIn:
         return min(max(needed_deg, base.limits.tilt_deg), LARGEST_TILT_DEG)
 
 
-def _with_pull(base: VehicleProfile, pull_n: float) -> Rotor:
+def _with_pull(base: VehicleProfile, pull_n: float) -> _Rotor:
     faster = math.sqrt(pull_n / base.max_thrust_n)
     return dataclasses.replace(
         base.rotor,

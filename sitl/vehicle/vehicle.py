@@ -34,7 +34,7 @@ from sitl.vehicle.physics import (
     RAW_WOW,
     Physics,
 )
-from sitl.vehicle.profile import Battery, EnergyRegression, VehicleProfile
+from sitl.vehicle.profile import VehicleProfile
 
 T_STAMP = 0
 T_POSITION = 1
@@ -55,13 +55,9 @@ T_ENERGY_PROPELLER = 32
 TRUTH_SIZE = 33
 
 KMH_PER_MPS = 3.6
-GRAMS_PER_KG = 1000.0
-SECONDS_PER_HOUR = 3600.0
 
-# Remaining charge at a lithium cell's empty, nominal, middle and full voltage. The middle
-# voltage lies 30 % of the way from nominal to full: 3.85 V for an ordinary 4.2 V cell.
+# Remaining charge at a lithium cell's empty, nominal, middle and full voltage.
 _KNEES = np.array([0.0, 0.1, 0.5, 1.0])
-_MIDDLE = 0.3
 
 PHYSICS_DT_S = 0.004
 
@@ -108,36 +104,14 @@ class Truth:
         """True if a landing leg carries weight."""
         return bool(self.flat[T_ON_GROUND] > 0.5)
 
-
-def wreck_of(truth: Truth) -> Truth:
-    """Return the state of a vehicle that stays where it is with its motors stopped."""
-    flat = truth.flat.copy()
-    flat[T_VELOCITY:T_QUATERNION] = 0.0  # and acceleration
-    flat[T_RATES:T_RPM] = 0.0  # and motor commands
-    flat[[T_CURRENT, T_POWER_REGRESSION, T_POWER_PROPELLER]] = 0.0
-    flat[T_ON_GROUND] = 1.0
-    return Truth(flat)
-
-
-def regression_coefficients(energy: EnergyRegression, payload_kg: float) -> Vector:
-    """Return b1..b6 and the constant, which includes the payload (7,), for `regression_power`."""
-    constant = energy.b9 + energy.b7 * payload_kg * GRAMS_PER_KG
-    return np.array([energy.b1, energy.b2, energy.b3, energy.b4, energy.b5, energy.b6, constant])
-
-
-def battery_parameters(battery: Battery) -> Vector:
-    """Return four open-circuit voltages, resistance, capacity C, efficiency and W (8,)."""
-    middle = battery.cell_nominal_v + _MIDDLE * (battery.cell_full_v - battery.cell_nominal_v)
-    cells = (battery.cell_empty_v, battery.cell_nominal_v, middle, battery.cell_full_v)
-    return np.array(
-        [
-            *(battery.cells * voltage for voltage in cells),
-            battery.resistance_ohm,
-            battery.capacity_ah * SECONDS_PER_HOUR,
-            battery.drive_efficiency,
-            battery.avionics_w,
-        ]
-    )
+    def wreck(self) -> Truth:
+        """Return the state of a vehicle that stays where it is with its motors stopped."""
+        flat = self.flat.copy()
+        flat[T_VELOCITY:T_QUATERNION] = 0.0  # and acceleration
+        flat[T_RATES:T_RPM] = 0.0  # and motor commands
+        flat[[T_CURRENT, T_POWER_REGRESSION, T_POWER_PROPELLER]] = 0.0
+        flat[T_ON_GROUND] = 1.0
+        return Truth(flat)
 
 
 @compiled
@@ -291,8 +265,8 @@ class Quadrotor:
             dt_s=dt_s,
         )
         self._gains = gains_for(profile, dt_s)
-        self._regression = regression_coefficients(profile.energy, profile.extra_payload_kg)
-        self._battery = battery_parameters(profile.battery)
+        self._regression = profile.energy.coefficients(profile.extra_payload_kg)
+        self._battery = profile.battery.parameters()
         self._state = np.zeros(STATE_SIZE)
         self._measurement = np.zeros(MEASUREMENT_SIZE)
         self._raw = np.zeros(RAW_SIZE)

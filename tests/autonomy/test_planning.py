@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mavfi_cli import autonomy
-from mavfi_cli.autonomy import collision, planning
+from mavfi_cli.autonomy import collision, planning, warm
 from mavfi_cli.autonomy.occupancy import snapshot_of
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.planners import find
@@ -68,4 +67,4 @@ def test_a_start_that_cannot_stop_in_time_is_refused():
 
 
 def test_warm_up_runs_every_kernel():
-    autonomy.warm_up()
+    warm.warm_up()

@@ -7,7 +7,7 @@ import pytest
 from missions import POSTS
 
 from mavfi_cli.attack.kernels.scope import kernel_scope
-from mavfi_cli.autonomy import warm_up
+from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion import node_process
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED, decode

@@ -5,7 +5,7 @@ is one. In a mission the kernel is the planner node's work for one request, with
 search (`node_scope`).
 
 Call these functions in the process in which the kernel runs, after it has run once
-(`autonomy.warm_up`): a just-in-time compiled kernel has an address only then. The result can be
+(`autonomy.warm`): a just-in-time compiled kernel has an address only then. The result can be
 sent to a tracer.
 """
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from mavfi_cli.attack.kernels.scope import node_scope
 from mavfi_cli.attack.served import channel, newest_cache_ns
-from mavfi_cli.autonomy import planners, warm_up
+from mavfi_cli.autonomy import planners
+from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.node_process import serve
 from mavfi_cli.companion.pipeline import Companion

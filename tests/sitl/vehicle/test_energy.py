@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from sitl.vehicle.profile import load_profile, profile_names
 from sitl.vehicle.vehicle import (
     battery_current,
-    battery_parameters,
     open_circuit_voltage,
-    regression_coefficients,
     regression_power,
 )
 
@@ -32,13 +30,13 @@ def twin(velocity, acceleration, energy, payload_kg):
 @given(components, components, st.floats(0.0, 1.0), st.sampled_from(profile_names()))
 def test_regression_is_its_twin(velocity, acceleration, payload_kg, name):
     energy = load_profile(name).energy
-    power = regression_power(velocity, acceleration, regression_coefficients(energy, payload_kg))
+    power = regression_power(velocity, acceleration, energy.coefficients(payload_kg))
     assert power == pytest.approx(twin(velocity, acceleration, energy, payload_kg), rel=1e-9)
 
 
 def test_regression_reproduces_the_published_check():
     # Solo at 2 m/s with 0.5 m/s^2 along and 0.2 m/s^2 up: 522 W by the equation, 527 W recorded.
-    b = regression_coefficients(load_profile("solo").energy, 0.0)
+    b = load_profile("solo").energy.coefficients(0.0)
     power = regression_power(np.array([2.0, 0.0, 0.0]), np.array([0.5, 0.0, -0.2]), b)
     assert power == pytest.approx(522.0, abs=1.0)
 
@@ -54,7 +52,7 @@ def test_hovering_solo_takes_the_constant(airborne, setpoint):
 @pytest.mark.parametrize("name", profile_names())
 def test_open_circuit_voltage_rises_with_charge(name):
     battery = load_profile(name).battery
-    parameters = battery_parameters(battery)
+    parameters = battery.parameters()
     volts = [open_circuit_voltage(charge, parameters) for charge in np.linspace(0.0, 1.0, 101)]
     assert (np.diff(volts) > 0.0).all()
     assert volts[0] == pytest.approx(battery.cells * battery.cell_empty_v)
