@@ -22,7 +22,6 @@ are followed within the limits. The output is always finite and within its limit
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -110,9 +109,7 @@ def step(
     track(*law, params.v_max_mps, *limits, out)
     stretch = 1.0
     if params.stretches_clock:
-        demanded = np.empty(10)
-        track(*law, math.inf, *limits, demanded)
-        stretch = max(1.0, _length(demanded[0:3].tolist()) / params.v_max_mps)
+        stretch = max(1.0, _demanded_mps(*law, *limits) / params.v_max_mps)
     yaw_rad = float(out[9])
     command = Command(
         stamp_s=inputs.stamp_s,
@@ -126,15 +123,6 @@ def step(
         TrackingState(integral_mps=out[6:9].copy(), yaw_rad=yaw_rad, stamp_s=inputs.stamp_s),
         command,
     )
-
-
-def _length(vector: Sequence[float]) -> float:
-    """Return the length of a vector (3,). Safe if its square overflows; inf on overflow."""
-    largest = max(map(abs, vector))
-    if largest == 0.0:
-        return 0.0
-    x, y, z = (component / largest for component in vector)
-    return largest * math.sqrt(x * x + y * y + z * z)
 
 
 @compiled
@@ -180,6 +168,37 @@ def track(
     turn = _finite_or(angle_between(last_yaw, target[3]), 0.0)
     reach = yaw_rate_max * step_s
     out[9] = angle_between(0.0, last_yaw + min(max(turn, -reach), reach))
+
+
+@compiled
+def _demanded_mps(
+    target: FloatArray,
+    rate: float,
+    rate_change_per_s: float,
+    position: FloatArray,
+    velocity: FloatArray,
+    integral: FloatArray,
+    last_yaw: float,
+    elapsed_s: float,
+    kp: float,
+    ki: float,
+    kd: float,
+    integral_max: float,
+    a_max: float,
+    yaw_rate_max: float,
+    step_max_s: float,
+) -> float:
+    """Return the commanded speed before the speed limit, m/s; inf on overflow."""
+    out = np.empty(10)
+    track(
+        target, rate, rate_change_per_s, position, velocity, integral, last_yaw, elapsed_s,
+        kp, ki, kd, integral_max, math.inf, a_max, yaw_rate_max, step_max_s, out,
+    )  # fmt: skip
+    largest = max(abs(out[0]), abs(out[1]), abs(out[2]))
+    if largest == 0.0:
+        return 0.0
+    x, y, z = out[0] / largest, out[1] / largest, out[2] / largest
+    return float(largest * math.sqrt(x * x + y * y + z * z))
 
 
 @compiled
