@@ -1,4 +1,4 @@
-"""Starts the camera and receives its depth frames, in spite of loss and reordering.
+"""Receives depth frames, in spite of loss and reordering.
 
 A frame consists of CAMERA_IMAGE_CAPTURED (stamp, index, and `depth8:crc32=%08x` of the pixels in
 `file_url`), DATA_TRANSMISSION_HANDSHAKE (size), and ENCAPSULATED_DATA packets. A packet gives its
@@ -21,9 +21,6 @@ from numpy.typing import NDArray
 from mavfi_cli.core.frames import rotation_matrix
 from mavfi_cli.core.types import DepthFrame, FloatArray, VehicleState
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.commands import CommandChannel
-
-_CAMERA = dialect.MAV_COMP_ID_CAMERA
 
 MAX_PIXELS = 1 << 20
 DEPTH_UNIT_M = 0.1
@@ -39,38 +36,6 @@ _REMEMBERED = 64  # indices of frames that are done with
 _CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
 
 _DEPTH_M = np.arange(256, dtype=np.float64) * DEPTH_UNIT_M
-
-
-class CameraClient:
-    """Client of the camera component (MAV_COMP_ID_CAMERA) of one system.
-
-    Args:
-        commands: Command channel of that system.
-
-    Attributes:
-        heard: True once the camera has sent a HEARTBEAT.
-    """
-
-    def __init__(self, commands: CommandChannel) -> None:
-        self._commands = commands
-        self.heard = False
-
-    def handle(self, message: Message) -> None:
-        """Request the camera's information at its first HEARTBEAT."""
-        if isinstance(message, dialect.MAVLink_heartbeat_message) and not self.heard:
-            self.heard = True
-            self._commands.submit(
-                dialect.MAV_CMD_REQUEST_MESSAGE,
-                dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION,
-                component=_CAMERA,
-            )
-
-    def start(self, interval_s: float) -> None:
-        """Request a frame every `interval_s` without end."""
-        self._commands.submit(
-            dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
-            component=_CAMERA, unused=math.nan, refusals=3,
-        )  # fmt: skip
 
 
 def _hfov_of(message: Message) -> float | None:

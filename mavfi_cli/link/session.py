@@ -16,7 +16,6 @@ from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.commands import CommandChannel, Requests
-from mavfi_cli.link.images import CameraClient
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.texts import text_messages
 
@@ -32,6 +31,7 @@ _NO_ACCELERATION = (
     | dialect.POSITION_TARGET_TYPEMASK_AZ_IGNORE
 )
 _NO_YAW = dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+_CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _LARGEST_FLOAT32 = 3.4028234663852886e38
 
 _HEARTBEAT_INTERVAL_S = 1.0
@@ -169,7 +169,7 @@ class OffboardSession:
         failsafe_text: Reason why the autopilot no longer follows (it changed its mode or disarmed);
             None while it follows. Never reset.
         telemetry: Newest telemetry of the autopilot.
-        camera: Camera component of the same system.
+        camera_heard: True once the camera (MAV_COMP_ID_CAMERA) of the system has sent a HEARTBEAT.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class OffboardSession:
         self.failure: LinkError | None = None
         self.failsafe_text: str | None = None
         self._commands = CommandChannel(self._settings.system, self._settings.component)
-        self.camera = CameraClient(self._commands)
+        self.camera_heard = False
         self._requests = Requests(self._commands, self.telemetry)
         self._target = _Target()
         self._replies = _Replies()
@@ -234,6 +234,13 @@ class OffboardSession:
         """Send a STATUSTEXT with severity WARNING to ground stations."""
         self._replies.announce(dialect.MAV_SEVERITY_WARNING, text)
 
+    def start_camera(self, interval_s: float) -> None:
+        """Request a frame of the camera every `interval_s` without end."""
+        self._commands.submit(
+            dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
+            component=_CAMERA, unused=math.nan, refusals=3,
+        )  # fmt: skip
+
     def request_land(self) -> None:
         """Land at the present position and disarm. Before arming, end the session at once."""
         if self.phase not in (Phase.LANDING, Phase.DONE):
@@ -248,9 +255,16 @@ class OffboardSession:
         if telemetry.heard and message.get_srcSystem() == telemetry.system:
             if isinstance(message, dialect.MAVLink_command_ack_message):
                 self._commands.acknowledge(message)
-            elif message.get_srcComponent() == dialect.MAV_COMP_ID_CAMERA:
-                self.camera.handle(message)
+            elif message.get_srcComponent() == _CAMERA and not self.camera_heard:
+                self._hear_camera(message)
         self._replies.handle(message, self._now_s)
+
+    def _hear_camera(self, message: Message) -> None:
+        """Ask the camera for its information at its first HEARTBEAT."""
+        if isinstance(message, dialect.MAVLink_heartbeat_message):
+            self.camera_heard = True
+            information = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
+            self._commands.submit(dialect.MAV_CMD_REQUEST_MESSAGE, information, component=_CAMERA)
 
     # Sent messages ------------------------------------------------------------------------------
 

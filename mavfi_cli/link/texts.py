@@ -40,7 +40,7 @@ def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Any]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Text:
+class _Text:
     """A complete text of a component."""
 
     stamp_s: float  # arrival of its last chunk
@@ -59,11 +59,11 @@ class TextCollector:
     """Collects texts. `texts` holds the newest thousand, `total` counts all."""
 
     def __init__(self) -> None:
-        self.texts: deque[Text] = deque(maxlen=_MAX_TEXTS)
+        self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
         self.total = 0
         self._open: dict[tuple[int, int, int], _Open] = {}
 
-    def since(self, total: int) -> list[Text]:
+    def since(self, total: int) -> list[_Text]:
         """Return the texts received since `total` had this value."""
         fresh = min(self.total - total, len(self.texts))
         return list(self.texts)[len(self.texts) - fresh :]
@@ -101,4 +101,4 @@ class TextCollector:
 
     def _emit(self, stamp_s: float, severity: int, text: str) -> None:
         self.total += 1
-        self.texts.append(Text(stamp_s=stamp_s, severity=severity, text=text.strip()))
+        self.texts.append(_Text(stamp_s=stamp_s, severity=severity, text=text.strip()))

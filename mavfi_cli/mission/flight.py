@@ -288,7 +288,7 @@ class Flight:
             companion.executor.compute()
         if not self._camera_asked and self._nearly_up(state):
             self._camera_asked = True
-            self._session.camera.start(1.0 / self._config.camera_rate_hz)
+            self._session.start_camera(1.0 / self._config.camera_rate_hz)
         self.logger.tell(stamp_s, self._session, companion, self.injection)
         return True
 

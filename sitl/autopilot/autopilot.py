@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,14 +18,10 @@ from sitl.autopilot.commander import (
     Result,
     Severity,
 )
-from sitl.autopilot.commands import acknowledge, execute
 from sitl.autopilot.flight_modes import Guidance, begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.setpoint import (
     Setpoint,
-    SetpointRefused,
-    global_setpoint,
-    local_setpoint,
     no_setpoint,
 )
 from sitl.autopilot.streams import Link, Preset
@@ -35,6 +30,7 @@ from sitl.geodesy import Origin
 from sitl.vehicle.vehicle import Truth
 
 COMPONENT = 1
+_PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
 _STRAIGHT_DOWN_MPS = 0.3
 
 
@@ -90,8 +86,8 @@ class Autopilot:
 
     def collect(self, link: Link) -> list[Any]:
         """Return all due messages of a link at the newest stamp: answers, then streams."""
-        if link.parameters_left:
-            services.list_parameters(self, link)
+        for _ in range(min(_PARAMETERS_A_TICK, len(link.parameters_left))):
+            link.send(self.parameters.message(link.parameters_left.popleft()))
         due = link.streams.due(self.snapshot.stamp_us, self.snapshot)
         if not link.outbox:
             return due
@@ -109,10 +105,10 @@ class Autopilot:
     def handle(self, message: Any, link: Link) -> None:
         """Handle a message of a client. Messages for other systems are ignored."""
         number = message.get_msgId()
-        if number in _ANY_TARGET:
-            _ANY_TARGET[number](self, message, link)
-        elif number in _ADDRESSED and self._is_for_me(message):
-            _ADDRESSED[number](self, message, link)
+        if number in services.ANY_TARGET:
+            services.ANY_TARGET[number](self, message, link)
+        elif number in services.ADDRESSED and self._is_for_me(message):
+            services.ADDRESSED[number](self, message, link)
         self._flush_texts()
 
     def enter_mode(self, mode: FlightMode | None) -> Result:
@@ -235,59 +231,6 @@ class Autopilot:
             for message in text_messages(severity, data, self._text_id):
                 self.broadcast(message)
 
-    # Messages.
-
     def _is_for_me(self, message: Any) -> bool:
         systems = (self.system_id, 0)
         return message.target_system in systems and message.target_component in (COMPONENT, 0)
-
-    def _on_local_target(self, message: Any, _link: Link) -> None:
-        heading = self.snapshot.euler_rad[2]
-        self._take_setpoint(lambda: local_setpoint(message, heading))
-
-    def _on_global_target(self, message: Any, _link: Link) -> None:
-        home_down = float(self.snapshot.home_ned_m[2])
-        self._take_setpoint(lambda: global_setpoint(message, self.snapshot.origin, home_down))
-
-    def _take_setpoint(self, read: Callable[[], Setpoint]) -> None:
-        try:
-            self.snapshot.offboard = read()
-        except SetpointRefused as refusal:
-            self.commander.say(Severity.CRITICAL, str(refusal))
-            return
-        self.commander.offboard_setpoint_arrived()
-
-    def _on_attitude_target(self, _message: Any, _link: Link) -> None:
-        self.commander.say(Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported")
-
-    def _on_command(self, message: Any, link: Link) -> None:
-        if message.target_system == self.system_id:
-            execute(self, message, link)
-
-    def _on_set_mode(self, message: Any, link: Link) -> None:
-        """Handle SET_MODE, the predecessor of DO_SET_MODE, with one answer."""
-        if message.target_system != self.system_id:
-            return
-        mode = FlightMode.from_custom(message.custom_mode) if message.base_mode & 1 else None
-        result = self.enter_mode(mode)
-        link.send(acknowledge(message, dialect.MAV_CMD_DO_SET_MODE, result))
-
-    def _on_manual_control(self, message: Any, _link: Link) -> None:
-        if message.target == self.system_id:
-            self.snapshot.sticks = (message.x, message.y, message.z, message.r)
-            self.commander.sticks_arrived()
-
-
-_ANY_TARGET: Mapping[int, services.Service] = {
-    **services.ANY_TARGET,
-    dialect.MAVLINK_MSG_ID_SET_MODE: Autopilot._on_set_mode,
-    dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: Autopilot._on_manual_control,
-}
-_ADDRESSED: Mapping[int, services.Service] = {
-    **services.ADDRESSED,
-    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: Autopilot._on_local_target,
-    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: Autopilot._on_global_target,
-    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: Autopilot._on_attitude_target,
-    dialect.MAVLINK_MSG_ID_COMMAND_LONG: Autopilot._on_command,
-    dialect.MAVLINK_MSG_ID_COMMAND_INT: Autopilot._on_command,
-}

@@ -399,7 +399,7 @@ def test_the_camera_is_asked_who_it_is_and_started() -> None:
     flight.until_phase(Phase.WAITING_READY)
     session = flight.session
     session.handle(_from(1, 100, dialect.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3)))
-    session.camera.start(0.1)
+    session.start_camera(0.1)
     asked = {
         m.command: m
         for m in flight.tick()
