@@ -103,9 +103,10 @@ class Client:
         """Send answers without waiting for the tick."""
         self._send([], self._simulation.autopilot.take_outbox(self._link))
 
-    def forward(self, frame: bytes) -> None:
+    def forward(self, *, frame: bytes, of: Client) -> None:
         """Send a frame of another client unchanged."""
-        self.transport.send(frame)
+        if of is not self:
+            self.transport.send(frame)
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> None:
         """Send messages of both components; the camera's answers are the first."""

@@ -1,24 +1,280 @@
-"""Assembles a server from its options, runs it, and shuts it down."""
+"""The server: a simulation in lockstep with one companion, or in real time for any clients.
+
+In lockstep, simulated time stands still while the companion computes. Each control tick everything
+due goes out in one send that ends with LOCAL_POSITION_NED. The next tick begins when the companion
+has sent SET_POSITION_TARGET_LOCAL_NED with the same time_boot_ms.
+"""
 
 from __future__ import annotations
 
+import select
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.errors import LinkLost, RecordError, VehicleProcessError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.link.codec import Signing, key_from_file
-from mavfi_cli.link.transport import open_listener, open_transport
-from sitl.autopilot.streams import Preset
+from mavfi_cli.link.codec import Signing, dialect, key_from_file
+from mavfi_cli.link.transport import Listener, memory_pair, open_listener, open_transport
+from sitl.autopilot.streams import TICK_US, Preset
 from sitl.command_line import exit_code, stop_on_signals
 from sitl.server.client import Client
-from sitl.server.loops import Door, EmbeddedVehicle, Realtime, run_lockstep
 from sitl.server.options import ServerOptions, parse
 from sitl.server.simulation import Simulation
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
+
+_PATIENCE_S = 0.5
+_SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
+_LOOK_UP_S = 0.2  # interval at which a silent wait checks for a stop
+
+
+class _Pace:
+    """Computes the wait before the next tick.
+
+    A slow machine does not accumulate delay: time lost beyond half a second of delay is
+    dropped.
+
+    Args:
+        speed: simulated seconds for each second of the wall clock.
+    """
+
+    def __init__(self, speed: float) -> None:
+        self._speed = speed
+        self._due_s = time.monotonic()
+
+    def next_tick(self, tick_s: float) -> None:
+        """Count one more simulated tick."""
+        self._due_s = max(self._due_s + tick_s / self._speed, time.monotonic() - _PATIENCE_S)
+
+    def remaining_s(self) -> float:
+        """Time until the tick is due; zero or less if it is."""
+        return self._due_s - time.monotonic()
+
+
+def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
+    """Run until the companion closes the connection, or until stopped.
+
+    Raises:
+        VehicleProcessError: The companion gave no answer within the limit.
+    """
+    client = Client(simulation, open_transport(f"fd:{options.fd}"), Preset.LOCKSTEP)
+    pace = None if options.speed is None else _Pace(options.speed)
+    try:
+        while not stopped():
+            client.send_tick()
+            stamp_ms = simulation.stamp_us // 1000
+            if not _await_answer(stamp_ms, client, options.answer_limit_s, stopped):
+                return
+            if pace is not None:
+                pace.next_tick(TICK_US * 1e-6)
+                time.sleep(max(pace.remaining_s(), 0.0))
+            simulation.advance()
+    except LinkLost:
+        return
+    finally:
+        client.close()
+
+
+def _await_answer(
+    stamp_ms: int, client: Client, limit_s: float, stopped: Callable[[], bool]
+) -> bool:
+    """Handle messages of the companion until it answers; False if stopped before."""
+    deadline_s = 0.0
+    while True:
+        messages = client.receive(_LOOK_UP_S)
+        if _answers(messages, stamp_ms):
+            return True
+        if messages:
+            deadline_s = 0.0
+            continue
+        now_s = time.monotonic()
+        if stopped():
+            return False
+        if not deadline_s:
+            deadline_s = now_s + limit_s
+        elif now_s > deadline_s:
+            raise VehicleProcessError(
+                f"the companion gave no answer to {stamp_ms} ms within {limit_s:g} s"
+            )
+
+
+def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
+    """Whether the setpoint for a stamp is among the companion's messages."""
+    return any(
+        message.get_msgId() == _SETPOINT and message.time_boot_ms == stamp_ms
+        for message in messages
+    )
+
+
+class _EmbeddedVehicle:
+    """The vehicle in the process of its companion, which waits while the vehicle flies.
+
+    Args:
+        simulation: the vehicle.
+        truth_folder: folder in which the truth is saved at the end.
+
+    Attributes:
+        link: the companion's end of the link. When the companion has answered a tick and waits for
+            more, the vehicle flies the next one.
+        error: error that ended the vehicle before its companion.
+    """
+
+    def __init__(self, simulation: Simulation, truth_folder: Path) -> None:
+        self._simulation = simulation
+        self.link, end = memory_pair("the simulated vehicle")
+        self._client = Client(simulation, end, Preset.LOCKSTEP)
+        self._begun = self._ended = False
+        self.truth_folder = truth_folder
+        self.error: Exception | None = None
+        self.link.on_wait = self._fly_on
+
+    def _fly_on(self) -> None:
+        """Fly a tick if the companion has answered the last one, and send its messages."""
+        try:
+            if not self._begun or self._fly_tick():
+                self._begun = True
+                self._client.send_tick()
+        except Exception as error:  # the vehicle's boundary: the companion only loses its link
+            self.error = error
+            self.end()
+
+    def _fly_tick(self) -> bool:
+        """Fly a tick if the companion has answered; return whether it has."""
+        answered = _answers(self._client.receive(0.0), self._simulation.stamp_us // 1000)
+        if answered:
+            self._simulation.advance()
+        return answered
+
+    def end(self) -> None:
+        """Fly the companion's last answer and save the truth; may be called repeatedly.
+
+        Raises:
+            RecordError: the truth cannot be saved.
+        """
+        if self._ended:
+            return
+        self._ended = True
+        try:
+            if self._begun and self.error is None:
+                self._fly_tick()
+        except Exception as error:  # as above
+            self.error = error
+        self._client.close()
+        self._simulation.save_truth(self.truth_folder)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Door:
+    """An endpoint for clients, and their preset."""
+
+    listener: Listener
+    preset: Preset
+    key: bytes | None  # each client signs with it
+    ends_with_peer: bool  # an inherited connection; the server ends with it
+
+
+class _Realtime:
+    """The clients of a simulation that is paced by the wall clock, any number of them."""
+
+    def __init__(self, options: ServerOptions, simulation: Simulation) -> None:
+        self._options = options
+        self._simulation = simulation
+        self._doors: list[_Door] = []
+        self._pace = _Pace(options.speed or 1.0)
+        self._clients: list[tuple[Client, _Door]] = []
+        self._over = False
+
+    def open(self) -> None:
+        """Open every endpoint.
+
+        Raises:
+            EndpointError: One of them cannot be opened.
+            ConfigError: The file of the signing key cannot be read.
+        """
+        file, allowed = self._options.key_file, self._options.allow_unsigned
+        key = None if file is None else key_from_file(file)
+        for preset, url in self._options.links:
+            inherited = url.startswith("fd:")
+            listener = open_listener(url, signed=key is not None, allow_unsigned=allowed)
+            door = _Door(
+                listener=listener, preset=preset, key=None if inherited else key,
+                ends_with_peer=inherited,
+            )  # fmt: skip
+            self._doors.append(door)
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Run until stopped, or until an inherited connection closes."""
+        self._welcome()
+        while not stopped() and not self._over:
+            self._each(Client.send_tick)
+            self._pace.next_tick(TICK_US * 1e-6)
+            self._serve(stopped)
+            self._simulation.advance()
+
+    def close(self) -> None:
+        """Close every client and door."""
+        for client, _ in self._clients:
+            client.close()
+        for door in self._doors:
+            door.listener.close()
+
+    def _serve(self, stopped: Callable[[], bool]) -> None:
+        """Answer clients until the next tick is due; at least once."""
+        while True:
+            self._wait(max(self._pace.remaining_s(), 0.0))
+            self._welcome()
+            self._each(Client.drain)
+            self._forward()
+            self._each(Client.send_answers)
+            if self._pace.remaining_s() <= 0.0 or stopped() or self._over:
+                return
+
+    def _forward(self) -> None:
+        """Forward the status texts of each client to all others."""
+        for speaker, _ in list(self._clients):
+            while speaker.overheard:
+                self._each(partial(Client.forward, frame=speaker.overheard.popleft(), of=speaker))
+
+    def _wait(self, timeout_s: float) -> None:
+        poller = select.poll()
+        descriptors = {door.listener.fileno() for door in self._doors}
+        descriptors |= {client.transport.fileno() for client, _ in self._clients}
+        for descriptor in descriptors:
+            if descriptor >= 0:  # a door with one peer closes with it
+                poller.register(descriptor, select.POLLIN)
+        poller.poll(timeout_s * 1e3)
+
+    def _welcome(self) -> None:
+        for door in self._doors:
+            for transport in door.listener.accept_ready():
+                signing = None if door.key is None else Signing(door.key, clock=time.time)
+                client = Client(self._simulation, transport, door.preset, signing=signing)
+                self._clients.append((client, door))
+
+    def _each(self, action: Callable[[Client], None]) -> None:
+        """Call a function with every client, and remove disconnected ones."""
+        for client, door in list(self._clients):
+            try:
+                action(client)
+            except LinkLost:
+                client.close()
+                self._clients.remove((client, door))
+                self._over = self._over or door.ends_with_peer
+
+
+def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
+    server = _Realtime(options, simulation)
+    try:
+        server.open()
+        _announce(options, simulation)
+        server.run(stopped)
+    finally:
+        server.close()
 
 
 def _write_briefing(simulation: Simulation, folder: Path) -> None:
@@ -61,7 +317,7 @@ def _serve(options: ServerOptions) -> None:
             simulation.save_truth(options.truth)
 
 
-def embedded(arguments: Sequence[str], truth_folder: Path) -> EmbeddedVehicle:
+def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
     """The vehicle of `python -m sitl --lockstep` in this process, ready to fly.
 
     Args:
@@ -73,7 +329,7 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> EmbeddedVehicle:
     """
     simulation = _simulation(parse(arguments))
     _write_briefing(simulation, truth_folder)
-    return EmbeddedVehicle(simulation, truth_folder)
+    return _EmbeddedVehicle(simulation, truth_folder)
 
 
 def warm_up() -> None:
@@ -99,45 +355,6 @@ def _simulation(options: ServerOptions) -> Simulation:
         camera_rows=rows,
         camera_rate_hz=options.camera_rate_hz,
     )
-
-
-def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    transport = open_transport(f"fd:{options.fd}")
-    client = Client(simulation, transport, Preset.LOCKSTEP)
-    try:
-        run_lockstep(
-            simulation,
-            client,
-            speed=options.speed,
-            limit_s=options.answer_limit_s,
-            stopped=stopped,
-        )
-    finally:
-        client.close()
-
-
-def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    key = None if options.key_file is None else key_from_file(options.key_file)
-    doors: list[Door] = []
-    server = Realtime(simulation, doors, speed=options.speed or 1.0)
-    try:
-        for preset, url in options.links:
-            inherited = url.startswith("fd:")
-            listener = open_listener(
-                url, signed=key is not None, allow_unsigned=options.allow_unsigned
-            )
-            signing = _signing_maker(None if inherited else key)
-            doors.append(
-                Door(listener=listener, preset=preset, signing=signing, ends_with_peer=inherited)
-            )
-        _announce(options, simulation)
-        server.run(stopped)
-    finally:
-        server.close()
-
-
-def _signing_maker(key: bytes | None) -> Callable[[], Signing | None]:
-    return lambda: None if key is None else Signing(key, clock=time.time)
 
 
 def _announce(options: ServerOptions, simulation: Simulation) -> None:
