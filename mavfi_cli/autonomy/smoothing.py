@@ -121,7 +121,7 @@ class _Smoothed:
 
 def smooth(
     path_enu_m: FloatArray,
-    grid: ObstacleGrid | None,
+    grid: ObstacleGrid,
     departure: Departure,
     params: SmoothingParams,
 ) -> _Smoothed:
@@ -134,10 +134,19 @@ def smooth(
     velocity = _cut(departure.velocity_enu_mps, params.v_max_mps)
     path = np.asarray(path_enu_m, np.float64)
     vertices, free = _with_run_out(path, velocity, grid, params)
-    flight = _Flight(path[0], velocity, departure.yaw_rad, vertices, params)
-    caps = flight.corner_caps()
+    limits, period = params.limits, params.sample_period_s
+    line = corners.polyline(vertices, limits)
+    speed, acceleration = float(np.linalg.norm(velocity)), limits.acceleration_mps2
+    before = path[0] - 0.5 * period * velocity
+    # squared speeds that cut each corner by `corner_cut_m` at most
+    caps = 2.0 * acceleration * params.corner_cut_m / np.maximum(line.half_sines, 1e-6) ** 2
     for _ in range(params.passes_max):
-        q, moving, spline = flight.fly(caps)
+        q = corners.squared_corner_speeds(line, speed, caps, acceleration)
+        dwells_s = _dwells(line.directions, q, departure.yaw_rad, params)
+        moving = corners.motion(line, q, dwells_s, acceleration)
+        count = math.ceil(moving.duration_s / period) + 2
+        ahead = moving.position(np.arange(count, dtype=np.float64) * period)
+        spline = np.vstack([before, ahead])
         blamed = [c for c in _blocked_corners(spline, moving, grid, params) if q[c] > 0.0]
         if not blamed:
             break
@@ -146,58 +155,22 @@ def smooth(
     return _Smoothed(trajectory=_waypoints(spline, departure, params), free=free)
 
 
-class _Flight:
-    """A polyline from a start in motion, flown again for each choice of corner speeds."""
-
-    def __init__(
-        self,
-        start: FloatArray,
-        velocity: FloatArray,
-        yaw_rad: float,
-        vertices: FloatArray,
-        params: SmoothingParams,
-    ) -> None:
-        self._start = start
-        self._velocity = velocity
-        self._yaw_rad = yaw_rad
-        self._params = params
-        self._line = corners.polyline(vertices, params.limits)
-
-    def corner_caps(self) -> FloatArray:
-        """Return the squared speeds (n,) that cut each corner by `corner_cut_m` at most."""
-        room = 2.0 * self._params.limits.acceleration_mps2 * self._params.corner_cut_m
-        sines = self._line.half_sines
-        caps: FloatArray = room / np.maximum(sines, 1e-6) ** 2
-        return caps
-
-    def fly(self, caps: FloatArray) -> tuple[FloatArray, Motion, FloatArray]:
-        """Return squared corner speeds (n,), motion and control points (m, 3) for the caps (n,)."""
-        acceleration = self._params.limits.acceleration_mps2
-        speed = float(np.linalg.norm(self._velocity))
-        q = corners.squared_corner_speeds(self._line, speed, caps, acceleration)
-        moving = corners.motion(self._line, q, self._dwells(q), acceleration)
-        period = self._params.sample_period_s
-        count = math.ceil(moving.duration_s / period) + 2
-        ahead = moving.position(np.arange(count, dtype=np.float64) * period)
-        before = self._start - 0.5 * period * self._velocity
-        return q, moving, np.vstack([before, ahead])
-
-    def _dwells(self, q: FloatArray) -> FloatArray:
-        """Return the waiting time at each vertex (n,), which includes the time to turn at rest."""
-        line, params = self._line, self._params
-        dwells = np.zeros(len(q))
-        yaw = self._yaw_rad
-        for i, direction in enumerate(line.directions):
-            if q[i] == 0.0:
-                turning = turn_time_s(
-                    yaw, direction, params.turn_first_rad, params.yaw_rate_max_radps
-                )
-                # Two control points on a corner keep the spline on the two segments.
-                settling = 2.0 * params.sample_period_s if i > 0 else 0.0
-                dwells[i] = max(turning, settling)
-            if math.hypot(direction[0], direction[1]) >= 0.1:
-                yaw = math.atan2(direction[1], direction[0])
-        return dwells
+def _dwells(
+    directions: FloatArray, q: FloatArray, yaw_rad: float, params: SmoothingParams
+) -> FloatArray:
+    """Return the waiting time at each vertex (n,), which includes the time to turn at rest."""
+    dwells = np.zeros(len(q))
+    for i, direction in enumerate(directions):
+        if q[i] == 0.0:
+            turning = turn_time_s(
+                yaw_rad, direction, params.turn_first_rad, params.yaw_rate_max_radps
+            )
+            # Two control points on a corner keep the spline on the two segments.
+            settling = 2.0 * params.sample_period_s if i > 0 else 0.0
+            dwells[i] = max(turning, settling)
+        if math.hypot(direction[0], direction[1]) >= 0.1:
+            yaw_rad = math.atan2(direction[1], direction[0])
+    return dwells
 
 
 def _cut(velocity: FloatArray, limit: float) -> FloatArray:
@@ -225,7 +198,7 @@ def _run_out(position: FloatArray, velocity: FloatArray, params: SmoothingParams
 
 
 def _with_run_out(
-    path: FloatArray, velocity: FloatArray, grid: ObstacleGrid | None, params: SmoothingParams
+    path: FloatArray, velocity: FloatArray, grid: ObstacleGrid, params: SmoothingParams
 ) -> tuple[FloatArray, bool]:
     """Return the vertices to fly, and True if the straight stretch from the start is free.
 
@@ -236,8 +209,6 @@ def _with_run_out(
     if len(vertices) == 1:
         return path, True
     stop = vertices[-1]
-    if grid is None:
-        return np.vstack([vertices, path[1:]]), True
     free = grid.segment_free(path[0], stop)
     for k in range(len(path) - 1, 0, -1):
         if grid.segment_free(stop, path[k]):
@@ -246,7 +217,7 @@ def _with_run_out(
 
 
 def _blocked_corners(
-    spline: FloatArray, moving: Motion, grid: ObstacleGrid | None, params: SmoothingParams
+    spline: FloatArray, moving: Motion, grid: ObstacleGrid, params: SmoothingParams
 ) -> list[int]:
     """Return the vertices that are rounded by spline pieces that are not free."""
     period = params.sample_period_s
@@ -260,11 +231,8 @@ def _blocked_corners(
     return sorted(blamed)
 
 
-def _piecewise_free(spline: FloatArray, grid: ObstacleGrid | None) -> NDArray[np.bool_]:
+def _piecewise_free(spline: FloatArray, grid: ObstacleGrid) -> NDArray[np.bool_]:
     """Return a flag for each spline piece (m - 2,): True if its four chords are free."""
-    pieces = len(spline) - 2
-    if grid is None:
-        return np.ones(pieces, np.bool_)
     first, second, third = spline[:-2, None], spline[1:-1, None], spline[2:, None]
     u = np.linspace(0.0, 1.0, 5)[:, None]
     points = (

@@ -46,7 +46,7 @@ def test_a_straight_flight_takes_as_long_as_a_trapezoid():
 
 def test_sequence_and_stamp_are_carried():
     numbered = replace(departure(), trajectory_seq=4, future_collision_seq=2)
-    made = smooth(path([0, 0, 5], [5, 0, 5]), None, numbered, PARAMS).trajectory
+    made = smooth(path([0, 0, 5], [5, 0, 5]), OPEN, numbered, PARAMS).trajectory
     assert (made.stamp_s, made.trajectory_seq, made.future_collision_seq) == (7.0, 4, 2)
     assert (made.durations_s == 0.5).all()
 
@@ -116,7 +116,7 @@ def test_a_start_in_motion_towards_a_wall_is_not_called_free():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300])
 def test_a_senseless_departure_gives_a_sound_trajectory(bad):
-    made = smooth(path([0, 0, 5], [5, 0, 5]), None, departure((bad, 0, 0), bad), PARAMS)
+    made = smooth(path([0, 0, 5], [5, 0, 5]), OPEN, departure((bad, 0, 0), bad), PARAMS)
     assert np.isfinite(made.trajectory.waypoints).all()
     assert (np.linalg.norm(flown(made.trajectory)[:, 4:7], axis=1) <= 3.0 + 1e-9).all()
 
