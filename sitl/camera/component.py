@@ -18,13 +18,14 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.frames import Vector, flu_enu_from_frd_ned, rotation_matrix
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.telemetry import int32
-from sitl.camera.depth import Optics, render_depth
+from sitl.camera.depth import render_depth
 from sitl.geodesy import Origin
 
 _SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding errors
 
 COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
 MAX_RATE_HZ = 50.0  # one frame per control tick
+_MAX_SIDE_PX = 2048
 _HEARTBEAT_S = 1.0
 _HOME = Origin()
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -101,10 +102,14 @@ class Camera:
     ) -> None:
         if not 0.0 < rate_hz <= MAX_RATE_HZ:
             raise ConfigError(f"camera rate {rate_hz:g} Hz: must be above 0, to {MAX_RATE_HZ:g}")
-        forward, left, up = (float(c) for c in mount_offset_flu_m)
-        self.optics = Optics(
-            columns=columns, rows=rows, hfov_rad=hfov_rad, mount_offset_flu_m=(forward, left, up)
-        )
+        if not (1 <= columns <= _MAX_SIDE_PX and 1 <= rows <= _MAX_SIDE_PX):
+            size = f"{columns}x{rows}"
+            raise ConfigError(f"camera size {size}: each side must be 1 to {_MAX_SIDE_PX} pixels")
+        if not 0.01 <= hfov_rad <= 3.1:
+            raise ConfigError(f"camera field of view {hfov_rad:g} rad: must be 0.01 to 3.1")
+        self.mount_offset_flu_m = np.array(mount_offset_flu_m, dtype=np.float64)
+        self._columns, self._rows, self._hfov_rad = columns, rows, hfov_rad
+        self._focal_px = columns / 2.0 / math.tan(hfov_rad / 2.0)
         self.system = system
         self.images = 0  # images since boot, which is also the next index
         self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
@@ -157,7 +162,7 @@ class Camera:
         if stamp_s < self._stamp_s - 1.0:
             self._reboot()
         self._stamp_s = stamp_s
-        offset_m = rotation_matrix(quaternion_flu_enu) @ np.array(self.optics.mount_offset_flu_m)
+        offset_m = rotation_matrix(quaternion_flu_enu) @ self.mount_offset_flu_m
         self._pose = position_enu_m + offset_m, quaternion_flu_enu
         due = [_heartbeat()] if self._heartbeat.due(stamp_s) else []
         for message_id, stream in self._streams.items():
@@ -184,9 +189,9 @@ class Camera:
         (size) and ENCAPSULATED_DATA (253 bytes each). This is MAVLink's image transmission protocol
         (https://mavlink.io/en/services/image_transmission.html).
         """
-        rows, columns = self.optics.rows, self.optics.columns
+        rows, columns = self._rows, self._columns
         pixels = render_depth(
-            self._boxes, position_enu_m, quaternion_flu_enu, columns, rows, self.optics.hfov_rad
+            self._boxes, position_enu_m, quaternion_flu_enu, columns, rows, self._hfov_rad
         ).tobytes()
         captured = dialect.MAVLink_camera_image_captured_message(
             self._boot_ms, 0, 0, *self._geodetic_e7_mm(position_enu_m),
@@ -236,11 +241,10 @@ class Camera:
 
     def _information(self) -> Message:
         """Return CAMERA_INFORMATION. Focal length and sensor size give the field of view."""
-        optics = self.optics
-        sensor_mm = (optics.columns * _PIXEL_PITCH_MM, optics.rows * _PIXEL_PITCH_MM)
+        sensor_mm = (self._columns * _PIXEL_PITCH_MM, self._rows * _PIXEL_PITCH_MM)
         return dialect.MAVLink_camera_information_message(
             self._boot_ms, list(b"mavfi".ljust(32, b"\0")), list(b"depth8".ljust(32, b"\0")), 1,
-            optics.focal_px * _PIXEL_PITCH_MM, *sensor_mm, optics.columns, optics.rows, 0,
+            self._focal_px * _PIXEL_PITCH_MM, *sensor_mm, self._columns, self._rows, 0,
             dialect.CAMERA_CAP_FLAGS_CAPTURE_IMAGE, 0, b"",
         )  # fmt: skip
 
@@ -269,8 +273,8 @@ class Camera:
         position_enu_m, quaternion_flu_enu = self._pose
         return dialect.MAVLink_camera_fov_status_message(
             self._boot_ms, *self._geodetic_e7_mm(position_enu_m), _UNKNOWN, _UNKNOWN, _UNKNOWN,
-            flu_enu_from_frd_ned(quaternion_flu_enu).tolist(), math.degrees(self.optics.hfov_rad),
-            math.degrees(self.optics.vfov_rad),
+            flu_enu_from_frd_ned(quaternion_flu_enu).tolist(), math.degrees(self._hfov_rad),
+            math.degrees(2.0 * math.atan(self._rows / 2.0 / self._focal_px)),
         )  # fmt: skip
 
     @property

@@ -18,16 +18,12 @@ only these are tested, so the cost of a frame depends on the visible boxes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.compiled import compiled
-from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.frames import Vector, rotation_matrix
-
-MAX_SIDE_PX = 2048
 
 LEVELS_PER_M = 10.0
 NOTHING = 255
@@ -39,37 +35,6 @@ _INFINITY = math.inf
 _EDGES = np.array(
     [[a, a | bit] for bit in (1, 2, 4) for a in range(8) if not a & bit], dtype=np.int64
 )  # (12, 2) pairs of corners that share an edge; bit 0 is x, 1 is y, 2 is z
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Optics:
-    """A pinhole camera with square pixels that looks forward.
-
-    Raises:
-        ConfigError: The image size or field of view is invalid.
-    """
-
-    columns: int = 64
-    rows: int = 48
-    hfov_rad: float = math.pi / 2.0
-    mount_offset_flu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.columns <= MAX_SIDE_PX and 1 <= self.rows <= MAX_SIDE_PX):
-            size = f"{self.columns}x{self.rows}"
-            raise ConfigError(f"camera size {size}: each side must be 1 to {MAX_SIDE_PX} pixels")
-        if not 0.01 <= self.hfov_rad <= 3.1:
-            raise ConfigError(f"camera field of view {self.hfov_rad:g} rad: must be 0.01 to 3.1")
-
-    @property
-    def focal_px(self) -> float:
-        """Focal length, pixels."""
-        return self.columns / 2.0 / math.tan(self.hfov_rad / 2.0)
-
-    @property
-    def vfov_rad(self) -> float:
-        """Vertical field of view, rad."""
-        return 2.0 * math.atan(self.rows / 2.0 / self.focal_px)
 
 
 Image = NDArray[np.uint8]

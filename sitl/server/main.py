@@ -288,7 +288,7 @@ def _write_briefing(simulation: Simulation, folder: Path) -> None:
         "start_enu_m": world.start_enu_m.tolist(),
         "goal_enu_m": world.goal_enu_m.tolist(),
         "bounds_enu_m": world.bounds_enu_m.tolist(),
-        "camera_offset_flu_m": [float(c) for c in simulation.camera.optics.mount_offset_flu_m],
+        "camera_offset_flu_m": simulation.camera.mount_offset_flu_m.tolist(),
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
