@@ -88,7 +88,7 @@ class Autopilot:
         """Return all due messages of a link at the newest stamp: answers, then streams."""
         for _ in range(min(_PARAMETERS_A_TICK, len(link.parameters_left))):
             link.send(self.parameters.message(link.parameters_left.popleft()))
-        due = link.streams.due(self.snapshot.stamp_us, self.snapshot)
+        due = link.due(self.snapshot.stamp_us, self.snapshot)
         if not link.outbox:
             return due
         messages, link.outbox = link.outbox, []
@@ -217,7 +217,7 @@ class Autopilot:
             dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
         ):
             for link in self._links:
-                link.streams.hasten(number, self.snapshot.stamp_us)
+                link.hasten(number, self.snapshot.stamp_us)
 
     def _flush_texts(self) -> None:
         texts = self.commander.texts

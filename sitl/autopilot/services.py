@@ -201,7 +201,7 @@ def _set_interval(autopilot: Autopilot, command: _Command, link: Link) -> Result
     number = _whole(command.p1)
     if number is None or not math.isfinite(command.p2):
         return Result.FAILED
-    known = link.streams.set_interval(number, command.p2, autopilot.snapshot.stamp_us)
+    known = link.set_interval(number, command.p2, autopilot.snapshot.stamp_us)
     return Result.ACCEPTED if known else Result.FAILED
 
 
@@ -209,7 +209,7 @@ def _get_interval(_autopilot: Autopilot, command: _Command, link: Link) -> Resul
     number = _whole(command.p1)
     if number is None or not 0 <= number <= 0xFFFF:
         return Result.FAILED
-    interval = link.streams.interval_us(number)
+    interval = link.interval_us(number)
     wire = 0 if interval is None else (interval or -1)  # 0: unavailable, -1: not streamed
     link.send(dialect.MAVLink_message_interval_message(number, int32(wire)))
     return Result.ACCEPTED

@@ -64,20 +64,30 @@ class _Stream:
         self.due_us = 0
 
 
-class _Streams:
-    """The streams of one link.
+class Link:
+    """The autopilot's end of one connection, without a socket, and its telemetry streams.
 
     Args:
         preset: Default rates of the client.
+
+    Attributes:
+        outbox: Pending messages, oldest first.
+        parameters_left: Indices of parameters still to be listed.
     """
 
     def __init__(self, preset: Preset) -> None:
+        self.outbox: list[Any] = []
+        self.parameters_left: deque[int] = deque()
         self._rates_hz = _RATES_HZ[preset]
         self._streams = {
             number: _Stream(build, self._default_us(number)) for number, build in BUILDERS.items()
         }
         self._active: tuple[_Stream, ...] = ()
         self._choose_active()
+
+    def send(self, message: Any) -> None:
+        """Queue a message for this client."""
+        self.outbox.append(message)
 
     def interval_us(self, message_id: int) -> int | None:
         """Return the interval of a message; 0 if it is not streamed, None if unknown."""
@@ -123,24 +133,3 @@ class _Streams:
 
     def _choose_active(self) -> None:
         self._active = tuple(s for s in self._streams.values() if s.interval_us)
-
-
-class Link:
-    """The autopilot's end of one connection, without a socket.
-
-    Attributes:
-        streams: Telemetry streams of this client.
-        outbox: Pending messages, oldest first.
-        parameters_left: Indices of parameters still to be listed.
-    """
-
-    __slots__ = ("outbox", "parameters_left", "streams")
-
-    def __init__(self, preset: Preset) -> None:
-        self.streams = _Streams(preset)
-        self.outbox: list[Any] = []
-        self.parameters_left: deque[int] = deque()
-
-    def send(self, message: Any) -> None:
-        """Queue a message for this client."""
-        self.outbox.append(message)

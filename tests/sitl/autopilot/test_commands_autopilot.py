@@ -94,8 +94,8 @@ def test_interval_of_the_unknown_fails(bench):
 def test_rates_belong_to_one_client(bench):
     other = bench.autopilot.open_link(Preset.LOCKSTEP)
     bench.command(SET, 30, 100_000)
-    assert bench.link.streams.interval_us(30) == 100_000
-    assert other.streams.interval_us(30) == 0
+    assert bench.link.interval_us(30) == 100_000
+    assert other.interval_us(30) == 0
 
 
 def test_answers_go_to_who_asked_and_texts_to_all(bench):

@@ -96,7 +96,7 @@ def offboard(flying, velocity_target):
 
 
 def test_offboard_velocity_is_flown_and_echoed(offboard, velocity_target):
-    streams = offboard.link.streams
+    streams = offboard.link
     streams.set_interval(dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED, 1e5, offboard.stamp_us)
     offboard.run(2.0, lambda: velocity_target(2.0, -1.0, 0.0, 0.7))
     assert offboard.vehicle.velocity_ned_mps == pytest.approx([2.0, -1.0, 0.0], abs=0.01)

@@ -53,7 +53,7 @@ def test_every_message_can_be_built_and_sent(make_bench):
     bench.vehicle.battery_voltage_v = 1e6
     bench.vehicle.battery_current_a = math.nan
     for number in BUILDERS:
-        bench.link.streams.set_interval(number, 20_000, 0)
+        bench.link.set_interval(number, 20_000, 0)
     for stamp_us in (1_000_000, 10_000_000, 5_000_000_000_000):
         bench.stamp_us = stamp_us
         bench.tick()
