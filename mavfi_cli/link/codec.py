@@ -103,19 +103,17 @@ class Signing:
         block = bytes([self._link_id]) + timestamp.to_bytes(6, "little")
         return block + self._digest(frame + block)
 
-    def accept_plain(self, message_id: int) -> bool:
-        """Return True if a frame without signature is accepted."""
-        return self._accept_unsigned or message_id == _RADIO_STATUS
-
-    def accept(self, frame: bytes, system: int, component: int) -> bool:
-        """Return True if a signed frame is authentic and not a replay.
+    def accept(self, frame: bytes, header: int, message_id: int, *, signed: bool) -> bool:
+        """Return True if a frame is authentic and not a replay, or may be unsigned.
 
         Only authentic frames update the timestamps, so an attacker cannot block a stream.
         """
+        if not signed:
+            return self._accept_unsigned or message_id == _RADIO_STATUS
         if not hmac.compare_digest(self._digest(frame[:-6]), frame[-6:]):
             return False
         timestamp = int.from_bytes(frame[-12:-6], "little")
-        stream = (frame[-13], system, component)
+        stream = (frame[-13], frame[header - 5], frame[header - 4])  # link, system, component
         newest = self._streams.get(stream)
         if newest is None:
             if timestamp + NEW_STREAM_SLACK < max(self._now(), self._next_timestamp):
@@ -346,7 +344,7 @@ class Codec:
             return True
         if _crc(frame[1:crc_at] + kind.crc_extra) != crc:
             return False
-        if self._signing is not None and not self._genuine(frame, header, number, signed):
+        if self._signing and not self._signing.accept(frame, header, number, signed=signed):
             self.refused += 1
             return True
         message = _build(kind, frame, header, crc)
@@ -355,12 +353,6 @@ class Codec:
             message._link_id = frame[-SIGNATURE_LENGTH]
         messages.append(message)
         return True
-
-    def _genuine(self, frame: bytes, header: int, number: int, signed: bool) -> bool:
-        assert self._signing is not None
-        if not signed:
-            return self._signing.accept_plain(number)
-        return self._signing.accept(frame, frame[header - 5], frame[header - 4])
 
 
 def _frame_length(buffer: bytes, position: int, end: int) -> int:
