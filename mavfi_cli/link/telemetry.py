@@ -100,11 +100,6 @@ ARDUCOPTER = AutopilotProfile(
 )
 
 
-def _autopilot_of(mav_autopilot: int) -> AutopilotProfile:
-    """Return the entry for a HEARTBEAT.autopilot. An unknown autopilot is treated as PX4."""
-    return ARDUCOPTER if mav_autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA else PX4
-
-
 _REORDERED_MS = 1000  # older by less: a late packet; older by more: a restarted clock
 
 
@@ -242,9 +237,11 @@ class Telemetry:
         return True
 
     def _adopt(self, message: Message) -> None:
+        """Follow the sender of a HEARTBEAT. An unknown autopilot is treated as PX4."""
         if message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
             self.system = message.get_srcSystem()
-            self.autopilot = _autopilot_of(message.autopilot)
+            ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+            self.autopilot = ARDUCOPTER if ardupilot else PX4
 
     def _heartbeat(self, message: Message) -> None:
         self.heartbeat_s = self.now_s

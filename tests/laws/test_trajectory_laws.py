@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavfi_cli.autonomy import collision, tracking
+from mavfi_cli.autonomy import collision, grid, tracking
 from mavfi_cli.autonomy.collision import CollisionParams
-from mavfi_cli.autonomy.occupancy import snapshot_of
+from mavfi_cli.autonomy.occupancy import empty_snapshot, snapshot_of
 from mavfi_cli.autonomy.pilot import Departure
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingParams, TrackingState
@@ -16,6 +16,7 @@ from mavfi_cli.autonomy.trajectory import reference_waypoint, without_waypoint
 from mavfi_cli.core.types import Trajectory
 
 PARAMS = SmoothingParams()
+OPEN = grid.build(empty_snapshot(), np.repeat([-math.inf, math.inf], 3), 0.5)
 
 coordinate = st.floats(-40.0, 40.0, allow_nan=False)
 points = st.tuples(coordinate, coordinate, st.floats(0.0, 12.0))
@@ -66,7 +67,7 @@ def assert_flyable(trajectory, start, end, departure, end_atol=1e-9):
 @settings(max_examples=150, deadline=None)
 @given(paths, departures())
 def test_any_path_is_flown_within_the_limits(path, departure):
-    made = smooth(path, None, departure, PARAMS)
+    made = smooth(path, OPEN, departure, PARAMS)
     last_leg_m = np.linalg.norm(path[-1] - path[-2])
     end_atol = 1e-9 if last_leg_m > ONE_VERTEX_M else ONE_VERTEX_M
     assert_flyable(made.trajectory, path[0], path[-1], departure, end_atol)
@@ -75,7 +76,7 @@ def test_any_path_is_flown_within_the_limits(path, departure):
 def flown_trajectory():
     path = np.array([[0.0, 0, 5], [10, 0, 5], [14, 9, 6]])
     departure = Departure(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0, trajectory_seq=1)
-    return smooth(path, None, departure, PARAMS).trajectory
+    return smooth(path, OPEN, departure, PARAMS).trajectory
 
 
 def flip(array, flips):

@@ -66,12 +66,6 @@ class Planner(Protocol):
         """
 
 
-def _failure(problem: PlanningProblem, reason: str) -> PlanResult:
-    """Return a failure without a search."""
-    gap_m = math.dist(problem.goal_enu_m, problem.start_enu_m)
-    return PlanResult(found=False, path_enu_m=np.empty((0, 3)), reason=reason, nearest_m=gap_m)
-
-
 def pose_problem(
     snapshot: MapSnapshot,
     start_enu_m: FloatArray,
@@ -114,8 +108,11 @@ def _escape(
 
 def refuse(problem: PlanningProblem) -> PlanResult | None:
     """Return a failure if start or goal is blocked, else None."""
-    if not problem.grid.point_free(problem.start_enu_m):
-        return _failure(problem, "start blocked")
-    if not problem.grid.point_free(problem.goal_enu_m):
-        return _failure(problem, "goal blocked")
+    start, goal = problem.start_enu_m, problem.goal_enu_m
+    for place, reason in ((start, "start blocked"), (goal, "goal blocked")):
+        if not problem.grid.point_free(place):
+            return PlanResult(
+                found=False, path_enu_m=np.empty((0, 3)), reason=reason,
+                nearest_m=math.dist(goal, start),
+            )  # fmt: skip
     return None
