@@ -21,7 +21,7 @@ from mavfi_cli.link.texts import TextCollector
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AutopilotProfile:
+class _AutopilotProfile:
     """Modes and command conventions of one autopilot."""
 
     name: str
@@ -52,7 +52,7 @@ def _px4(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
-PX4 = AutopilotProfile(
+PX4 = _AutopilotProfile(
     name="PX4",
     modes={
         "MANUAL": _px4(1),
@@ -76,7 +76,7 @@ PX4 = AutopilotProfile(
     early_setpoints=True,
 )
 
-ARDUCOPTER = AutopilotProfile(
+ARDUCOPTER = _AutopilotProfile(
     name="ArduCopter",
     modes={
         "STABILIZE": 0,
@@ -193,7 +193,7 @@ class Telemetry:
     def __init__(self) -> None:
         self.now_s = 0.0
         self.system = 0
-        self.autopilot: AutopilotProfile = PX4
+        self.autopilot: _AutopilotProfile = PX4
         self.state: VehicleState | None = None
         self.armed = False
         self.mode = ""

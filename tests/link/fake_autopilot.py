@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 from mavfi_cli.link.codec import Codec, Message, dialect
-from mavfi_cli.link.telemetry import ARDUCOPTER, PX4, AutopilotProfile
+from mavfi_cli.link.telemetry import ARDUCOPTER, PX4
 
 DT_S = 0.02
 HOME_AMSL_M = 488.0
@@ -22,7 +22,7 @@ _GROUND, _AIR, _TAKEOFF, _LANDING = 1, 2, 3, 4
 class FakeAutopilot(ABC):
     """What both have in common; a subclass answers commands its own way."""
 
-    autopilot: AutopilotProfile
+    autopilot = PX4
     mav_autopilot: int
     streams_unasked: bool
 

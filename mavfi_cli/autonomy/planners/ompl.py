@@ -36,7 +36,7 @@ class _Search:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OmplPlanner:
+class _OmplPlanner:
     """One of OMPL's planners. It searches again, as the next search says, while there is no path.
 
     A straight line from start to goal is the path if it is free.
@@ -153,7 +153,7 @@ OMPL_PLANNERS = (
     # After the first solution, RRT* samples only states that could shorten the path (Gammell et al.
     # 2014). 300 iterations with this restriction give shorter paths than 500 without, at half the
     # cost. Only hard maps incur the cost of the second search.
-    OmplPlanner(
+    _OmplPlanner(
         name="rrtstar",
         kind=og.RRTstar,
         settings={**_GOAL_BIAS, "setRewireFactor": 1.1, "setInformedSampling": True},
@@ -162,6 +162,6 @@ OMPL_PLANNERS = (
             _Search(iterations=2000, range_m=5.0),
         ),
     ),
-    OmplPlanner(name="rrt", kind=og.RRT, settings=_GOAL_BIAS, searches=(_FIRST_SOLUTION,)),
-    OmplPlanner(name="rrtconnect", kind=og.RRTConnect, settings={}, searches=(_FIRST_SOLUTION,)),
+    _OmplPlanner(name="rrt", kind=og.RRT, settings=_GOAL_BIAS, searches=(_FIRST_SOLUTION,)),
+    _OmplPlanner(name="rrtconnect", kind=og.RRTConnect, settings={}, searches=(_FIRST_SOLUTION,)),
 )
