@@ -87,7 +87,7 @@ COMMANDS = {
     "plan": ("6aa389c6388b46f8", ["campaign", "plan", "fig7", "--json"]),
     # Its inputs_sha256 is of a pickle that names our modules: renewed when those moved to attack/.
     # Renewed when operands became the bits that are read or written.
-    # One crash is of a corrupted pointer: its signal or exception moves with the code that is loaded.
+    # One crash is of a corrupted pointer: its kind moves with the code that is loaded.
     "kernels": ("033f0b327bb7bab4", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
     "compare": (
         "eac34e35e3c1cd54",
