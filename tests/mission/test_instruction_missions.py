@@ -18,6 +18,7 @@ from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, Unk
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
+from mavfi_cli.fi.tracer.sampling import Rule
 from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction.server import PROGRAM, Setup
 from mavfi_cli.mission.progress import Watcher
@@ -183,6 +184,9 @@ def test_the_habits_of_another_injector_keep_a_moment_that_repeats():
     config = InstructionConfig(target="control", compat="rosfi-2021")
     assert config.strategy().imitates is not None
     assert config.sampling_name().startswith("instruction-uniform with")
+    pinfi = InstructionConfig(target="control", compat="pinfi")
+    assert pinfi.strategy().rule is Rule.INSTRUCTION
+    assert pinfi.sampling_name() == "instruction-uniform with the operands and bits of pinfi"
 
 
 @pytest.fixture

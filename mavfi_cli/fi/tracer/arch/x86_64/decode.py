@@ -13,10 +13,10 @@ import capstone
 from capstone import x86
 
 from mavfi_cli.fi.tracer.arch.interface import Instruction, MemoryUse
+from mavfi_cli.fi.tracer.arch.x86_64.jumps import branches
 from mavfi_cli.fi.tracer.arch.x86_64.operands import Operands, general_part, operands_of
 
 _FULL = (1 << 64) - 1
-_BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
 
 _engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
 _engine.detail = True
@@ -43,7 +43,7 @@ def _decode(code: bytes, address: int) -> Instruction | None:
         memory=(*_memory(found, operands), *_stack(found)),
         element=_element(found.mnemonic),
         scalar=found.mnemonic.endswith(("sd", "ss")),
-        branches=bool(_BRANCHES.intersection(found.groups)),
+        branches=branches(found),
         run_over=_run_over(found.mnemonic),
     )
 

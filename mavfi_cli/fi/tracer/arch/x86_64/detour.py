@@ -17,6 +17,7 @@ import capstone
 from capstone import x86
 
 from mavfi_cli.fi.tracer.arch.interface import Flow
+from mavfi_cli.fi.tracer.arch.x86_64.jumps import branches
 from mavfi_cli.fi.tracer.arch.x86_64.registers import TRAITS, Registers
 
 _PAGE = 4096
@@ -43,8 +44,7 @@ def flow(code: bytes, address: int) -> Flow | None:
     found = next(_engine.disasm(code[:16], address, 1), None)
     if found is None:
         return None
-    leaves = any(found.group(each) for each in (x86.X86_GRP_JUMP, x86.X86_GRP_CALL,
-                                                x86.X86_GRP_RET, x86.X86_GRP_IRET))  # fmt: skip
+    leaves = branches(found)
     return Flow(
         size=found.size,
         straight=not leaves and found.mnemonic not in _FIXED,

@@ -1,13 +1,24 @@
-"""The flags whose flip inverts a conditional jump (Intel SDM volume 2, Jcc)."""
+"""Which instructions branch, and the flags whose flip inverts a conditional jump."""
 
 from __future__ import annotations
 
+from typing import Any
+
+from capstone import x86
+
+_BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
+# Intel SDM volume 2, Jcc.
 _CF, _PF, _ZF, _SF, _OF = 0, 2, 6, 7, 11
 JUMP_FLAGS = {
     "jo": (_OF,), "jno": (_OF,), "js": (_SF,), "jns": (_SF,), "jp": (_PF,), "jnp": (_PF,),
     "je": (_ZF,), "jne": (_ZF,), "jb": (_CF,), "jae": (_CF,), "jl": (_SF,), "jge": (_SF,),
     "jbe": (_CF, _ZF), "ja": (_CF, _ZF), "jle": (_ZF, _SF), "jg": (_ZF, _SF),
 }  # fmt: skip
+
+
+def branches(found: Any) -> bool:
+    """True for a jump, a call or a return, as capstone decodes it."""
+    return bool(_BRANCHES.intersection(found.groups))
 
 
 def inverting_bits(jump: str, flags: int) -> tuple[int, ...]:
