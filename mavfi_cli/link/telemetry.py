@@ -159,7 +159,7 @@ def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> Vehic
     )
 
 
-HEARTBEAT_LOSS_S = 3.0
+HEARTBEAT_LOSS_S = 5.0  # 4 to 5 missing ones (mavlink.io/en/services/heartbeat.html)
 _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 
@@ -215,7 +215,7 @@ class Telemetry:
 
     @property
     def link_lost(self) -> bool:
-        """True if no HEARTBEAT of a known autopilot has arrived for three seconds."""
+        """True if no HEARTBEAT of a known autopilot has arrived for `HEARTBEAT_LOSS_S`."""
         return self.heard and self.now_s - self.heartbeat_s >= HEARTBEAT_LOSS_S
 
     @property

@@ -26,7 +26,7 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
-from mavfi_cli.link.telemetry import Telemetry
+from mavfi_cli.link.telemetry import HEARTBEAT_LOSS_S, Telemetry
 from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission.briefing import require_flyable
@@ -358,7 +358,7 @@ class Flight:
         elif session.failsafe_text is not None:
             self.end(Outcome.FAILSAFE, session.failsafe_text)
         elif session.telemetry.link_lost:
-            self.end(Outcome.LINK_LOST, "no heartbeat for 3 s")
+            self.end(Outcome.LINK_LOST, f"no heartbeat for {HEARTBEAT_LOSS_S:g} s")
         elif companion is not None and companion.mode is PilotMode.ARRIVED:
             self.end(Outcome.SUCCESS)
         elif companion is not None and companion.mode is PilotMode.GAVE_UP:

@@ -141,7 +141,7 @@ def test_states_that_stop_while_the_rest_goes_on_are_a_lost_link(
 def test_heartbeats_that_stop_are_a_lost_link(autopilot_on_udp, fly_short, at_event):
     link, url = autopilot_on_udp(FakePX4())
     result = load_run(fly_short(at_event("offboard", cut(link, "HEARTBEAT")), link=url).path).result
-    assert (result["outcome"], result["reason"]) == ("link_lost", "no heartbeat for 3 s")
+    assert (result["outcome"], result["reason"]) == ("link_lost", "no heartbeat for 5 s")
 
 
 def test_an_autopilot_that_talks_much_but_tells_no_position_is_not_waited_for_for_ever(
