@@ -4,9 +4,10 @@ It exists to check the injector, and shares no code with it. The emulator execut
 `ENVIRONMENT` makes the C library choose its SSE variants. Both injectors need the same environment,
 so that the addresses of a run are the same.
 
-What the emulator would let pass is caught once a fault has struck: a vector operand that must be
-aligned and is not, and an address that no process has, which it would truncate. The stack may grow
-to its limit, as it may natively.
+The emulator would let two kinds of wrong accesses pass, which a processor does not: addresses that
+no process has (it drops their highest bits), and a vector operand that must be aligned and is not.
+The first are refused when a page is first used, the second in the program's own code. The stack may
+grow to its limit, as it may natively.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import signal
 import struct
 import subprocess
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -37,7 +37,7 @@ ENVIRONMENT = {
 PAGE = 4096
 STACK_BYTES = 8 << 20
 LARGEST_BYTES = 1 << 30  # of one request for memory
-NOWHERE = 0xFFFF_FFFF_FFFF_F000  # where no run ends
+NOWHERE = 0x8000  # where no run ends: nothing is mapped there
 VECTORS = 16
 GENERAL = tuple("r15 r14 r13 r12 rbp rbx r11 r10 r9 r8 rax rcx rdx rsi rdi".split())  # noqa: SIM905
 UNREADABLE = ("[vvar]", "[vvar_vclock]", "[vsyscall]")
@@ -69,6 +69,7 @@ class Snapshot:
         vectors: xmm0 to xmm15.
         bias: what is added to an address of the file.
         heap: end of the heap.
+        aligned: operands that must be aligned, by address of the file.
     """
 
     program: Path
@@ -78,62 +79,57 @@ class Snapshot:
     bias: int
     heap: int
     mappings: tuple[Mapping, ...]
-
-    @cached_property
-    def aligned(self) -> np.ndarray:
-        """(2^18,) a bit for each of the lowest 24 bits of an address of an aligned access."""
-        bits = np.zeros(1 << 18, np.int64)
-        firsts: dict[str, int] = {}
-        for mapping in self.mappings:
-            firsts.setdefault(mapping.name, mapping.start)
-        for name, start in firsts.items():
-            if not name.startswith("/"):
-                continue
-            base = start if _relocated(Path(name)) else 0
-            for address in aligned_accesses(Path(name)):
-                place = (base + address) & 0xFFFFFF
-                bits[place >> 6] |= np.int64(np.uint64(1 << (place & 63)).astype(np.int64))
-        return bits
-
-
-def _relocated(path: Path) -> bool:
-    with path.open("rb") as file:
-        return ELFFile(file).header["e_type"] == "ET_DYN"
+    aligned: dict[int, Access]
 
 
 _UNALIGNED = re.compile(
-    r"\s(?:mov(?:[uhl]p[sd]|dqu|[qd]|s[sd]|ddup|nti)|lddqu|\w+s[sd]|u?comis[sd]|cvt\w+"
-    r"|pinsr\w|pextr\w|pmov[sz]x\w+|v\w+)\s"
+    r"mov(?:[uhl]p[sd]|dqu|[qd]|s[sd]|ddup)|lddqu|\w+s[sd]|u?comis[sd]|cvt\w+|pinsr\w|pextr\w"
+    r"|pmov[sz]x\w+|v\w+"
 )
+_ACCESS = re.compile(r"\s*([0-9a-f]+):\s+(\w+)\s.*?(-?0x[0-9a-f]+)?\(%(\w+)(?:,%(\w+),(\d))?\).*")
 
 
-def aligned_accesses(path: Path) -> list[int]:
-    """Addresses of a file's instructions whose vector operand in memory must be aligned."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Access:
+    """An operand in memory: `base + index * scale + offset`."""
+
+    base: str
+    index: str  # empty for none
+    scale: int
+    offset: int
+
+
+def aligned_accesses(program: Path) -> dict[int, Access]:
+    """The vector operands in memory that must be aligned, by address of the instruction."""
     listing = subprocess.run(
-        ["objdump", "-d", "--no-show-raw-insn", str(path)], capture_output=True, text=True,
+        ["objdump", "-d", "--no-show-raw-insn", str(program)], capture_output=True, text=True,
         check=True,
     )  # fmt: skip
-    return [
-        int(line.split(":")[0], 16)
-        for line in listing.stdout.splitlines()
-        if "%xmm" in line and "(" in line and not _UNALIGNED.search(line)
-    ]
+    found = {}
+    for line in listing.stdout.splitlines():
+        match = _ACCESS.fullmatch(line.partition("#")[0])
+        if match is None or "%xmm" not in line or _UNALIGNED.fullmatch(match[2]):
+            continue
+        address, _, offset, base, index, scale = match.groups()
+        if base != "rip":  # such an operand cannot be wrong
+            found[int(address, 16)] = Access(
+                base=base, index=index or "", scale=int(scale or 1), offset=int(offset or "0", 16)
+            )
+    return found
 
 
-def take_snapshot(program: Path, directory: Path) -> Snapshot:
-    """Start a program in a folder and copy it in front of `main`."""
+def take_snapshot(program: Path) -> Snapshot:
+    """Start a program and copy it in front of `main`."""
     with program.open("rb") as file:
         elf = ELFFile(file)
         main = elf.get_section_by_name(".symtab").get_symbol_by_name("main")[0]["st_value"]
     process = subprocess.Popen(
-        ["sh", "-c", 'cd -- "$1" && exec "$2"', "sh", str(directory), str(program)],
-        env=ENVIRONMENT, preexec_fn=_begin, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        [str(program)], env=ENVIRONMENT, preexec_fn=_begin, stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
     )  # fmt: skip
     pid = process.pid
     try:
         os.waitpid(pid, 0)
-        while os.readlink(f"/proc/{pid}/exe") != str(program):
-            _go_on(pid)
         bias = next(m.start for m in _mappings(pid, None) if m.name == str(program))
         with open(f"/proc/{pid}/mem", "r+b", buffering=0) as memory:
             kept = os.pread(memory.fileno(), 1, bias + main)
@@ -177,6 +173,7 @@ def _copy(pid: int, memory: BinaryIO, program: Path, bias: int, main: int) -> Sn
     mappings = tuple(_mappings(pid, memory))
     return Snapshot(
         program=program, registers=registers, bias=bias, mappings=mappings,
+        aligned=aligned_accesses(program),
         vectors=tuple(
             int.from_bytes(area.raw[160 + 16 * i : 176 + 16 * i], "little") for i in range(VECTORS)
         ),
@@ -204,48 +201,32 @@ def _mappings(pid: int, memory: BinaryIO | None) -> list[Mapping]:
     return found
 
 
-# The state that the hooks share with us: words in front of the bits of aligned accesses.
-LEFT, NEXT_ALIGNED, WRONG, FIRST_BIT = 0, 1, 2, 4
-WORDS = FIRST_BIT + (1 << 18)
 _stop = uclib.uc_emu_stop
+_CODE = types.void(types.voidptr, types.uint64, types.uint32, types.voidptr)
+_PAGE = types.boolean(
+    types.voidptr, types.uint64, types.int32, types.CPointer(types.uint64), types.voidptr
+)
 
 
-@cfunc(types.void(types.voidptr, types.uint64, types.uint32, types.voidptr))
+@cfunc(_CODE)
 def _count_down(engine, _address, _size, data):  # type: ignore[no-untyped-def]
-    state = carray(data, (WORDS,), np.int64)
-    state[LEFT] -= 1
-    if state[LEFT] == 0:
+    left = carray(data, (1,), np.int64)
+    left[0] -= 1
+    if left[0] == 0:
         _stop(engine)
 
 
-@cfunc(types.void(types.voidptr, types.uint64, types.uint32, types.voidptr))
+@cfunc(_CODE)
 def _count_each(_engine, address, _size, data):  # type: ignore[no-untyped-def]
     counts = carray(data, (1 << 40,), np.int64)
     counts[np.int64(address) - counts[0]] += 1
 
 
-@cfunc(types.void(types.voidptr, types.uint64, types.uint32, types.voidptr))
-def _watch_instruction(engine, address, _size, data):  # type: ignore[no-untyped-def]
-    state = carray(data, (WORDS,), np.int64)
-    state[LEFT] -= 1
-    if address >> np.uint64(47) != 0:
-        state[WRONG] = 1
-        _stop(engine)
-    if state[LEFT] == 0:
-        _stop(engine)
-    place = np.int64(address) & 0xFFFFFF
-    state[NEXT_ALIGNED] = (state[FIRST_BIT + (place >> 6)] >> (place & 63)) & 1
-
-
-@cfunc(
-    types.void(types.voidptr, types.int32, types.uint64, types.int32, types.int64, types.voidptr)
-)
-def _watch_memory(engine, _kind, address, _size, _value, data):  # type: ignore[no-untyped-def]
-    state = carray(data, (WORDS,), np.int64)
-    if address >> np.uint64(47) != 0 or (state[NEXT_ALIGNED] != 0 and address & np.uint64(15)):
-        state[WRONG] = 1
-        _stop(engine)
-    state[NEXT_ALIGNED] = 0
+@cfunc(_PAGE)
+def _enter_page(_engine, address, _access, entry, _data):  # type: ignore[no-untyped-def]
+    place = carray(entry, (2,), np.uint64)
+    place[0], place[1] = address, 7
+    return address >> np.uint64(47) == 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,7 +237,7 @@ class End:
     reason: str  # empty if it left by itself
     hangs: bool
     output: bytes
-    instructions: int
+    blocks: int  # basic blocks that it has executed
 
 
 class Emulation:
@@ -270,10 +251,12 @@ class Emulation:
         self._killed = ""
         self._heap = snapshot.heap
         self._lowest = min(m.start for m in snapshot.mappings if m.start >> 44 == 7)
-        self._state = np.zeros(WORDS, np.int64)
+        self._left = np.zeros(1, np.int64)
         self._load()
 
     def _load(self) -> None:
+        self.engine.ctl_set_tlb_mode(unicorn.UC_TLB_VIRTUAL)
+        self._hook(unicorn.UC_HOOK_TLB_FILL, _enter_page)
         for mapping in self.snapshot.mappings:
             self.engine.mem_map(mapping.start, mapping.end - mapping.start, mapping.rights)
             self.engine.mem_write(mapping.start, mapping.data)
@@ -292,11 +275,14 @@ class Emulation:
     def __setitem__(self, register: str, value: int) -> None:
         self.engine.reg_write(getattr(x86, f"UC_X86_REG_{register.upper()}"), value)
 
-    def _hook(self, kinds: int, function: Any, data: np.ndarray, first: int, last: int) -> Any:
+    def _hook(
+        self, kind: int, function: Any, data: Any = None, first: int = 1, last: int = 0
+    ) -> Any:
         handle = ctypes.c_size_t()
         status = uclib.uc_hook_add(
-            self.engine._uch, ctypes.byref(handle), kinds,
-            ctypes.c_void_p(function.address), ctypes.c_void_p(data.ctypes.data),
+            self.engine._uch, ctypes.byref(handle), kind,
+            ctypes.c_void_p(function.address),
+            ctypes.c_void_p(None if data is None else data.ctypes.data),
             ctypes.c_uint64(first), ctypes.c_uint64(last),
         )  # fmt: skip
         if status != unicorn.UC_ERR_OK:
@@ -324,8 +310,8 @@ class Emulation:
 
     def run_to(self, address: int, k: int) -> bool:
         """Run until an instruction is about to execute for the k-th time; False if it never is."""
-        self._state[LEFT] = k
-        handle = self._hook(unicorn.UC_HOOK_CODE, _count_down, self._state, address, address)
+        self._left[0] = k
+        handle = self._hook(unicorn.UC_HOOK_CODE, _count_down, self._left, address, address)
         self._go()
         uclib.uc_hook_del(self.engine._uch, handle)
         if self.over:
@@ -341,23 +327,29 @@ class Emulation:
         while self["rip"] == before and not self.over:
             self._go(1)
 
-    def finish(self, budget: int) -> End:
-        """Run to the end, at most `budget` instructions, with the watch for wrong addresses."""
-        self._state[:FIRST_BIT] = budget, 0, 0, 0
-        self._state[FIRST_BIT:] = self.snapshot.aligned
-        self._hook(unicorn.UC_HOOK_CODE, _watch_instruction, self._state, 1, 0)
-        accesses = unicorn.UC_HOOK_MEM_READ | unicorn.UC_HOOK_MEM_WRITE
-        self._hook(accesses, _watch_memory, self._state, 1, 0)
+    def finish(self, blocks: int) -> End:
+        """Run to the end, at most that many basic blocks."""
+        self._left[0] = blocks
+        self._hook(unicorn.UC_HOOK_BLOCK, _count_down, self._left)
+        for address, access in self.snapshot.aligned.items():
+            place = self.snapshot.bias + address
+            self.engine.hook_add(unicorn.UC_HOOK_CODE, self._check, access, place, place)
         self.engine.ctl_flush_tb()
         if not self.over:
             self._go()
-        if self._state[WRONG]:
-            self._killed, self._exit_code = "misaligned or impossible address", None
-        left = int(self._state[LEFT])
+        left = int(self._left[0])
         return End(
-            exit_code=self._exit_code, reason=self._killed, hangs=left <= 0 and not self.over,
-            output=bytes(self._output), instructions=budget - left,
+            exit_code=None if self._killed else self._exit_code, reason=self._killed,
+            hangs=left <= 0 and not self.over, output=bytes(self._output), blocks=blocks - left,
         )  # fmt: skip
+
+    def _check(self, _engine: Any, _address: int, _size: int, access: Access) -> None:
+        place = self[access.base] + access.offset
+        if access.index:
+            place += self[access.index] * access.scale
+        if place % 16:
+            self._killed = "misaligned"
+            self.engine.emu_stop()
 
     def _serve(self, _engine: Any, _data: Any) -> None:
         a, b, c = (self[name] for name in ("rdi", "rsi", "rdx"))

@@ -44,7 +44,7 @@ from mavfi_cli.stats.shares import wilson
 
 SOURCES = Path(__file__).parents[1] / "tests" / "programs"
 OUTCOMES = ("benign", "crash", "hang", "sdc")
-HANG_RATIO = 10  # a run of so many times the golden instructions hangs
+HANG_RATIO = 10  # a run of so many times the golden run's basic blocks hangs
 PATIENCE = 100  # the same, of a recorded fault that did not hang in mavfi
 EXCLUDED = ("_start", "__libc", "__do_global", "frame_dummy", "call_gmon_start", "__stat")
 CARRY, PARITY, ZERO, SIGN, DIRECTION, OVERFLOW = 0, 2, 6, 7, 10, 11
@@ -100,8 +100,8 @@ def full_register(register: str) -> str:
     """The full register of a part of it."""
     if numbered := re.fullmatch(r"(r\d+)[dwb]?", register):
         return numbered[1]
-    if register.startswith("xmm"):
-        return register
+    if vector := re.fullmatch(r"[xyz](mm\d+)", register):
+        return f"x{vector[1]}"
     letters = re.fullmatch(r"[re]?([a-d])[xhl]|[re]?(si|di|bp|sp)l?", register)
     if letters is None:
         raise ValueError(f"unknown register {register}")
@@ -222,7 +222,7 @@ class Bench:
     @classmethod
     def of(cls, program: Path) -> Bench:
         """Run a program once without a fault, and once to count executions."""
-        snapshot, code = take_snapshot(program, program.parent), Code(program)
+        snapshot, code = take_snapshot(program), Code(program)
         golden = Emulation(snapshot).finish(1 << 40)
         if golden.exit_code != 0:
             raise RuntimeError(f"{program.name} ends by itself: {golden}")
@@ -250,7 +250,7 @@ class Bench:
         if not run.run_to(self.snapshot.bias + fault.address, fault.k):
             raise RuntimeError(f"{fault} is never reached")
         before, after = self._flip(run, fault)
-        ended = run.finish(patience * self.golden.instructions)
+        ended = run.finish(patience * self.golden.blocks)
         return Result(
             outcome=self._outcome(ended), output_sha256=hashlib.sha256(ended.output).hexdigest(),
             before=before, after=after, reason=ended.reason,
@@ -300,9 +300,11 @@ def inject(program: Path, out: Path, *, runs: int, jobs: int) -> list[dict[str, 
     """Let mavfi inject faults; its records."""
     command = [
         sys.executable, "-m", "mavfi_cli", "kernels", "--program", str(program),
-        "--compat", "pinfi", "--runs", str(runs), "--jobs", str(jobs), "--out", str(out.resolve()),
+        "--compat", "pinfi", "--runs", str(runs),
+        "--jobs", str(jobs), "--out", str(out.resolve()),
+        *(f"--env={name}={value}" for name, value in ENVIRONMENT.items()),
     ]  # fmt: skip
-    subprocess.run(command, cwd=program.parent, env=ENVIRONMENT, check=True)
+    subprocess.run(command, env={"PATH": ENVIRONMENT["PATH"]}, check=True)
     lines = (out / "runs.jsonl").read_text().splitlines()
     return sorted(map(json.loads, lines), key=lambda record: record["run"])
 
@@ -423,7 +425,7 @@ def compare(
     """Compare both on a program; the rows of its counts."""
     program = build(name, folder)
     work = Work(bench=Bench.of(program), seed=1)
-    print(f"{name}: {work.bench.golden.instructions} instructions from main on")
+    print(f"{name}: {work.bench.executions.sum()} executed instructions that count")
     theirs = in_parallel(work.own, range(emulated), folder / f"{name}-emulator.jsonl", jobs)
     records = inject(program, folder / f"{name}-mavfi", runs=runs, jobs=jobs)
     struck = [record for record in records if record["outcome"] in OUTCOMES]
