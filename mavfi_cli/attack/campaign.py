@@ -278,14 +278,16 @@ def _claim_processor() -> socket.socket:
     """Stay on a processor that no other campaign has claimed; closing the result gives it up.
 
     The claim is a name that one socket on the machine can have, so it ends with its process. If
-    all are claimed, the process is not bound to any.
+    all are claimed, one is shared.
     """
-    claim = socket.socket(socket.AF_UNIX)
-    for processor in sorted(os.sched_getaffinity(0), reverse=True):
+    claim, processors = socket.socket(socket.AF_UNIX), sorted(os.sched_getaffinity(0), reverse=True)
+    chosen = processors[os.getpid() % len(processors)]
+    for processor in processors:
         with contextlib.suppress(OSError):
             claim.bind(f"\0mavfi-processor-{processor}")
-            os.sched_setaffinity(0, [processor])
+            chosen = processor
             break
+    os.sched_setaffinity(0, [chosen])
     return claim
 
 
