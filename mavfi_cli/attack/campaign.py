@@ -9,6 +9,7 @@ open and runs its faults in order.
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import pickle
@@ -263,32 +264,41 @@ _CHUNK = 32  # tasks that are sent at once
 Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn at its moment
 
 
+_claims: list[socket.socket] = []  # of this process
+
+
 @contextmanager
 def one_processor() -> Iterator[None]:
     """Stay on one processor: tracer and target switch all the time, which is fastest there."""
     before = os.sched_getaffinity(0)
-    with contextlib.closing(_claim_processor()):
-        try:
-            yield
-        finally:
-            os.sched_setaffinity(0, before)
+    os.sched_setaffinity(0, [_claimed_processor()])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
-def _claim_processor() -> socket.socket:
-    """Stay on a processor that no other campaign has claimed; closing the result gives it up.
+@functools.lru_cache(maxsize=1)
+def _claimed_processor() -> int:
+    """A processor that no other campaign has claimed; it stays the same, as what is started there.
 
     The claim is a name that one socket on the machine can have, so it ends with its process. If
     all are claimed, one is shared.
     """
     claim, processors = socket.socket(socket.AF_UNIX), sorted(os.sched_getaffinity(0), reverse=True)
-    chosen = processors[os.getpid() % len(processors)]
+    _claims.append(claim)
     for processor in processors:
         with contextlib.suppress(OSError):
             claim.bind(f"\0mavfi-processor-{processor}")
-            chosen = processor
-            break
-    os.sched_setaffinity(0, [chosen])
-    return claim
+            return processor
+    return processors[os.getpid() % len(processors)]
+
+
+def _give_up_processor() -> None:
+    """Leave the claimed processor to others."""
+    while _claims:
+        _claims.pop().close()
+    _claimed_processor.cache_clear()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -348,11 +358,8 @@ def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     return results
 
 
-_claims: list[socket.socket] = []  # of a worker process, for its life
-
-
 def _settle() -> None:
-    _claims.append(_claim_processor())
+    os.sched_setaffinity(0, [_claimed_processor()])
 
 
 class _AttackWorkers:
@@ -372,6 +379,7 @@ class _AttackWorkers:
         _Open.close()
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
+        _give_up_processor()
 
     def take(self, bench: _Bench, place: JudgedPlace) -> None:
         """Keep a place that was opened in this process, or close it if no worker here needs it."""
@@ -379,6 +387,7 @@ class _AttackWorkers:
             _Open.keep(bench, place)
         else:
             place.close()
+            _give_up_processor()
 
     def run(self, bench: _Bench, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
         """The results in the order of the tasks.

@@ -8,7 +8,11 @@ import sys
 
 import pytest
 
-from mavfi_cli.attack.campaign import one_processor
+from mavfi_cli.attack import campaign
+from mavfi_cli.attack.campaign import Plan, one_processor, run_campaign
+from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.program import ProgramTarget
+from mavfi_cli.fi.tracer.spawn import Program
 
 HOLDER = """
 import os, sys
@@ -52,13 +56,16 @@ def is_free(processor):
     return True
 
 
-def test_a_processor_is_claimed_once_and_given_up(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {10**6})  # nobody else has that
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
-    assert is_free(10**6)
+def test_a_campaign_stays_where_it_began_until_it_is_over(native_program):
+    program = ProgramTarget(
+        command=Program.of([str(native_program("counting")), "9"]), comparison=OutputComparison()
+    )
     with one_processor():
-        assert not is_free(10**6)
-        with one_processor():  # shares it
-            assert not is_free(10**6)
-        assert not is_free(10**6)
-    assert is_free(10**6)
+        ours = os.sched_getaffinity(0)
+    with one_processor():
+        assert os.sched_getaffinity(0) == ours
+    with another_campaign() as theirs:
+        assert theirs != ours or not any(map(is_free, os.sched_getaffinity(0)))
+    assert not any(is_free(processor) for processor in ours)
+    run_campaign(Plan(runs=1, seed=1), [program])
+    assert not campaign._claims
