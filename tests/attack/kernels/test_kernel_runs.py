@@ -185,6 +185,29 @@ def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, mon
     assert all(not replay.differs for replay in replay_runs(tmp_path))
 
 
+def test_the_writing_of_the_tree_is_not_attacked_but_the_whole_tree_is_compared(
+    attack, monkeypatch
+):
+    monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
+    plan, (runs,) = attack("octomap", runs=15, windows=3)
+    profile = runs.inputs[2].profile
+    addresses = {
+        int(address)
+        for stratum in profile.strata
+        for segment in stratum.segments
+        for address in segment.trace
+    }
+    symbols = {profile.image.symbol(profile.image.locate(address)) for address in addresses}
+    assert any("computeRayKeys" in symbol for symbol in symbols)
+    assert not any("write" in symbol for symbol in symbols)
+    corrupted = [e["magnitude"] for e in runs.records if e["outcome"] == "sdc"]
+    assert corrupted
+    assert all(size["parts"]["nodes"] > 0 or size["noticeable"] for size in corrupted)
+    (kernel,) = summarise(plan, [runs])["kernels"]
+    assert kernel["sdc_parts"]["nodes"]["runs"] <= len(corrupted)
+    assert kernel["sdc_noticeable"]["count"] <= len(corrupted)
+
+
 def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
     plan, campaign = control_campaign
     summary = summarise(plan, campaign)
