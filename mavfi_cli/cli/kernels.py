@@ -91,6 +91,9 @@ def kernels(**options: Any) -> None:
 
     Outcomes: benign, crash, hang, SDC (silent data corruption), not injected.
     """
+    if options["compat"] is not None:
+        chosen = ("sampling", "site", "role", "field", "bits")
+        refuse_given(chosen, "goes without --compat, which chooses it by its own rule")
     if options["replay"] is not None:
         others = [name for name in options if name not in ("replay", "kernel", "runs")]
         refuse_given(others, "goes without --replay: a record says how it was drawn")
@@ -102,10 +105,7 @@ def kernels(**options: Any) -> None:
         _attack_program(options)
     else:
         programs = "args compare ignore_lines stdin_file folder env memory scope function"
-        refuse_given(
-            programs.split(),
-            "needs --program",
-        )
+        refuse_given(programs.split(), "needs --program")
         _attack_kernels(options)
 
 

@@ -187,6 +187,8 @@ def test_the_habits_of_another_injector_keep_a_moment_that_repeats():
     pinfi = InstructionConfig(target="control", compat="pinfi")
     assert pinfi.strategy().rule is Rule.INSTRUCTION
     assert pinfi.sampling_name() == "instruction-uniform with the operands and bits of pinfi"
+    with pytest.raises(FaultSpecError, match="pinfi chooses sites, roles, field and bits by its"):
+        InstructionConfig(target="control", compat="pinfi", bits=3).strategy()
 
 
 @pytest.fixture

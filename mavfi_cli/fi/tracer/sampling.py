@@ -16,7 +16,13 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import FaultError, TargetError, UnknownName, named_member
+from mavfi_cli.core.errors import (
+    FaultError,
+    FaultSpecError,
+    TargetError,
+    UnknownName,
+    named_member,
+)
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, decode, record_steps, return_address
 from mavfi_cli.fi.tracer.arch.interface import StepEnd
@@ -314,10 +320,13 @@ def strategy(name: str, model: FaultModel | None = None, *, compat: str | None =
 
     Raises:
         UnknownName: no such rule or compatibility mode; names the nearest.
+        FaultSpecError: an injector that is imitated chooses operands and bits by its own rule.
     """
     if compat is not None:
         if compat not in _COMPAT:
             raise UnknownName("compatibility mode", compat, _COMPAT)
+        if model not in (None, FaultModel()):
+            raise FaultSpecError(f"{compat} chooses sites, roles, field and bits by its own rule")
         return _COMPAT[compat]
     rule = named_member(Rule, "sampling rule", name)
     return Strategy(name=rule.value, rule=rule, model=model or FaultModel())
