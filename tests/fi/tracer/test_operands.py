@@ -28,6 +28,8 @@ ROUNDED = "is rounded off: it changes the inexact flag of MXCSR at most"
 MOVES = "moves by a constant, and what it points to has to stay in the window of memory"
 ITSELF = "copies a value onto itself"
 ARITHMETIC = "keeps this bit whatever the value is"
+REMAINDER = "has the dividend's sign, which was in the same place, unless the remainder is zero"
+SQUARE = "changes only for a value from the root of 2 to 2, which random states hardly ever have"
 
 # Bits of a mask that no execution shows: instruction, operand, bits, and why they stay in it.
 NEVER_READ = [
@@ -46,6 +48,8 @@ NEVER_WRITTEN = [
     (r"v?psra[wd] ", "zmm", SIGNS_32 | SIGNS_16, ARITHMETIC),
     (r"v?sqrts[sd] ", "zmm", 1 << 63 | 1 << 31, ARITHMETIC),
     (r"sbb (\w+), \1$", "rflags", 1, ARITHMETIC),
+    (r"idiv r", "rdx", 1 << 63, REMAINDER),
+    (r"muls[sd] (\w+), \1$", "zmm", 1 << 62 | 1 << 30, SQUARE),
 ]
 
 
