@@ -63,7 +63,7 @@ MISSIONS = {
             "seed": 4,
             "instruction": InstructionConfig(target="control", seed=5),
         },
-        "280e29122aa7153f",
+        "a5726c94917b6f8e",  # renewed when operands became the bits that are read or written
     ),
 }
 

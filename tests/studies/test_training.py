@@ -59,7 +59,7 @@ def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_mad
 @pytest.mark.parametrize("kind", [*KINDS, "aad"])
 def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
     detector = base.find_detector(kind)
-    setting = set(model.provenance(model.shipped(kind))["split"]["threshold"]) & FLOWN
+    setting = set(model.read(model.shipped(kind)).provenance["split"]["threshold"]) & FLOWN
     flights = Dataset.load(folder / "dataset.parquet").flights
     scores = [
         fit.scores(detector, flight)
