@@ -30,10 +30,12 @@ from unicorn import x86_const as x86
 from unicorn.unicorn_py3.unicorn import uclib
 
 ENVIRONMENT = {
-    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX2,-AVX,-FMA,-ERMS",
+    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX2,-AVX,-AVX_Fast_Unaligned_Load,-FMA,-ERMS",
     "LD_BIND_NOW": "1",  # or the first call of a function saves the registers by an AVX instruction
-    "PATH": "/usr/bin:/bin",
+    "PATH": "/usr/bin",
 }
+AVX_PREFIXES = (0x62, 0xC4, 0xC5)
+NOT_EMULATED = "AVX"  # instead of a reason to kill the process
 PAGE = 4096
 STACK_BYTES = 8 << 20
 LARGEST_BYTES = 1 << 30  # of one request for memory
@@ -294,6 +296,9 @@ class Emulation:
             self.engine.emu_start(self["rip"], NOWHERE, 0, count)
         except unicorn.UcError as error:
             self._killed = str(error)
+            invalid = error.errno == unicorn.UC_ERR_INSN_INVALID
+            if invalid and self.engine.mem_read(self["rip"], 1)[0] in AVX_PREFIXES:
+                self._killed = NOT_EMULATED
 
     @property
     def over(self) -> bool:
