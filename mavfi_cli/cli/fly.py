@@ -97,6 +97,11 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_mission("--realtime", is_flag=True, help="Pace the simulated vehicle by the wall clock.")
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
+@_mission("--autopilot", default="ours", show_default=True, metavar="ours|px4|ardupilot",
+          help="Autopilot of the simulated vehicle. A real one is started and ended with the "
+               "mission.")  # fmt: skip
+@_mission("--firmware", metavar="PATH",
+          help="SITL binary of a real autopilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @_mission("--land/--no-land", default=None,
           help="Land and disarm at the goal  [only with --link].")  # fmt: skip
 @_fault("--inject", metavar="STAGE|STATE|GROUP",
@@ -216,7 +221,7 @@ def _mission_of(path: Path | None) -> MissionConfig:
 def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     """The mission with the given options in place."""
     from mavfi_cli.spec.detector import detector_of
-    from mavfi_cli.spec.mission import stack_of
+    from mavfi_cli.spec.mission import OWN_AUTOPILOT, stack_of
     from mavfi_cli.spec.platform import measured_factor
 
     fault, instruction = _faults(base, given)
@@ -225,6 +230,8 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     platform = given.get("platform", base.platform)
     if link is not None and given.get("goal", base.goal) is None:
         raise click.UsageError("--link needs --goal X,Y,Z (ENU, m, from its local origin)")
+    if "firmware" in given and given.get("autopilot", base.autopilot) == OWN_AUTOPILOT:
+        raise click.UsageError("--firmware needs --autopilot px4 or ardupilot")
     if measured_factor(platform) is not None and not given.get("realtime", base.realtime):
         raise click.UsageError(f"--platform {platform} needs --realtime")
     own = {field.name for field in fields(base)} - {"fault", "instruction", "detector"}

@@ -255,7 +255,7 @@ def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -
     try:
         _call_this_process(WORKER)
         os.setsid()
-        _die_with(guard)
+        die_with(guard)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
         folder = Path(order["folder"])
@@ -295,7 +295,7 @@ def _become_reaper() -> None:
     _request(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def _die_with(parent: int) -> None:
+def die_with(parent: int) -> None:
     """Have the kernel kill this process when its parent ends. Exit now if it has already ended."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:

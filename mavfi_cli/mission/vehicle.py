@@ -8,6 +8,7 @@ companion's side that imports the vehicle's, and only to start it.
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import signal
 import socket
@@ -17,9 +18,10 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from mavfi_cli.core.errors import MavfiError, VehicleProcessError
+from mavfi_cli.core.errors import ConfigError, MavfiError, VehicleProcessError
+from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.link.transport import Transport, open_transport
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.mission import FIRMWARE, OWN_AUTOPILOT, MissionConfig
 
 
 class VehicleInProcess:
@@ -74,7 +76,9 @@ class VehicleProcess:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         line = [sys.executable, "-m", "sitl", *_arguments(config), "--truth", str(folder)]
-        line += ["--lockstep", "--fd", str(theirs.fileno())]
+        line += ["--fd", str(theirs.fileno())]
+        if config.autopilot == OWN_AUTOPILOT:  # real firmware is paced by the wall clock alone
+            line.append("--lockstep")
         if config.realtime:
             line += ["--speed", "1"]
         with theirs:
@@ -130,7 +134,36 @@ def _arguments(config: MissionConfig) -> list[str]:
     for name, place in (("--start", config.start), ("--goal", config.goal)):
         if place is not None:
             line.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")
-    return line
+    return line + _firmware_arguments(config)
+
+
+def _firmware_arguments(config: MissionConfig) -> list[str]:
+    """Options that let a real autopilot fly; none for our own."""
+    if config.autopilot == OWN_AUTOPILOT:
+        return []
+    option = "--hil" if config.autopilot == "px4" else "--json"
+    seed = derive(config.seed, Stream.SENSOR, "firmware")
+    return [
+        option, config.autopilot, "--firmware", str(firmware_of(config)),
+        "--firmware-seed", str(seed),
+    ]  # fmt: skip
+
+
+def firmware_of(config: MissionConfig) -> Path:
+    """Return the SITL binary of a mission's real autopilot.
+
+    Raises:
+        ConfigError: Neither the mission nor the environment names one.
+    """
+    variable = FIRMWARE[config.autopilot]
+    path = config.firmware or os.environ.get(variable)
+    if not path:
+        raise ConfigError(
+            f"{config.autopilot} needs its SITL binary: --firmware PATH, or {variable} in the "
+            "environment",
+            key="firmware",
+        )
+    return Path(path)
 
 
 Vehicle = VehicleInProcess | VehicleProcess

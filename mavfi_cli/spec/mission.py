@@ -15,6 +15,10 @@ from mavfi_cli.spec.platform import measured_factor
 from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack
 
 ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
+FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}
+"""Real autopilots, and the environment variables that name their SITL binaries."""
+
+OWN_AUTOPILOT = "ours"
 Vector3 = tuple[float, float, float]
 LIMITS = {  # minimum and maximum of each number
     "takeoff_height_m": (1.0, 50.0),
@@ -44,6 +48,8 @@ class MissionConfig:
         goal_tolerance_m: None selects the stack's own.
         world_seed: Seed of a generated world, or of start and goal in a scene; None for `seed`.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
+        autopilot: Which autopilot flies the simulated vehicle: ours, or real firmware.
+        firmware: SITL binary of a real autopilot; None for that of its environment variable.
         realtime: Run the simulated vehicle at wall-clock speed.
         land: Land and disarm at the goal.
         fault: Source-level fault to inject; None for a golden run.
@@ -74,6 +80,8 @@ class MissionConfig:
     camera_rate_hz: float = 10.0
     realtime: bool = False
     link: str | None = None
+    autopilot: str = OWN_AUTOPILOT
+    firmware: str | None = None
     land: bool = False
     node_restart_s: float = 1.0
     node_watchdog_s: float = 5.0
@@ -99,6 +107,7 @@ class MissionConfig:
         if self.fault is not None:
             self.fault.check_within(self.time_limit_s)
         self._check_platform()
+        self._check_autopilot()
         for node in self.isolate:
             if node not in ISOLATABLE:
                 raise UnknownName("node", node, ISOLATABLE)
@@ -131,10 +140,26 @@ class MissionConfig:
                 key="platform",
             )
 
+    def _check_autopilot(self) -> None:
+        if self.autopilot not in (OWN_AUTOPILOT, *FIRMWARE):
+            raise UnknownName("autopilot", self.autopilot, (OWN_AUTOPILOT, *FIRMWARE))
+        if self.autopilot == OWN_AUTOPILOT:
+            return
+        if self.link is not None:
+            raise ConfigError("flies our vehicle, without --link", key="autopilot")
+        if self.instruction is not None:
+            raise ConfigError(
+                f"flights of {self.autopilot} do not repeat exactly, and --level instruction "
+                "needs that",
+                key="autopilot",
+            )
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for the record of the run, without settings of the host."""
         values = asdict(self)
         del values["isolate"]
+        if self.autopilot == OWN_AUTOPILOT:
+            del values["autopilot"], values["firmware"]
         return values
 
     @property
@@ -148,7 +173,8 @@ class MissionConfig:
         model = None if self.detector is None else self.detector.model
         stack = self.stack.partition(":")[0]  # without the changes of a variant
         named = (self.world, self.platform, stack, self.vehicle)
-        return tuple(name for name in named if name.endswith(".toml")) + ((model,) if model else ())
+        files = tuple(name for name in named if name.endswith(".toml"))
+        return files + tuple(name for name in (model, self.firmware) if name)
 
 
 def stack_of(config: MissionConfig) -> Stack:

@@ -89,15 +89,19 @@ class Client:
                 self._simulation.autopilot.handle(message, self._link)
         return messages
 
-    def send_tick(self) -> None:
-        """Send everything due at this tick at once, the autopilot's streams last."""
+    def send_tick(self) -> bool:
+        """Send everything due at this tick at once, the autopilot's streams last.
+
+        Returns:
+            Whether anything was due.
+        """
         with self._simulation.wall.measure("link"):
             due = [
                 message
                 for message in self._simulation.camera_due
                 if self._wants_frames or message.get_msgId() not in _FRAMES
             ]
-            self._send(due, self._simulation.autopilot.collect(self._link))
+            return self._send(due, self._simulation.autopilot.collect(self._link))
 
     def send_answers(self) -> None:
         """Send answers without waiting for the tick."""
@@ -108,13 +112,14 @@ class Client:
         if of is not self:
             self.transport.send(frame)
 
-    def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> None:
+    def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
         """Send messages of both components; the camera's answers are the first."""
         answers, self._camera_answers = self._camera_answers, []
         frames = [self._camera_codec.encode(message) for message in answers + of_camera]
         frames += [self._codec.encode(message) for message in of_autopilot]
         if frames:
             self.transport.send(b"".join(frames))
+        return bool(frames)
 
     def _offer_camera(self, message: Any) -> None:
         answers = self._simulation.camera.handle(message)

@@ -22,6 +22,8 @@ from mavfi_cli.link.codec import Signing, dialect, key_from_file
 from mavfi_cli.link.transport import Listener, memory_pair, open_listener, open_transport
 from sitl.autopilot.streams import TICK_US, Preset
 from sitl.command_line import exit_code, stop_on_signals
+from sitl.firmware.simulation import FirmwareSimulation
+from sitl.firmware.start import PARAMETERS, open_firmware
 from sitl.server.client import Client
 from sitl.server.options import ServerOptions, parse
 from sitl.server.simulation import Simulation
@@ -136,18 +138,24 @@ class _EmbeddedVehicle:
     def _fly_on(self) -> None:
         """Fly a tick if the companion has answered the last one, and send its messages."""
         try:
+            if not self._begun:
+                self._simulation.begin()
             if not self._begun or self._fly_tick():
                 self._begun = True
-                self._client.send_tick()
+                while not self._client.send_tick():
+                    self._simulation.advance()
         except Exception as error:  # the vehicle's boundary: the companion only loses its link
             self.error = error
             self.end()
 
     def _fly_tick(self) -> bool:
         """Fly a tick if the companion has answered; return whether it has."""
-        answered = _answers(self._client.receive(0.0), self._simulation.stamp_us // 1000)
+        messages, simulation = self._client.receive(0.0), self._simulation
+        answered = not simulation.awaits_setpoints or _answers(
+            messages, simulation.stamp_us // 1000
+        )
         if answered:
-            self._simulation.advance()
+            simulation.advance()
         return answered
 
     def end(self) -> None:
@@ -165,6 +173,7 @@ class _EmbeddedVehicle:
         except Exception as error:  # as above
             self.error = error
         self._client.close()
+        self._simulation.close()
         self._simulation.save_truth(self.truth_folder)
 
 
@@ -209,6 +218,7 @@ class _Realtime:
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Run until stopped, or until an inherited connection closes."""
+        self._simulation.begin(stopped)
         self._welcome()
         while not stopped() and not self._over:
             self._each(Client.send_tick)
@@ -256,7 +266,7 @@ class _Realtime:
                 client = Client(self._simulation, transport, door.preset, signing=signing)
                 self._clients.append((client, door))
 
-    def _each(self, action: Callable[[Client], None]) -> None:
+    def _each(self, action: Callable[[Client], object]) -> None:
         """Call a function with every client, and remove disconnected ones."""
         for client, door in list(self._clients):
             try:
@@ -313,6 +323,7 @@ def _serve(options: ServerOptions) -> None:
     try:
         run(options, simulation, stopped)
     finally:
+        simulation.close()
         if options.truth is not None:
             simulation.save_truth(options.truth)
 
@@ -347,14 +358,29 @@ def _simulation(options: ServerOptions) -> Simulation:
         goal_enu_m=options.goal_enu_m,
     )
     columns, rows = options.camera_size
-    return Simulation(
+    profile = load_profile(options.vehicle)
+    settings: dict[str, Any] = {
+        "system_id": options.system_id,
+        "camera_columns": columns,
+        "camera_rows": rows,
+        "camera_rate_hz": options.camera_rate_hz,
+    }
+    if options.firmware_kind is None:
+        return Simulation(world, profile, **settings)
+    firmware = open_firmware(
+        options.firmware_kind,
+        options.firmware,
         world,
-        load_profile(options.vehicle),
+        profile,
+        seed=options.firmware_seed,
         system_id=options.system_id,
-        camera_columns=columns,
-        camera_rows=rows,
-        camera_rate_hz=options.camera_rate_hz,
+        url=options.firmware_link,
     )
+    try:
+        return FirmwareSimulation(world, profile, firmware, **settings)
+    except BaseException:
+        firmware.close()
+        raise
 
 
 def _announce(options: ServerOptions, simulation: Simulation) -> None:
@@ -367,9 +393,23 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
         f"system {options.system_id}, {options.speed:g} x real time",
         *(line.rstrip() for line in links),
+        *_wanted(options),
         "Ctrl-C ends it.",
     ]
     print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201 - for who starts it by hand
+
+
+def _wanted(options: ServerOptions) -> list[str]:
+    """What a firmware that somebody else starts has to do, one line each."""
+    kind = options.firmware_kind
+    if kind is None or options.firmware is not None:
+        return []
+    parameters = PARAMETERS[kind](load_profile(options.vehicle))
+    return [
+        f"waits for {kind.value}, which sends its MAVLink to {options.firmware_link} "
+        "and needs these parameters:",
+        *(f"  {name} {value:.6g}" for name, value in parameters.items()),
+    ]
 
 
 def _how(url: str) -> list[str]:

@@ -12,6 +12,7 @@ import click
 
 from sitl.autopilot.streams import Preset
 from sitl.command_line import CONTEXT, Place, Positive, Size, Triple
+from sitl.firmware.start import LINK, FirmwareKind
 
 # As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
 _DEFAULT_LINKS = (
@@ -19,6 +20,8 @@ _DEFAULT_LINKS = (
     "gcs=udpout:127.0.0.1:14550",
     "gcs=tcpin:127.0.0.1:5760",
 )
+# Real firmware already sends to PX4's port for companions, and the simulation listens there.
+_FIRMWARE_LINKS = ("onboard=udpin:127.0.0.1:14600", *_DEFAULT_LINKS[1:])
 
 
 class _Link(click.ParamType[tuple[Preset, str]]):
@@ -59,6 +62,10 @@ class ServerOptions:
     system_id: int
     key_file: Path | None
     allow_unsigned: bool
+    firmware_kind: FirmwareKind | None  # None: our own autopilot flies
+    firmware: Path | None
+    firmware_link: str
+    firmware_seed: int
 
 
 @click.command(context_settings=CONTEXT)
@@ -99,6 +106,23 @@ class ServerOptions:
     "--key-file", type=click.Path(path_type=Path), help="File with the signing passphrase."
 )
 @click.option("--allow-unsigned", is_flag=True, help="Allow unsigned links beyond this machine.")
+@click.option("--hil", type=click.Choice(["px4"]), help="PX4 flies, on its simulator link (TCP).")
+@click.option(
+    "--json", "json_backend", type=click.Choice(["ardupilot"]),
+    help="ArduPilot flies, on its JSON backend (UDP).",
+)  # fmt: skip
+@click.option(
+    "--firmware", type=click.Path(path_type=Path),
+    help="SITL binary to start  [somebody else starts it].",
+)  # fmt: skip
+@click.option(
+    "--firmware-link", metavar="URL", default=LINK, show_default=True,
+    help="Where a firmware that somebody else starts sends its MAVLink.",
+)  # fmt: skip
+@click.option(
+    "--firmware-seed", type=click.IntRange(min=0), default=1, show_default=True,
+    help="Seed of the noise of the firmware's sensors.",
+)  # fmt: skip
 def _sitl() -> None:
     """Run a simulated quadrotor that speaks MAVLink as a PX4 does."""
 
@@ -111,7 +135,8 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
         click.exceptions.Exit: It asks for help, which is printed.
     """
     given = _sitl.make_context("mavfi sitl", list(arguments)).params
-    options = ServerOptions(**given)
+    kind = _firmware_kind(given)
+    options = ServerOptions(**given, firmware_kind=kind)
     links, speed = options.links, 1.0 if options.realtime else options.speed
     if options.realtime and options.speed is not None:
         raise click.UsageError("--realtime and --speed exclude each other")
@@ -123,7 +148,24 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
     elif options.fd is not None:
         links = [*links, (Preset.LOCKSTEP, f"fd:{options.fd}")]
     elif not links:
-        links = [_Link().convert(link, None, None) for link in _DEFAULT_LINKS]
+        urls = _DEFAULT_LINKS if options.firmware_kind is None else _FIRMWARE_LINKS
+        links = [_Link().convert(url, None, None) for url in urls]
     if speed is None and not options.lockstep:
         speed = 1.0
     return dataclasses.replace(options, links=links, speed=speed)
+
+
+def _firmware_kind(given: dict[str, Any]) -> FirmwareKind | None:
+    """Return the firmware that flies, and remove its two options.
+
+    Raises:
+        click.UsageError: The options contradict each other.
+    """
+    named = [name for name in (given.pop("hil"), given.pop("json_backend")) if name is not None]
+    if len(named) > 1:
+        raise click.UsageError("--hil and --json exclude each other")
+    if not named and given["firmware"] is not None:
+        raise click.UsageError("--firmware needs --hil or --json")
+    if named and given["lockstep"]:
+        raise click.UsageError("--lockstep is for our own autopilot")
+    return FirmwareKind(named[0]) if named else None

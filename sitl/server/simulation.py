@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import resource
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mavfi_cli.core.wall import WallClock
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.streams import TICK_US
 from sitl.camera.component import Camera
+from sitl.firmware.autopilot import FirmwareAutopilot
 from sitl.referee.referee import Referee
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Quadrotor, Truth
@@ -39,12 +41,16 @@ class Simulation:
         camera_columns: depth image width, pixels.
         camera_rows: depth image height, pixels.
         camera_rate_hz: frames per second for clients that request no interval.
+        step_s: physics step.
+        autopilot: makes the autopilot of the vehicle at its start; None for our own.
 
     Attributes:
         stamp_us: boot clock at the newest tick.
         camera_due: messages of the camera at the newest tick.
         wall: wall times of this machine by part.
     """
+
+    awaits_setpoints = True  # in lockstep, every tick waits for the companion's setpoint
 
     def __init__(
         self,
@@ -55,15 +61,19 @@ class Simulation:
         camera_columns: int = 64,
         camera_rows: int = 48,
         camera_rate_hz: float = 10.0,
+        step_s: float = _STEP_S,
+        autopilot: FirmwareAutopilot | None = None,
     ) -> None:
         to_goal = world.goal_enu_m - world.start_enu_m
         self.vehicle = Quadrotor(
             profile,
             position_enu_m=world.start_enu_m,
             yaw_enu_rad=math.atan2(to_goal[1], to_goal[0]),
-            dt_s=_STEP_S,
+            dt_s=step_s,
         )
-        self.autopilot = Autopilot(self.vehicle.truth, system_id=system_id)
+        self.autopilot: Autopilot | FirmwareAutopilot = autopilot or Autopilot(
+            self.vehicle.truth, system_id=system_id
+        )
         self.camera = Camera(
             world.boxes_enu_m,
             columns=camera_columns,
@@ -83,15 +93,25 @@ class Simulation:
 
     def advance(self) -> None:
         """Fly one control tick with the autopilot's command, then judge the result."""
+        self._fly()
+        self.stamp_us += TICK_US
+        self._look()
+
+    def _fly(self) -> None:
         autopilot, vehicle = self.autopilot, self.vehicle
+        assert isinstance(autopilot, Autopilot)
         autopilot.fly()
         setpoint, motors_on = autopilot.setpoint, autopilot.motors_on
         if self._wreck is None:
             with self.wall.measure("physics"):
                 for _ in range(STEPS_A_TICK):
                     vehicle.step(setpoint, motors_on)
-        self.stamp_us += TICK_US
-        self._look()
+
+    def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Wait until the autopilot can fly, or until stopped."""
+
+    def close(self) -> None:
+        """Release everything outside this process. May be called repeatedly."""
 
     def save_truth(self, folder: Path) -> None:
         """Write the referee's log and verdict.
@@ -118,7 +138,10 @@ class Simulation:
             self._judge(truth, position, quaternion)
         autopilot.observe(self.stamp_us, truth)
         with self.wall.measure("camera"):
-            self.camera_due = self.camera.poll(self.stamp_us * 1e-6, position, quaternion)
+            self.camera_due = self._photograph(position, quaternion)
+
+    def _photograph(self, position_enu_m: Vector, quaternion_flu_enu: Vector) -> list[Any]:
+        return self.camera.poll(self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu)
 
     def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
         """Let the referee judge this tick; after a collision the vehicle falls and stays there."""

@@ -287,6 +287,10 @@ class Quadrotor:
         self._state, commands = control_step(
             self._state, self._measurement, setpoint, self._gains, armed
         )
+        self.drive(commands, armed=armed)
+
+    def drive(self, commands: Vector, *, armed: bool) -> None:
+        """Advance the physics by one step under motor commands (4,) in 0..1."""
         self._physics.advance(commands)
         self._steps += 1
         self._flat[T_STAMP] = self._steps * self.dt_s

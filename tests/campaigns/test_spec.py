@@ -324,3 +324,8 @@ def test_an_unknown_preset_gets_the_nearest():
         load_spec("tabel4")
     with pytest.raises(ConfigError, match="no such file"):
         load_spec("none.toml")
+
+
+def test_the_autopilot_is_a_factor():
+    spec = spec_of('[factors]\nautopilot = ["ours", "px4"]\n')
+    assert {mission.config.autopilot for mission in spec.missions()} == {"ours", "px4"}

@@ -212,6 +212,16 @@ def test_truth_is_joined_by_stamp_and_null_where_there_is_none():
     assert "truth_x_m" not in a_trace().table(None).column_names
 
 
+def test_truth_between_two_ticks_is_interpolated():
+    stamps = a_trace().table(None)["stamp_s"].to_pylist()
+    ticks = {name: np.repeat(column[:1], 3, axis=0) for name, column in TRUTH.items()}
+    ticks["stamp_s"] = np.array([stamps[0], stamps[1] - 0.005, stamps[1] + 0.015])
+    ticks["position_enu_m"] = np.array([[0.0, 0, 0], [1.0, 2.0, 3.0], [2.0, 2.0, 7.0]])
+    ticks["clearance_m"] = np.array([1.0, np.inf, np.inf])
+    _, second = a_trace().table(ticks).to_pylist()
+    assert (second["truth_x_m"], second["truth_z_m"]) == pytest.approx((1.25, 4.0))
+
+
 def test_a_trace_of_nothing_is_a_table_all_the_same(tmp_path):
     write_parquet(tmp_path / "trace.parquet", Trace().table(TRUTH))
     assert read_parquet(tmp_path / "trace.parquet", "trace").num_rows == 0

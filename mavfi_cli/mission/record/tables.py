@@ -16,6 +16,7 @@ from mavfi_cli.core.types import (
     WAYPOINT_FIELDS,
     CollisionReport,
     Command,
+    FloatArray,
     Invocation,
     Reaction,
     Trajectory,
@@ -36,6 +37,7 @@ _TRUTH_COLUMNS = {
     "power_regression_w": ("power_regression_w",),
     "power_propeller_w": ("power_propeller_w",),
 }
+_TICK_MS = 20.0  # interval of the referee's rows
 _GROUPS: dict[type, tuple[State, ...]] = {
     kind: tuple(state for state in STATES if state.message is kind)
     for kind in (CollisionReport, Trajectory, Command)
@@ -90,7 +92,8 @@ class Trace:
         """Return a table of stamp, phase, vehicle, monitored states and the referee's truth.
 
         The stamps of report and trajectory and the index of the waypoint identify the messages of
-        the states. A state is null before its first message. Truth is joined by stamp.
+        the states. A state is null before its first message. Truth is joined by stamp; between the
+        referee's ticks, where only real firmware has stamps, it is interpolated.
         """
         import pyarrow as pa
 
@@ -117,16 +120,29 @@ class Trace:
     def _truth_columns(self, truth: dict[str, np.ndarray]) -> dict[str, pa.Array]:
         import pyarrow as pa
 
-        place = {round(stamp * 1e3): row for row, stamp in enumerate(truth["stamp_s"].tolist())}
-        rows = np.array([place.get(round(stamp * 1e3), -1) for stamp in self._stamps], dtype=int)
-        known = rows >= 0
+        stamps_ms = np.round(np.array(self._stamps) * 1e3)
+        logged_ms = np.round(truth["stamp_s"] * 1e3)
+        after = np.searchsorted(logged_ms, stamps_ms)
+        known = (after < len(logged_ms)) & (stamps_ms >= logged_ms[0])
+        after = np.minimum(after, len(logged_ms) - 1)
+        before = np.maximum(np.where(logged_ms[after] == stamps_ms, after, after - 1), 0)
+        spans_ms = logged_ms[after] - logged_ms[before]
+        known &= spans_ms <= _TICK_MS
+        shares = (stamps_ms - logged_ms[before]) / np.maximum(spans_ms, 1.0)
         columns = {}
         for source, names in _TRUTH_COLUMNS.items():
-            values = truth[source].reshape(len(truth["stamp_s"]), -1)
+            values = truth[source].reshape(len(logged_ms), -1)
             for column, name in enumerate(names):
-                taken = np.where(known, values[rows, column], np.nan)
-                columns[name] = pa.array(taken, mask=~known)
+                taken = _between(values[before, column], values[after, column], shares)
+                columns[name] = pa.array(np.where(known, taken, np.nan), mask=~known)
         return columns
+
+
+def _between(before: FloatArray, after: FloatArray, shares: FloatArray) -> FloatArray:
+    """Interpolate linearly; a value at share 0 stays as it is, also if it is infinite."""
+    with np.errstate(invalid="ignore"):
+        mixed: FloatArray = np.where(shares == 0.0, before, before + shares * (after - before))
+    return mixed
 
 
 # Plans: one row per waypoint ----------------------------------------------------------------------

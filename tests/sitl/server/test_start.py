@@ -35,6 +35,8 @@ def run(capfd):
         (["--world", "farm", "--link", "udpin:0.0.0.0:14777"], "sign"),
         (["--world", "farm", "--camera-rate", "1000"], "camera rate"),
         (["--world", "farm", "--key-file", "/nowhere/key"], "/nowhere/key"),
+        (["--hil", "px4", "--firmware", "/nowhere/px4"], "no firmware at /nowhere/px4"),
+        (["--json", "ardupilot", "--firmware", "/etc/passwd"], "no permission to execute"),
     ],
 )
 def test_known_error_is_one_line(run, arguments, words):
@@ -79,6 +81,10 @@ def test_port_in_use_is_named(run):
         ["--link", "best=udpin:127.0.0.1:1"],
         ["--lockstep", "--fd", "3", "--link", "udpin:127.0.0.1:1"],
         ["--no-such-option"],
+        ["--hil", "ardupilot"],
+        ["--hil", "px4", "--json", "ardupilot"],
+        ["--firmware", "/bin/true"],
+        ["--hil", "px4", "--lockstep", "--fd", "3"],
     ],
 )
 def test_misuse_is_one_line_and_exit_2(run, arguments):

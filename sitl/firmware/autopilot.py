@@ -1,0 +1,203 @@
+"""Real firmware in the place of the autopilot: its messages go to the clients, theirs to it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from mavfi_cli.core.errors import LinkLost, VehicleProcessError
+from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.texts import text_messages
+from mavfi_cli.link.transport import Transport
+from sitl.autopilot.streams import Link, Preset
+from sitl.camera.component import COMPONENT_ID as CAMERA
+from sitl.geodesy import Origin
+from sitl.vehicle.vehicle import Truth
+
+_STATE_US = 20_000.0
+_STREAMS_US = {
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _STATE_US,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _STATE_US,
+    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,
+    dialect.MAVLINK_MSG_ID_SYS_STATUS: 5e5,
+    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5e5,
+}
+_FOLLOWING = {  # the mode in which a firmware follows a companion
+    dialect.MAV_AUTOPILOT_PX4: 6 << 16,  # OFFBOARD
+    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: 4,  # GUIDED
+}
+_ECHO_LIMIT_S = 0.2
+_SILENCE_US = 60_000_000
+_OUTBOX_LIMIT = 10_000
+
+
+class FirmwareAutopilot:
+    """A firmware behind a MAVLink link, as the autopilot of a simulation.
+
+    It asks the firmware for the streams of a flight, and sets its local origin to the world's, so
+    that its positions are world coordinates.
+
+    Args:
+        transport: Link to the firmware.
+        origin: Geographic origin of the world.
+        system_id: System id of the firmware.
+        echoes: The firmware answers TIMESYNC while its clock stands still. Then a client's frame
+            has been read before simulated time goes on.
+
+    Attributes:
+        state_stamp_us: Stamp of the newest LOCAL_POSITION_NED; -1 without one.
+        armed: True while the motors may turn. The owner sets it.
+        terminated: True after a collision.
+    """
+
+    def __init__(
+        self, transport: Transport, origin: Origin, *, system_id: int = 1, echoes: bool = True
+    ) -> None:
+        self.system_id = system_id
+        self.state_stamp_us = -1
+        self.armed = self.terminated = False
+        self._transport = transport
+        self._origin = origin
+        self._echoes = echoes
+        self._codec = Codec(system_id, CAMERA)
+        self._follows = False
+        self._links: list[Link] = []
+        self._to_firmware: list[bytes] = []
+        self._prepared = False
+        self._heard_us = 0
+        self._echo = self._echoed = 0
+
+    # Clients.
+
+    def open_link(self, preset: Preset) -> Link:
+        """Add a client. Whatever its preset, it gets all messages of the firmware."""
+        link = Link(preset)
+        self._links.append(link)
+        return link
+
+    def close_link(self, link: Link) -> None:
+        """Remove a client."""
+        self._links.remove(link)
+
+    def handle(self, message: Any, _link: Link) -> None:
+        """Keep a client's message for the next `deliver`, under the client's own ids."""
+        codec = self._codec
+        codec.system, codec.component = message.get_srcSystem(), message.get_srcComponent()
+        self._to_firmware.append(codec.encode(message))
+        codec.system, codec.component = self.system_id, CAMERA
+
+    def collect(self, link: Link) -> list[Any]:
+        """Return the messages for a client since the last call."""
+        messages, link.outbox = link.outbox, []
+        return messages
+
+    take_outbox = collect
+
+    def forget(self) -> None:
+        """Drop what no client has collected."""
+        for link in self._links:
+            link.outbox.clear()
+
+    def terminate(self, text: str) -> None:
+        """Stop the motors for good and tell the clients why."""
+        if self.terminated:
+            return
+        self.terminated = True
+        for message in text_messages(dialect.MAV_SEVERITY_CRITICAL, text.encode(), 1):
+            self._broadcast(message)
+
+    @property
+    def commander(self) -> FirmwareAutopilot:
+        """The part that knows the state of the motors."""
+        return self
+
+    @property
+    def may_touch_ground(self) -> bool:
+        """True unless the firmware follows a companion."""
+        return not self._follows
+
+    # The firmware.
+
+    def deliver(self) -> None:
+        """Send the clients' messages, and wait until the firmware has read them.
+
+        Raises:
+            VehicleProcessError: The firmware closed its link.
+        """
+        if not self._to_firmware:
+            return
+        frames, self._to_firmware = self._to_firmware, []
+        if self._echoes:
+            self._echo += 1
+            frames.append(self._codec.encode(dialect.MAVLink_timesync_message(0, self._echo)))
+        self._send(frames)
+        deadline_s = time.monotonic() + _ECHO_LIMIT_S
+        while self._echoed < self._echo and time.monotonic() < deadline_s:
+            self._receive(_ECHO_LIMIT_S)
+
+    def observe(self, stamp_us: int, _truth: Truth) -> None:
+        """Take everything that the firmware has sent up to a stamp.
+
+        Raises:
+            VehicleProcessError: The firmware closed its link, or has been silent for a minute.
+        """
+        while self._receive(0.0):
+            self._heard_us = stamp_us
+        if stamp_us - self._heard_us > _SILENCE_US:
+            raise VehicleProcessError("the firmware sends no MAVLink")
+
+    def _receive(self, timeout_s: float) -> bool:
+        try:
+            data = self._transport.receive(timeout_s)
+        except LinkLost as error:
+            raise VehicleProcessError(str(error)) from None
+        for message in self._codec.decode(data, datagram=self._transport.datagram) if data else ():
+            self._take(message)
+        return bool(data)
+
+    def _take(self, message: Any) -> None:
+        number = message.get_msgId()
+        if number == dialect.MAVLINK_MSG_ID_TIMESYNC and message.ts1 == self._echo and message.tc1:
+            self._echoed = self._echo
+            return
+        if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            self.state_stamp_us = message.time_boot_ms * 1000
+        elif number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+            self._follows = message.custom_mode == _FOLLOWING.get(message.autopilot)
+            if not self._prepared:
+                self._prepare()
+        self._broadcast(message)
+
+    def _prepare(self) -> None:
+        """Ask for the streams and set the origin, at each heartbeat until positions arrive."""
+        self._prepared = self.state_stamp_us >= 0
+        place = self._origin
+        frames = [
+            dialect.MAVLink_set_gps_global_origin_message(
+                self.system_id, round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7),
+                round(place.altitude_amsl_m * 1e3),
+            )
+        ]  # fmt: skip
+        frames += [
+            dialect.MAVLink_command_long_message(
+                self.system_id, dialect.MAV_COMP_ID_AUTOPILOT1,
+                dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval_us, 0, 0, 0, 0, 0,
+            )
+            for number, interval_us in _STREAMS_US.items()
+        ]  # fmt: skip
+        self._send([self._codec.encode(frame) for frame in frames])
+
+    def _send(self, frames: list[bytes]) -> None:
+        try:
+            self._transport.send(b"".join(frames))
+        except LinkLost as error:
+            raise VehicleProcessError(str(error)) from None
+
+    def _broadcast(self, message: Any) -> None:
+        for link in self._links:
+            if len(link.outbox) < _OUTBOX_LIMIT:
+                link.outbox.append(message)
+
+    def close(self) -> None:
+        """Close the link to the firmware."""
+        self._transport.close()

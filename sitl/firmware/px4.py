@@ -1,0 +1,157 @@
+"""The simulator's side of PX4's lockstep link: sensors out, motor outputs back, over TCP.
+
+PX4 is the client. HIL_SENSOR sets its clock, and HIL_ACTUATOR_CONTROLS answers it once the
+controllers have run. PX4 sends no answer while no controller runs, so a missing one must not stop
+the simulation.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from mavfi_cli.core.errors import LinkLost, VehicleProcessError
+from mavfi_cli.core.frames import Vector
+from mavfi_cli.link.codec import Codec, Message, dialect
+from mavfi_cli.link.transport import Transport
+from sitl.firmware.sensors import Sensors, pressure_altitude_m
+from sitl.vehicle.vehicle import Truth
+
+PORT = 4560
+STEP_S = 0.004  # PX4's SITL takes inertial samples at 250 Hz
+SETTLE_S = 12.0  # its boot ends at another time in every flight, its estimator settles by then
+_MAG_STEPS = 5  # 50 Hz
+_BARO_STEPS = 10  # 25 Hz
+_FIX_STEPS = 25  # 10 Hz
+
+_INERTIAL_FIELDS = 0x003F
+_MAG_FIELDS = 0x01C0
+_BARO_FIELDS = 0x1A00  # pressure, altitude and temperature
+_TEMPERATURE_C = 15.0
+_FIX_3D, _SATELLITES = 3, 10
+_EPH_CM, _EPV_CM = 90, 178
+_ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
+
+ANSWER_LIMIT_S = 1.0  # wait for an answer after an answered step
+SILENT_WAIT_S = 0.004  # wait after an unanswered one
+_GONE = "PX4 closed the simulator link"
+
+
+class Px4Link:
+    """One PX4 on the simulator link.
+
+    Args:
+        transport: End of the TCP connection that PX4 calls.
+        sensors: Sensors of the vehicle.
+
+    Attributes:
+        unanswered: Number of steps without an answer since the first answer. Lockstep held in all
+            others.
+    """
+
+    step_s = STEP_S
+    settle_s = SETTLE_S
+
+    def __init__(self, transport: Transport, sensors: Sensors) -> None:
+        self._transport = transport
+        self._sensors = sensors
+        self._codec = Codec(1, dialect.MAV_COMP_ID_AUTOPILOT1)
+        self._throttles = np.zeros(4)
+        self._steps = 0
+        self._heard = False
+        self._answers = False
+        self.unanswered = 0
+
+    def heard(self, timeout_s: float) -> bool:
+        """Return True once PX4 has sent a message, waiting at most `timeout_s`."""
+        if not self._heard:
+            self._take(timeout_s)
+        return self._heard
+
+    def exchange(self, stamp_us: int, truth: Truth) -> Vector:
+        """Send the sensors of a step and return the motor outputs (4,) in 0..1.
+
+        Raises:
+            VehicleProcessError: PX4 has closed the link.
+        """
+        messages = [self._hil_sensor(stamp_us, truth)]
+        if self._steps % _FIX_STEPS == 0:
+            messages.insert(0, self._hil_gps(stamp_us, truth))
+        self._steps += 1
+        self._send(messages)
+        self._await_answer(stamp_us)
+        return self._throttles
+
+    def close(self) -> None:
+        """Close the link."""
+        self._transport.close()
+
+    def _await_answer(self, stamp_us: int) -> None:
+        limit_s = ANSWER_LIMIT_S if self._answers else SILENT_WAIT_S
+        deadline_s = time.monotonic() + limit_s
+        while True:
+            remaining_s = deadline_s - time.monotonic()
+            answered = self._take(max(remaining_s, 0.0))
+            if answered >= stamp_us:
+                self._answers = True
+                return
+            if remaining_s <= 0.0:
+                self.unanswered += self._answers or self.unanswered > 0
+                self._answers = False
+                return
+
+    def _take(self, timeout_s: float) -> int:
+        """Handle the next bytes. Return the newest stamp that PX4 has answered, or -1."""
+        try:
+            data = self._transport.receive(timeout_s)
+        except LinkLost:
+            raise VehicleProcessError(_GONE) from None
+        answered = -1
+        for message in self._codec.decode(data) if data else ():
+            self._heard = True
+            if message.get_msgId() == dialect.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS:
+                answered = message.time_usec
+                self._throttles = _throttles(message)
+        return answered
+
+    def _send(self, messages: list[Message]) -> None:
+        try:
+            self._transport.send(b"".join(map(self._codec.encode, messages)))
+        except LinkLost:
+            raise VehicleProcessError(_GONE) from None
+
+    def _hil_sensor(self, stamp_us: int, truth: Truth) -> Message:
+        sensors, fields = self._sensors, _INERTIAL_FIELDS
+        rates, force = sensors.inertial(truth)
+        magnetic, pressure, altitude_m = (0.0, 0.0, 0.0), 0.0, 0.0
+        if self._steps % _MAG_STEPS == 0:
+            fields |= _MAG_FIELDS
+            magnetic = tuple(sensors.magnetic_field(truth).tolist())
+        if self._steps % _BARO_STEPS == 0:
+            fields |= _BARO_FIELDS
+            pressure = sensors.pressure(truth)
+            altitude_m = pressure_altitude_m(pressure)
+        return dialect.MAVLink_hil_sensor_message(
+            stamp_us, *force.tolist(), *rates.tolist(), *magnetic, pressure / 100.0, 0.0,
+            altitude_m, _TEMPERATURE_C, fields,
+        )  # fmt: skip
+
+    def _hil_gps(self, stamp_us: int, truth: Truth) -> Message:
+        fix = self._sensors.fix(truth)
+        north, east, down = fix.velocity_ned_mps.tolist()
+        course_deg = math.degrees(math.atan2(east, north)) % 360.0
+        return dialect.MAVLink_hil_gps_message(
+            stamp_us, _FIX_3D, round(fix.latitude_deg * 1e7), round(fix.longitude_deg * 1e7),
+            round(fix.altitude_amsl_m * 1e3), _EPH_CM, _EPV_CM,
+            round(100.0 * math.hypot(north, east)), round(100.0 * north), round(100.0 * east),
+            round(100.0 * down), round(100.0 * course_deg) % 36_000, _SATELLITES,
+        )  # fmt: skip
+
+
+def _throttles(message: Message) -> Vector:
+    """Return the first four motor outputs (4,), zero while disarmed or not finite."""
+    if not message.mode & _ARMED:
+        return np.zeros(4)
+    return np.clip(np.nan_to_num(np.array(message.controls[:4], dtype=np.float64)), 0.0, 1.0)

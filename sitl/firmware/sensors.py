@@ -1,0 +1,124 @@
+"""What the sensors of a vehicle measure: its true state, with noise from a seed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mavfi_cli.core.frames import Vector
+from sitl.geodesy import Origin
+from sitl.vehicle.profile import GRAVITY_MPS2
+from sitl.vehicle.vehicle import Truth
+
+# Standard deviations of white noise, of the size that PX4's own simulated sensors have.
+GYRO_RADPS = 0.003
+ACCELEROMETER_MPS2 = 0.03
+MAGNETOMETER_GAUSS = 0.0004
+BAROMETER_PA = 1.0
+FIX_HORIZONTAL_M = 0.2
+FIX_VERTICAL_M = 0.5
+FIX_SPEED_MPS = 0.06
+
+# The magnetic field near Zurich by the World Magnetic Model: declination, inclination, strength.
+_DECLINATION_RAD = math.radians(3.19)
+_INCLINATION_RAD = math.radians(63.1)
+_STRENGTH_GAUSS = 0.4816
+FIELD_NED_GAUSS = _STRENGTH_GAUSS * np.array(
+    [
+        math.cos(_INCLINATION_RAD) * math.cos(_DECLINATION_RAD),
+        math.cos(_INCLINATION_RAD) * math.sin(_DECLINATION_RAD),
+        math.sin(_INCLINATION_RAD),
+    ]
+)
+_GRAVITY_NED_MPS2 = np.array([0.0, 0.0, GRAVITY_MPS2])
+
+# International standard atmosphere up to 11 km
+_SEA_LEVEL_PA = 101_325.0
+_LAPSE_PER_M = 2.25577e-5
+_EXPONENT = 5.25588
+
+
+def pressure_pa(altitude_amsl_m: float) -> float:
+    """Return the pressure of the standard atmosphere at an altitude."""
+    return float(_SEA_LEVEL_PA * (1.0 - _LAPSE_PER_M * altitude_amsl_m) ** _EXPONENT)
+
+
+def pressure_altitude_m(pressure: float) -> float:
+    """Return the altitude above sea level at which the standard atmosphere has a pressure, Pa."""
+    return float((1.0 - (pressure / _SEA_LEVEL_PA) ** (1.0 / _EXPONENT)) / _LAPSE_PER_M)
+
+
+def body_from_ned(quaternion_frd_ned: Vector) -> Vector:
+    """Return the matrix (3, 3) that turns NED components into body FRD components."""
+    w, x, y, z = quaternion_frd_ned.tolist()
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def specific_force(truth: Truth) -> Vector:
+    """Return what an ideal accelerometer measures (3,), body FRD, m/s^2."""
+    felt_ned = truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2
+    force: Vector = body_from_ned(truth.quaternion_frd_ned) @ felt_ned
+    return force
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """One position and velocity of a GPS receiver."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_amsl_m: float
+    velocity_ned_mps: Vector  # (3,)
+
+
+class Sensors:
+    """Gyroscope, accelerometer, magnetometer, barometer and GPS of one vehicle.
+
+    The same seed and the same calls give the same measurements.
+
+    Args:
+        seed: Seed of the noise.
+        origin: Geographic origin of the world.
+    """
+
+    def __init__(self, seed: int, origin: Origin | None = None) -> None:
+        self._noise = np.random.default_rng(seed)
+        self._origin = origin or Origin()
+
+    def inertial(self, truth: Truth) -> tuple[Vector, Vector]:
+        """Return rates (3,), rad/s, and specific force (3,), m/s^2, both in body FRD."""
+        noise = self._noise.standard_normal(6)
+        rates = truth.rates_frd_radps + GYRO_RADPS * noise[:3]
+        return rates, specific_force(truth) + ACCELEROMETER_MPS2 * noise[3:]
+
+    def magnetic_field(self, truth: Truth) -> Vector:
+        """Return the magnetic field (3,), body FRD, gauss."""
+        field: Vector = body_from_ned(truth.quaternion_frd_ned) @ FIELD_NED_GAUSS
+        return field + MAGNETOMETER_GAUSS * self._noise.standard_normal(3)
+
+    def pressure(self, truth: Truth) -> float:
+        """Return the air pressure, Pa."""
+        altitude_m = self._origin.altitude_amsl_m - float(truth.position_ned_m[2])
+        return pressure_pa(altitude_m) + BAROMETER_PA * float(self._noise.standard_normal())
+
+    def fix(self, truth: Truth) -> Fix:
+        """Return position and velocity of the GPS receiver."""
+        noise = self._noise.standard_normal(6)
+        north, east, down = truth.position_ned_m.tolist()
+        latitude, longitude = self._origin.geodetic(
+            north + FIX_HORIZONTAL_M * noise[0], east + FIX_HORIZONTAL_M * noise[1]
+        )
+        return Fix(
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            altitude_amsl_m=self._origin.altitude_amsl_m - down + FIX_VERTICAL_M * noise[2],
+            velocity_ned_mps=truth.velocity_ned_mps + FIX_SPEED_MPS * noise[3:],
+        )

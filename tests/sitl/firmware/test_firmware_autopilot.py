@@ -1,0 +1,137 @@
+"""The MAVLink side of a real firmware: what passes between it and the clients."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from mavfi_cli.core.errors import VehicleProcessError
+from mavfi_cli.link.codec import Codec, Message, dialect
+from mavfi_cli.link.transport import Transport
+from sitl.autopilot.streams import Preset
+from sitl.firmware.autopilot import FirmwareAutopilot
+from sitl.geodesy import Origin
+from sitl.vehicle.vehicle import Truth
+from tests.sitl.firmware.recorded import PX4_HEARTBEAT, PX4_POSITION
+
+Wire = tuple[Transport, socket.socket]
+
+
+@pytest.fixture
+def wired(wire: Wire) -> tuple[FirmwareAutopilot, socket.socket]:
+    return FirmwareAutopilot(wire[0], Origin(), echoes=False), wire[1]
+
+
+def _heard(theirs: socket.socket) -> list[Message]:
+    return Codec(1, 1).decode(theirs.recv(1 << 16))
+
+
+def test_its_messages_reach_every_client(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
+) -> None:
+    autopilot, theirs = wired
+    links = [autopilot.open_link(preset) for preset in (Preset.GCS, Preset.LOCKSTEP)]
+    theirs.sendall(PX4_HEARTBEAT + PX4_POSITION)
+    autopilot.observe(20_000, resting)
+    for link in links:
+        kinds = [message.get_type() for message in autopilot.collect(link)]
+        assert kinds == ["HEARTBEAT", "LOCAL_POSITION_NED"]
+        assert autopilot.collect(link) == []
+    assert autopilot.state_stamp_us == 14_004_000
+
+
+def test_its_origin_is_that_of_the_world(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
+) -> None:
+    autopilot, theirs = wired
+    theirs.sendall(PX4_HEARTBEAT)
+    autopilot.observe(20_000, resting)
+    origin, *requests = _heard(theirs)
+    assert origin.get_type() == "SET_GPS_GLOBAL_ORIGIN"
+    assert (origin.latitude, origin.longitude) == (473977420, 85455940)
+    assert origin.altitude == 489_400
+    assert {request.command for request in requests} == {dialect.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert 32 in {int(request.param1) for request in requests}
+
+
+def test_it_is_asked_until_positions_arrive(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
+) -> None:
+    autopilot, theirs = wired
+    for frame in (PX4_HEARTBEAT, PX4_HEARTBEAT, PX4_POSITION, PX4_HEARTBEAT):
+        theirs.sendall(frame)
+        autopilot.observe(20_000, resting)
+    asked = [message.get_type() for message in _heard(theirs)]
+    assert asked.count("SET_GPS_GLOBAL_ORIGIN") == 3
+    theirs.sendall(PX4_HEARTBEAT)
+    autopilot.observe(40_000, resting)
+    with pytest.raises(BlockingIOError):
+        theirs.recv(1)
+
+
+def test_a_client_speaks_under_its_own_ids(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
+) -> None:
+    autopilot, theirs = wired
+    link = autopilot.open_link(Preset.ONBOARD)
+    codec = Codec(245, 190)
+    [command] = codec.decode(
+        codec.encode(dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0))
+    )
+    autopilot.handle(command, link)
+    autopilot.deliver()
+    [heard] = _heard(theirs)
+    assert (heard.get_srcSystem(), heard.get_srcComponent()) == (245, 190)
+    assert (heard.command, heard.param1) == (400, 1.0)
+
+
+def test_a_gentle_touchdown_counts_as_a_landing_unless_it_follows_a_companion(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
+) -> None:
+    autopilot, theirs = wired
+    theirs.sendall(PX4_HEARTBEAT)  # in AUTO.TAKEOFF
+    autopilot.observe(20_000, resting)
+    assert autopilot.may_touch_ground
+    theirs.sendall(
+        Codec(1, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0x91, 6 << 16, 4, 3))
+    )
+    autopilot.observe(40_000, resting)
+    assert not autopilot.may_touch_ground
+
+
+def test_a_collision_is_told_once_and_for_good(
+    wired: tuple[FirmwareAutopilot, socket.socket],
+) -> None:
+    autopilot, _ = wired
+    link = autopilot.open_link(Preset.LOCKSTEP)
+    autopilot.terminate("Collision: box 3 at 1.0 2.0 3.0")
+    autopilot.terminate("Collision: ground at 1.0 2.0 0.0")
+    [text] = autopilot.collect(link)
+    assert text.text == "Collision: box 3 at 1.0 2.0 3.0"
+    assert autopilot.terminated
+
+
+def test_a_silent_firmware_is_told(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
+) -> None:
+    autopilot, theirs = wired
+    theirs.sendall(PX4_HEARTBEAT)
+    autopilot.observe(20_000, resting)
+    autopilot.observe(60_000_000, resting)
+    with pytest.raises(VehicleProcessError, match="sends no MAVLink"):
+        autopilot.observe(60_100_000, resting)
+
+
+def test_an_echo_proves_that_a_frame_was_read(wire: Wire) -> None:
+    transport, theirs = wire
+    autopilot = FirmwareAutopilot(transport, Origin())
+    link = autopilot.open_link(Preset.LOCKSTEP)
+    codec = Codec(1, 1)
+    # The answer to the first question, which lies ready: `deliver` must find it.
+    theirs.sendall(codec.encode(dialect.MAVLink_timesync_message(14_000_000_000, 1)))
+    [text] = codec.decode(codec.encode(dialect.MAVLink_statustext_message(6, b"hello")))
+    autopilot.handle(text, link)
+    autopilot.deliver()
+    assert [message.get_type() for message in _heard(theirs)] == ["STATUSTEXT", "TIMESYNC"]
+    assert autopilot.collect(link) == []

@@ -1,0 +1,97 @@
+"""The processes of real firmware, and what is no firmware."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+from live_processes import gone
+
+from mavfi_cli.core.errors import EndpointError, VehicleProcessError
+from sitl.firmware.process import FirmwareProcess, require_program, start_px4
+from sitl.firmware.start import Firmware, FirmwareKind, open_firmware
+from sitl.vehicle.profile import load_profile
+from sitl.world import load_world
+
+
+def _open(kind: FirmwareKind, binary: Path | None) -> Firmware:
+    world, profile = load_world("dense", seed=3), load_profile("solo")
+    return open_firmware(kind, binary, world, profile, seed=1, system_id=1, url="udpin:127.0.0.1:0")
+
+
+def _program(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+def test_a_path_without_a_file(tmp_path: Path) -> None:
+    with pytest.raises(VehicleProcessError, match="no firmware at"):
+        require_program(tmp_path / "px4")
+
+
+def test_a_file_that_must_not_be_executed(tmp_path: Path) -> None:
+    path = tmp_path / "px4"
+    path.write_text("")
+    with pytest.raises(VehicleProcessError, match="no permission to execute"):
+        require_program(path)
+
+
+def test_a_program_without_startup_files_is_no_px4(tmp_path: Path) -> None:
+    program = _program(tmp_path / "bin" / "px4", "#!/bin/sh\n")
+    with pytest.raises(VehicleProcessError, match="is no PX4: it has no startup files"):
+        start_px4(program, {}, simulator_port=4560, remote_port=1, system_id=1)
+
+
+def test_a_file_that_is_no_program(tmp_path: Path) -> None:
+    program = _program(tmp_path / "arducopter", "no program")
+    with pytest.raises(VehicleProcessError, match="is no firmware: Exec format error"):
+        _open(FirmwareKind.ARDUPILOT, program)
+
+
+def test_a_program_that_ends_is_no_firmware(tmp_path: Path) -> None:
+    program = _program(tmp_path / "arducopter", "#!/bin/sh\necho no such model\nexit 3\n")
+    firmware = _open(FirmwareKind.ARDUPILOT, program)
+    try:
+        with pytest.raises(VehicleProcessError, match="ended with code 3: no such model"):
+            firmware.wait(lambda: False)
+    finally:
+        firmware.close()
+
+
+def test_the_end_takes_children_and_folder_along(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    script = "import os, time; os.fork(); print(os.getpid(), flush=True); time.sleep(600)"
+    process = FirmwareProcess(Path(sys.executable), ["-c", script], folder, {})
+    output = folder / "output.txt"
+    while len(output.read_text().split()) < 2:
+        process.require_running()
+    pids = [int(word) for word in output.read_text().split()]
+    process.end()
+    process.end()
+    assert not folder.exists()
+    assert all(gone(pid) for pid in pids)
+
+
+@pytest.mark.parametrize(
+    ("kind", "family", "port"),
+    [
+        (FirmwareKind.PX4, socket.SOCK_STREAM, 4560),
+        (FirmwareKind.ARDUPILOT, socket.SOCK_DGRAM, 9002),
+    ],
+    ids=["px4", "ardupilot"],
+)
+def test_a_port_in_use_is_told(kind: FirmwareKind, family: int, port: int) -> None:
+    with socket.socket(socket.AF_INET, family) as holder:
+        with contextlib.suppress(OSError):  # somebody else's, and so in use
+            holder.bind(("127.0.0.1", port))
+        if family == socket.SOCK_STREAM:
+            holder.listen()
+        with pytest.raises(EndpointError, match="in use"):
+            _open(kind, None)

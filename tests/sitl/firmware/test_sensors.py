@@ -1,0 +1,85 @@
+"""Sensors of the vehicle for real firmware: truth plus noise from a seed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sitl.firmware.sensors import (
+    BAROMETER_PA,
+    FIELD_NED_GAUSS,
+    FIX_HORIZONTAL_M,
+    Sensors,
+    body_from_ned,
+    pressure_altitude_m,
+    pressure_pa,
+    specific_force,
+)
+from sitl.geodesy import Origin
+from sitl.vehicle.profile import GRAVITY_MPS2, load_profile
+from sitl.vehicle.vehicle import T_QUATERNION, TRUTH_SIZE, Quadrotor, Truth
+
+
+def _at_rest(quaternion: list[float]) -> Truth:
+    flat = np.zeros(TRUTH_SIZE)
+    flat[T_QUATERNION : T_QUATERNION + 4] = quaternion
+    return Truth(flat)
+
+
+LEVEL = _at_rest([1.0, 0.0, 0.0, 0.0])
+QUARTER = math.sqrt(0.5)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "force"),
+    [
+        ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0]),
+        ([QUARTER, QUARTER, 0.0, 0.0], [0.0, -1.0, 0.0]),  # rolled right: the left side is up
+        ([QUARTER, 0.0, QUARTER, 0.0], [1.0, 0.0, 0.0]),  # nose up
+        ([QUARTER, 0.0, 0.0, QUARTER], [0.0, 0.0, -1.0]),  # heading east
+    ],
+)
+def test_a_resting_accelerometer_feels_the_ground(
+    quaternion: list[float], force: list[float]
+) -> None:
+    expected = GRAVITY_MPS2 * np.array(force)
+    np.testing.assert_allclose(specific_force(_at_rest(quaternion)), expected, atol=1e-9)
+
+
+def test_the_magnetometer_turns_with_the_vehicle() -> None:
+    east = _at_rest([QUARTER, 0.0, 0.0, QUARTER])
+    north_gauss, east_gauss, down_gauss = FIELD_NED_GAUSS
+    field = body_from_ned(east.quaternion_frd_ned) @ FIELD_NED_GAUSS
+    np.testing.assert_allclose(field, [east_gauss, -north_gauss, down_gauss], atol=1e-12)
+
+
+def test_pressure_and_altitude_are_inverse() -> None:
+    assert pressure_pa(0.0) == pytest.approx(101_325.0)
+    assert pressure_pa(489.4) == pytest.approx(95_575.0, rel=1e-3)
+    assert pressure_altitude_m(pressure_pa(489.4)) == pytest.approx(489.4)
+
+
+def test_noise_has_its_size_and_no_bias() -> None:
+    sensors = Sensors(7)
+    samples = np.array([sensors.pressure(LEVEL) for _ in range(4000)])
+    assert samples.std() == pytest.approx(BAROMETER_PA, rel=0.05)
+    assert samples.mean() == pytest.approx(pressure_pa(Origin().altitude_amsl_m), abs=0.1)
+    fixes = [sensors.fix(LEVEL) for _ in range(2000)]
+    places = np.array([Origin().local(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
+    assert places.std(axis=0) == pytest.approx([FIX_HORIZONTAL_M] * 2, rel=0.1)
+    assert np.abs(places.mean(axis=0)).max() < 0.03
+
+
+def test_a_seed_repeats_its_measurements() -> None:
+    first, again, other = Sensors(1), Sensors(1), Sensors(2)
+    np.testing.assert_array_equal(first.inertial(LEVEL), again.inertial(LEVEL))
+    assert first.pressure(LEVEL) == again.pressure(LEVEL) != other.pressure(LEVEL)
+
+
+def test_a_falling_vehicle_weighs_nothing() -> None:
+    vehicle = Quadrotor(load_profile("solo"), position_enu_m=(0.0, 0.0, 50.0), yaw_enu_rad=0.0)
+    for _ in range(10):
+        vehicle.drive(np.zeros(4), armed=False)
+    assert np.linalg.norm(specific_force(vehicle.truth)) < 0.05
