@@ -24,6 +24,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as dialect
 
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.link.added_messages import ADDED
 
 SIGNATURE_LENGTH = 13  # bytes: link id, timestamp, truncated digest
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC, start of signing time
@@ -110,19 +111,32 @@ class Signing:
         """
         if not signed:
             return self._accept_unsigned or message_id == _RADIO_STATUS
-        if not hmac.compare_digest(self._digest(frame[:-6]), frame[-6:]):
+        if not self._is_new(frame, header):
             return False
-        timestamp = int.from_bytes(frame[-12:-6], "little")
-        stream = (frame[-13], frame[header - 5], frame[header - 4])  # link, system, component
-        newest = self._streams.get(stream)
-        if newest is None:
-            if timestamp + NEW_STREAM_SLACK < max(self._now(), self._next_timestamp):
-                return False
-        elif timestamp <= newest:
-            return False
-        self._streams[stream] = timestamp
+        timestamp = _timestamp(frame)
+        self._streams[_stream(frame, header)] = timestamp
         self._next_timestamp = max(self._next_timestamp, timestamp)
         return True
+
+    def vouches(self, data: bytes) -> bool:
+        """Return True if data begins with a signed frame that is authentic and no replay.
+
+        The frame is not remembered, so `accept` takes it afterwards.
+        """
+        if len(data) < 3 or data[0] != _V2 or not data[2] & _SIGNED:
+            return False
+        length = _frame_length(data, 0, len(data))
+        return length > 0 and self._is_new(data[:length], _V2_HEADER)
+
+    def _is_new(self, frame: bytes, header: int) -> bool:
+        """Return True if the signature is right and newer than all of its stream."""
+        if not hmac.compare_digest(self._digest(frame[:-6]), frame[-6:]):
+            return False
+        newest = self._streams.get(_stream(frame, header))
+        if newest is None:
+            now = max(self._now(), self._next_timestamp)
+            return _timestamp(frame) + NEW_STREAM_SLACK >= now
+        return _timestamp(frame) > newest
 
     def _now(self) -> int:
         return max(0, int((self._clock() - EPOCH_UNIX_S) * UNITS_PER_S))
@@ -131,12 +145,23 @@ class Signing:
         return hashlib.sha256(self._key + data).digest()[:6]
 
 
+def _timestamp(frame: bytes) -> int:
+    """Return the timestamp of a signed frame."""
+    return int.from_bytes(frame[-12:-6], "little")
+
+
+def _stream(frame: bytes, header: int) -> tuple[int, int, int]:
+    """Return link id, system and component of a signed frame."""
+    return frame[-13], frame[header - 5], frame[header - 4]
+
+
 __all__ = ["MAX_FRAME_LENGTH", "Codec", "Message", "Signing", "dialect"]
 
 Message = Any  # an instance of one of pymavlink's generated message classes
 
 
 _V1, _V2 = 0xFE, 0xFD
+_V2_HEADER = 10  # bytes
 
 
 def _slow_crc(data: bytes, initial: int = 0xFFFF) -> int:
@@ -234,8 +259,9 @@ def _writer(cls: Any) -> Callable[[Message], Sequence[Any]]:
 
 def _kind(message_id: int) -> _Kind | None:
     kind = _KINDS.get(message_id)
-    if kind is None and message_id in dialect.mavlink_map:
-        kind = _KINDS[message_id] = _Kind(dialect.mavlink_map[message_id])
+    cls = ADDED.get(message_id) or dialect.mavlink_map.get(message_id)
+    if kind is None and cls is not None:
+        kind = _KINDS[message_id] = _Kind(cls)
     return kind
 
 
@@ -353,6 +379,12 @@ class Codec:
             message._link_id = frame[-SIGNATURE_LENGTH]
         messages.append(message)
         return True
+
+
+def begins_with_frame(data: bytes) -> bool:
+    """Return True if data begins with a whole frame of the dialect whose checksum is right."""
+    length = _frame_length(data, 0, len(data)) if data[:1] in (b"\xfd", b"\xfe") else 0
+    return length > 0 and bool(Codec(0, 0).decode(data[:length], datagram=True))
 
 
 def _frame_length(buffer: bytes, position: int, end: int) -> int:

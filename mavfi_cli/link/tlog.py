@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.link.codec import Codec, Message
+from mavfi_cli.link.codec import Codec, Message, Signing
 from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
@@ -97,11 +97,14 @@ class RecordedLink:
     Args:
         transport: Open transport. Its opener closes it.
         system, component: MAVLink ids of this end.
+        signing: Signs sent frames and refuses received ones without a good signature.
     """
 
-    def __init__(self, transport: Transport, system: int, component: int) -> None:
+    def __init__(
+        self, transport: Transport, system: int, component: int, *, signing: Signing | None = None
+    ) -> None:
         self._transport = transport
-        self._codec = Codec(system, component)
+        self._codec = Codec(system, component, signing=signing)
         self._tlog: TlogWriter | None = None
         self._early: list[tuple[float, bytes]] = []
 

@@ -15,12 +15,16 @@ from typing import Any, NoReturn, Protocol
 from mavfi_cli.core.errors import EndpointError, LinkLost
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, parse_endpoint
 
-MAX_PEERS = 64
-MAX_WAITING = 4096  # maximum unread datagrams per peer; the oldest are dropped first
+MAX_PEERS = 16  # of one listener
+MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
+_JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost
+_PUMPED = 1000  # datagrams that one pass reads
 _CONNECT_TIMEOUT_S = 5.0
 _SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
 _MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 _CHUNK = 1 << 16
+_SMALL_CHUNK = 2048  # bytes that a client of a listener hands over at once, a datagram at most
+_BACKLOG = 1 << 16  # bytes that wait for a slow client of a listener
 _MARKERS = (0xFD, 0xFE)
 
 
@@ -91,13 +95,34 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
     return _FirstClient(_TcpListener(opened, url))
 
 
-def open_listener(url: str, *, signed: bool = False, allow_unsigned: bool = False) -> Listener:
-    """Open an endpoint that serves several peers. Arguments and errors as in `open_transport`."""
+def looks_like_mavlink(data: bytes) -> bool:
+    """Return True if data begins with the marker of a frame."""
+    return bool(data) and data[0] in _MARKERS
+
+
+def open_listener(
+    url: str,
+    *,
+    signed: bool = False,
+    allow_unsigned: bool = False,
+    admits: Callable[[bytes], bool] = looks_like_mavlink,
+) -> Listener:
+    """Open an endpoint that serves several peers.
+
+    Args:
+        url, signed, allow_unsigned: As in `open_transport`.
+        admits: Tells from the first datagram of an unknown sender whether it becomes a peer.
+
+    Raises:
+        EndpointError: As in `open_transport`.
+    """
     endpoint = parse_endpoint(url)
     if endpoint.scheme not in LISTENING:
         return _OnePeer(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
     opened = _open_socket(endpoint, beyond=signed or allow_unsigned)
-    return (_UdpListener if endpoint.scheme == "udpin" else _TcpListener)(opened, url)
+    if endpoint.scheme == "udpin":
+        return _UdpListener(opened, url, admits)
+    return _TcpListener(opened, url)
 
 
 def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
@@ -123,8 +148,7 @@ def _open_socket(endpoint: Endpoint, *, beyond: bool) -> socket.socket:
     if not (beyond or ipaddress.ip_address(address.partition("%")[0]).is_loopback):
         raise EndpointError(
             endpoint.url,
-            f"{address} is beyond this machine, where MAVLink signing is required: "
-            "give a signing passphrase, or allow unsigned links by name",
+            f"{address} is beyond this machine, where MAVLink signing is required: give --key-file",
         )
     opened = socket.socket(family, kind)
     try:
@@ -241,28 +265,33 @@ class _SocketOwner:
 class _StreamTransport(_SocketOwner, _Receiver):
     """A connected stream socket with one peer.
 
-    A patient one waits for a slow reader. Any other drops what does not fit the reader's buffer,
-    whole sends at a time, as autopilots do to a slow telemetry link.
+    A patient one waits for a slow reader. Any other keeps what the reader's buffer does not take,
+    64 KiB at most, and drops the oldest sends first, so that what arrives is recent.
     """
 
     def __init__(self, connection: socket.socket, url: str, *, patient: bool = True) -> None:
         super().__init__(connection, url)
         self._patient = patient
-        self._unsent = b""
+        self._chunk = _CHUNK if patient else _SMALL_CHUNK
+        self._begun = b""  # rest of a send of which the peer has a part
+        self._waiting: deque[bytes] = deque()
 
     def send(self, data: bytes) -> None:
-        if self._unsent:
-            self._unsent = self._push(self._unsent)
-            if self._unsent:
-                return
-        unsent = self._push(data)
         if self._patient:
-            while unsent:
-                if not _wait_for(self.fileno(), select.POLLOUT, _SEND_TIMEOUT_S):
-                    self._lost(f"the peer read nothing for {_SEND_TIMEOUT_S:g} s")
-                unsent = self._push(unsent)
-        elif len(unsent) < len(data):
-            self._unsent = unsent
+            self._send_all(data)
+            return
+        self._waiting.append(data)
+        while self._begun or self._waiting:
+            self._begun = self._push(self._begun or self._waiting.popleft())
+            if self._begun:
+                break
+        while sum(map(len, self._waiting)) > _BACKLOG:
+            self._waiting.popleft()
+
+    def _send_all(self, unsent: bytes) -> None:
+        while unsent := self._push(unsent):
+            if not _wait_for(self.fileno(), select.POLLOUT, _SEND_TIMEOUT_S):
+                self._lost(f"the peer read nothing for {_SEND_TIMEOUT_S:g} s")
 
     def _push(self, data: bytes) -> bytes:
         """Send as much as fits and return the rest."""
@@ -275,7 +304,7 @@ class _StreamTransport(_SocketOwner, _Receiver):
 
     def _pull(self) -> bytes:
         try:
-            data = self._socket.recv(_CHUNK)
+            data = self._socket.recv(self._chunk)
         except BlockingIOError:
             return b""
         except OSError as error:
@@ -286,7 +315,14 @@ class _StreamTransport(_SocketOwner, _Receiver):
 
 
 class _TcpListener(_SocketOwner):
-    """A port on which every TCP client becomes a peer. Slow readers among them lose frames."""
+    """A port on which every TCP client becomes a peer. Slow readers among them lose frames.
+
+    There are at most MAX_PEERS. The connection of a further client is closed.
+    """
+
+    def __init__(self, opened: socket.socket, url: str) -> None:
+        super().__init__(opened, url)
+        self._peers: list[_StreamTransport] = []
 
     def accept_ready(self, *, patient: bool = False) -> list[_StreamTransport]:
         """See `Listener`; see `_StreamTransport` for `patient`."""
@@ -296,8 +332,15 @@ class _TcpListener(_SocketOwner):
                 connection = self._socket.accept()[0]
             except OSError:  # no client is waiting, or it has disconnected already
                 return clients
+            self._peers = [peer for peer in self._peers if peer.fileno() >= 0]
+            if len(self._peers) >= MAX_PEERS:
+                connection.close()
+                continue
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            clients.append(_StreamTransport(connection, self.url, patient=patient))
+            if not patient:  # the system's buffers would hold telemetry of half a minute
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BACKLOG)
+            self._peers.append(_StreamTransport(connection, self.url, patient=patient))
+            clients.append(self._peers[-1])
 
 
 class _FirstClient(_Receiver):
@@ -405,20 +448,20 @@ class _UdpTransport(_SocketOwner, _Receiver):
             _send_datagrams(self._socket, data, self._peer)
 
     def _pull(self) -> bytes:
-        data, sender = _receive_datagram(self._socket)
-        if self._follows and data and data[0] in _MARKERS:
+        data, sender = _receive_datagram(self._socket, _CHUNK)
+        if self._follows and looks_like_mavlink(data):
             self._peer = sender
         return data
 
 
-def _receive_datagram(opened: socket.socket) -> tuple[bytes, Any]:
-    """Return a datagram and its sender, or b"" and None if there is none.
+def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:
+    """Return a datagram, up to a number of bytes, and its sender; b"" and None without one.
 
     ECONNREFUSED means that nobody listens at the other end of a connected socket. It is not an
     error for UDP, because the peer may start later.
     """
     try:
-        return opened.recvfrom(_CHUNK)
+        return opened.recvfrom(limit)
     except OSError:
         return b"", None
 
@@ -455,14 +498,15 @@ def _split_frames(data: bytes) -> list[bytes]:
 
 
 class _UdpListener(_SocketOwner):
-    """A port on which every sender of MAVLink becomes a peer. All peers share one socket.
+    """A port on which every admitted sender becomes a peer. All peers share one socket.
 
-    There are at most MAX_PEERS. A further peer replaces the one that has been silent longest.
+    There are at most MAX_PEERS, and while one of them is open nobody else takes its place.
     """
 
-    def __init__(self, opened: socket.socket, url: str) -> None:
+    def __init__(self, opened: socket.socket, url: str, admits: Callable[[bytes], bool]) -> None:
         super().__init__(opened, url)
-        self.peers: dict[Any, _UdpPeer] = {}  # by address; the one silent longest comes first
+        self._admits = admits
+        self.peers: dict[Any, _UdpPeer] = {}  # by address
         self._fresh: list[_UdpPeer] = []
 
     def accept_ready(self) -> list[_UdpPeer]:
@@ -471,25 +515,22 @@ class _UdpListener(_SocketOwner):
         return fresh
 
     def pump(self) -> None:
-        """Distribute all waiting datagrams to their peers."""
-        for _ in range(MAX_WAITING):
-            data, sender = _receive_datagram(self._socket)
+        """Distribute the waiting datagrams to their peers."""
+        judged = 0
+        for _ in range(_PUMPED):
+            data, sender = _receive_datagram(self._socket, _SMALL_CHUNK)
             if sender is None:
                 return
-            peer = self.peers.pop(sender, None)
+            peer = self.peers.get(sender)
             if peer is None:
-                if not data or data[0] not in _MARKERS:
+                if judged == _JUDGED or len(self.peers) >= MAX_PEERS:
                     continue
-                peer = self._welcome(sender)
-            self.peers[sender] = peer
+                judged += 1
+                if not self._admits(data):
+                    continue
+                peer = self.peers[sender] = _UdpPeer(self, sender)
+                self._fresh.append(peer)
             peer.waiting.append(data)
-
-    def _welcome(self, sender: Any) -> _UdpPeer:
-        if len(self.peers) >= MAX_PEERS:
-            self.peers.pop(next(iter(self.peers))).lost = True
-        peer = _UdpPeer(self, sender)
-        self._fresh.append(peer)
-        return peer
 
     def send_to(self, data: bytes, address: Any) -> None:
         """Send frames to one peer's address."""

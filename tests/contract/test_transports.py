@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
-from mavfi_cli.link.codec import Codec
+from mavfi_cli.link.codec import Codec, begins_with_frame
 from mavfi_cli.link.transport import Transport, memory_pair, open_listener, open_transport
 from mavfi_cli.testing import StreamTransportContract, TransportContract
 from mavfi_cli.testing.transports import WAIT_S, Pair, introduce, message, receive, send
@@ -248,20 +248,43 @@ def test_several_clients_of_one_listener_are_kept_apart() -> None:
             opened.close()
 
 
-def test_a_flood_of_udp_callers_pushes_out_the_silent_ones_only() -> None:
+@pytest.mark.parametrize(("scheme", "caller"), [("udpin", "udpout"), ("tcpin", "tcp")])
+def test_a_full_listener_welcomes_somebody_once_a_peer_has_left(scheme: str, caller: str) -> None:
     from mavfi_cli.link.transport import MAX_PEERS
 
-    listener = open_listener("udpin:127.0.0.1:0")
-    url = f"udpout:127.0.0.1:{listener.port}"  # type: ignore[attr-defined]
-    callers = [open_transport(url) for _ in range(MAX_PEERS + 2)]
-    peers: list[Transport] = []
-    for client in callers:
-        send(client, Codec(2, 2), range(1))
+    listener = open_listener(f"{scheme}:127.0.0.1:0")
+    url = f"{caller}:127.0.0.1:{listener.port}"  # type: ignore[attr-defined]
+    callers, peers = [], []
+    for number in range(MAX_PEERS + 2):
+        callers.append(open_transport(url))
+        if scheme == "udpin":
+            send(callers[-1], Codec(2, 2), range(1))
         assert _wait_readable(listener.fileno())
-        peers += listener.accept_ready()
-    assert [_is_lost(peer) for peer in peers] == [True, True, *[False] * MAX_PEERS]
+        fresh = listener.accept_ready()
+        assert len(fresh) == (number < MAX_PEERS)
+        peers += fresh
+    assert not any(map(_is_lost, peers))
+    peers.pop().close()
+    callers.append(open_transport(url))
+    send(callers[-1], Codec(2, 2), range(1))
+    assert _wait_readable(listener.fileno())
+    fresh = listener.accept_ready()
+    assert len(fresh) == 1
+    peers += fresh
     for opened in (*callers, *peers, listener):
         opened.close()
+
+
+def test_a_udp_listener_admits_only_whom_it_is_told_to() -> None:
+    listener = open_listener("udpin:127.0.0.1:0", admits=begins_with_frame)
+    caller = open_transport(f"udpout:127.0.0.1:{listener.port}")  # type: ignore[attr-defined]
+    frame = Codec(2, 2).encode(message(0))
+    for data, welcome in ((b"\xfd", 0), (b"\xfd" * 40, 0), (frame[:-1], 0), (frame, 1)):
+        caller.send(data)
+        assert _wait_readable(listener.fileno())
+        assert len(listener.accept_ready()) == welcome
+    caller.close()
+    listener.close()
 
 
 def _is_lost(peer: Transport) -> bool:
@@ -285,22 +308,22 @@ def test_noise_does_not_make_a_udp_peer() -> None:
     listener.close()
 
 
-def test_a_slow_reader_of_a_listener_loses_whole_batches_and_blocks_nobody() -> None:
+def test_a_slow_reader_of_a_listener_loses_the_oldest_and_blocks_nobody() -> None:
     listener = open_listener("tcpin:127.0.0.1:0")
     client = open_transport(f"tcp:127.0.0.1:{listener.port}")  # type: ignore[attr-defined]
     assert _wait_readable(listener.fileno())
     (peer,) = listener.accept_ready()
-    codec, sent = Codec(1, 1), 0
-    for _ in range(400):
-        batch = b"".join(codec.encode(message(number)) for number in range(1000))
-        peer.send(batch)
-        sent += 1000
-    decoder, got = Codec(2, 2), 0
+    codec, batch, batches = Codec(1, 1), 20, 20_000
+    for number in range(batches):
+        peer.send(b"".join(codec.encode(message(number)) for _ in range(batch)))
+    decoder, got = Codec(2, 2), []
     while data := client.receive(0.2):
-        got += len(decoder.decode(data))
-        peer.send(b"")  # lets the rest of a half-sent batch out
-    assert 0 < got < sent
+        got += [each.time_boot_ms for each in decoder.decode(data)]
+        peer.send(b"")  # lets what waits out
     assert decoder.bad_bytes == 0
+    assert got == sorted(got)
+    assert got[-1] == batches - 1  # the newest arrives
+    assert len(got) < batch * batches / 4
     for opened in (client, peer, listener):
         opened.close()
 
