@@ -102,6 +102,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
                "mission.")  # fmt: skip
 @_mission("--firmware", metavar="PATH",
           help="SITL binary of a real autopilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
+@_mission("--key-file", metavar="FILE", type=click.Path(dir_okay=False),
+          help="File with the signing passphrase of --link.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
           help="Land and disarm at the goal  [only with --link].")  # fmt: skip
 @_fault("--inject", metavar="STAGE|STATE|GROUP",

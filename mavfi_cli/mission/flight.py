@@ -23,7 +23,7 @@ from mavfi_cli.companion.protection import NoProtection, Protection
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.codec import Message, Signing, dialect, key_from_file
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import HEARTBEAT_LOSS_S, Telemetry
@@ -48,6 +48,17 @@ SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
 
 
+def _signing(config: MissionConfig) -> Signing | None:
+    """Return the signing of a mission's link.
+
+    Raises:
+        ConfigError: The key file cannot be read.
+    """
+    if config.key_file is None:
+        return None
+    return Signing(key_from_file(Path(config.key_file)), clock=time.time)
+
+
 class Flight:
     """One mission on one link, from the first heartbeat to its outcome."""
 
@@ -66,7 +77,7 @@ class Flight:
         self._platform = platform
         self._planner = planner
         self._interrupts = interrupts
-        self.link = RecordedLink(transport, SYSTEM_ID, COMPONENT_ID)
+        self.link = RecordedLink(transport, SYSTEM_ID, COMPONENT_ID, signing=_signing(config))
         self._session = self._new_session()
         self.images = ImageReceiver()
         self._frames: list[ImageFrame] = []

@@ -186,7 +186,9 @@ def other_end(
         MavfiError: the link cannot be opened, or the vehicle cannot start.
     """
     if config.link is not None:
-        with contextlib.closing(open_transport(config.link)) as link:
+        with contextlib.closing(
+            open_transport(config.link, signed=config.key_file is not None)
+        ) as link:
             yield link, None
         return
     folder = Path(tempfile.mkdtemp(prefix="mavfi-"))

@@ -50,6 +50,7 @@ class MissionConfig:
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
         autopilot: Which autopilot flies the simulated vehicle: ours, or real firmware.
         firmware: SITL binary of a real autopilot; None for that of its environment variable.
+        key_file: File with the signing passphrase of the link; None for an unsigned link.
         realtime: Run the simulated vehicle at wall-clock speed.
         land: Land and disarm at the goal.
         fault: Source-level fault to inject; None for a golden run.
@@ -82,6 +83,7 @@ class MissionConfig:
     link: str | None = None
     autopilot: str = OWN_AUTOPILOT
     firmware: str | None = None
+    key_file: str | None = None
     land: bool = False
     node_restart_s: float = 1.0
     node_watchdog_s: float = 5.0
@@ -106,6 +108,7 @@ class MissionConfig:
             raise ConfigError("one mission takes one fault", key="instruction")
         if self.fault is not None:
             self.fault.check_within(self.time_limit_s)
+        self._check_key()
         self._check_platform()
         self._check_autopilot()
         for node in self.isolate:
@@ -123,6 +126,10 @@ class MissionConfig:
         for name, seed in (("seed", self.seed), ("world_seed", self.world_seed)):
             if seed is not None and not 0 <= seed < 2**31:
                 raise ConfigError(f"must be within 0 and 2^31 - 1, got {seed}", key=name)
+
+    def _check_key(self) -> None:
+        if self.key_file is not None and self.link is None:
+            raise ConfigError("signs a link to a foreign autopilot: needs --link", key="key_file")
 
     def _check_platform(self) -> None:
         if measured_factor(self.platform) is None:
@@ -157,7 +164,7 @@ class MissionConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for the record of the run, without settings of the host."""
         values = asdict(self)
-        del values["isolate"]
+        del values["isolate"], values["key_file"]
         if self.autopilot == OWN_AUTOPILOT:
             del values["autopilot"], values["firmware"]
         return values
