@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import click
@@ -60,6 +61,25 @@ class Positive(click.ParamType[float]):
         if not 0.0 < number < math.inf:
             self.fail(f"{value!r} is not a number above 0", param, ctx)
         return number
+
+
+key_file = click.option(
+    "--key-file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="File with the signing passphrase.",
+)
+allow_unsigned = click.option(
+    "--allow-unsigned", is_flag=True, help="Allow unsigned links beyond this machine."
+)
+camera_heartbeat = click.option(
+    "--camera-heartbeat",
+    "camera_heartbeat_hz",
+    type=click.FloatRange(0.0, 50.0),
+    default=1.0,
+    show_default=True,
+    help="Hz; 0 for none, because MAVProxy takes the camera for a second vehicle.",
+)
 
 
 def stop_on_signals() -> Callable[[], bool]:

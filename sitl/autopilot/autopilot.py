@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.texts import text_messages
 from sitl.autopilot import services
+from sitl.autopilot.authority import Authority
 from sitl.autopilot.commander import (
     GPS_FIX_US,
     Commander,
@@ -32,6 +34,7 @@ from sitl.vehicle.vehicle import Truth
 COMPONENT = 1
 _PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
 _STRAIGHT_DOWN_MPS = 0.3
+_TEXTS_A_TICK = 10  # further texts are lost, so that a flood of mistakes is not one of texts
 
 
 class Autopilot:
@@ -45,12 +48,25 @@ class Autopilot:
         truth: Vehicle state before the first `observe`.
         system_id: MAVLink system id.
         origin: Geographic origin of the local frame.
+        trusted: MAVLink systems that may command; empty for all.
+
+    Attributes:
+        restart_asked: True once a client has asked for a reboot. The owner restarts.
     """
 
-    def __init__(self, truth: Truth, *, system_id: int = 1, origin: Origin | None = None) -> None:
+    def __init__(
+        self,
+        truth: Truth,
+        *,
+        system_id: int = 1,
+        origin: Origin | None = None,
+        trusted: Sequence[int] = (),
+    ) -> None:
         self.system_id = system_id
         self.parameters = Parameters(system_id)
         self.commander = Commander(self.parameters)
+        self.authority = Authority(trusted, self.commander.say)
+        self.restart_asked = False
         self.snapshot = Snapshot(
             commander=self.commander,
             parameters=self.parameters,
@@ -66,6 +82,7 @@ class Autopilot:
         self._flown: FlightMode | None = None
         self._guidance = self._enter(FlightMode.LOITER)
         self._text_id = 0
+        self._texts_left = _TEXTS_A_TICK
 
     # Links.
 
@@ -95,6 +112,13 @@ class Autopilot:
         messages += due
         return messages
 
+    def collect_between(self, link: Link, stamp_us: int) -> list[Any]:
+        """Return the messages of a link's fast streams at a stamp between two ticks."""
+        tick_us, self.snapshot.stamp_us = self.snapshot.stamp_us, stamp_us
+        messages = link.due_between(stamp_us, self.snapshot)
+        self.snapshot.stamp_us = tick_us
+        return messages
+
     def take_outbox(self, link: Link) -> list[Any]:
         """Return answers and texts only, for a link that is served between ticks."""
         messages, link.outbox = link.outbox, []
@@ -105,7 +129,10 @@ class Autopilot:
     def handle(self, message: Any, link: Link) -> None:
         """Handle a message of a client. Messages for other systems are ignored."""
         number = message.get_msgId()
-        if number in services.ANY_TARGET:
+        if not self.authority.may_command(message, link):
+            if self._is_for_me(message):
+                services.refuse(self, message, link)
+        elif number in services.ANY_TARGET:
             services.ANY_TARGET[number](self, message, link)
         elif number in services.ADDRESSED and self._is_for_me(message):
             services.ADDRESSED[number](self, message, link)
@@ -154,6 +181,7 @@ class Autopilot:
     def observe(self, stamp_us: int, truth: Truth) -> None:
         """Take the vehicle's state at a stamp and update the commander."""
         now = self.snapshot
+        self._texts_left = _TEXTS_A_TICK
         now.elapsed_s = (stamp_us - now.stamp_us) * 1e-6
         has_fix_now = stamp_us >= GPS_FIX_US > now.stamp_us
         now.stamp_us, now.truth = stamp_us, truth
@@ -224,7 +252,8 @@ class Autopilot:
         if not texts:
             return
         self.commander.texts = []
-        for severity, text in texts:
+        for severity, text in texts[: self._texts_left]:
+            self._texts_left -= 1
             self._text_id = self._text_id % 0xFFFF + 1
             # The TAB tells clients of the events interface that the text arrives there, too.
             data = text.encode("ascii", "replace") + b"\t"
@@ -233,4 +262,6 @@ class Autopilot:
 
     def _is_for_me(self, message: Any) -> bool:
         systems = (self.system_id, 0)
+        if not hasattr(message, "target_component"):  # SET_MODE, MANUAL_CONTROL
+            return getattr(message, "target_system", None) == self.system_id
         return message.target_system in systems and message.target_component in (COMPONENT, 0)

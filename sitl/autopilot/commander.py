@@ -229,6 +229,8 @@ class Commander:
             return Result.ACCEPTED
         if self.terminated or not (force or self.can_arm):
             text = "Arming denied: Resolve system health failures first"
+            if self.terminated:
+                text = "Arming denied: terminated, a reboot begins again"
             self.say(Severity.CRITICAL, text)
             return Result.TEMPORARILY_REJECTED
         self.armed = True

@@ -134,6 +134,10 @@ class Parameters:
         self._index = {row.name: number for number, row in enumerate(self._table)}
         self._values: list[float | int] = [_stored(row, row.default) for row in self._table]
 
+    def restore(self, other: Parameters) -> None:
+        """Take all values of the same system's parameters."""
+        self._values = list(other._values)
+
     def __len__(self) -> int:
         return len(self._table)
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mavfi_cli.link.codec import dialect
-from sitl.autopilot.commander import FlightMode, Result, Severity
+from sitl.autopilot.commander import GPS_FIX_US, FlightMode, Result, Severity
+from sitl.autopilot.descriptions import DESCRIPTIONS
 from sitl.autopilot.parameters import HASH_INDEX, HASH_NAME, SetResult
 from sitl.autopilot.setpoint import SetpointRefused, global_setpoint, local_setpoint
 from sitl.autopilot.streams import Link
@@ -24,6 +25,7 @@ _FORCE_MAGIC = 21196
 _INT_UNSET = 0x7FFFFFFF
 _RELATIVE_FRAMES = (3, 6, 10, 11)
 _FARTHEST_M = 1e6
+_NOT_REQUESTABLE = (dialect.MAVLINK_MSG_ID_MISSION_CURRENT,)  # as in PX4, though streamed
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
 
@@ -88,6 +90,19 @@ def _execute(autopilot: Autopilot, message: Any, link: Link) -> None:
         result = handler(autopilot, _command_of(message), link)
     if result is not None:
         link.send(_acknowledge(message, message.command, result))
+
+
+def refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Answer a sender that may not command: commands are denied, a parameter keeps its value."""
+    name = message.get_type()
+    if name == "SET_MODE":
+        link.send(_acknowledge(message, dialect.MAV_CMD_DO_SET_MODE, Result.DENIED))
+    elif name.startswith("COMMAND_"):
+        link.send(_acknowledge(message, message.command, Result.DENIED))
+    elif name == "PARAM_SET":
+        index = autopilot.parameters.index(message.param_id)
+        if index is not None:
+            link.send(autopilot.parameters.message(index))
 
 
 def _arm_disarm(autopilot: Autopilot, command: _Command, _link: Link) -> Result | None:
@@ -184,7 +199,15 @@ def _send(number: int) -> _Handler:
 
 def _request_message(autopilot: Autopilot, command: _Command, link: Link) -> Result:
     number = _whole(command.p1)
-    return Result.DENIED if number is None else _send_one(autopilot, number, link)
+    if number is None or number in _NOT_REQUESTABLE:
+        return Result.DENIED
+    describe = DESCRIPTIONS.get(number)
+    if describe is None:
+        return _send_one(autopilot, number, link)
+    messages = describe(autopilot.snapshot, _whole(command.p2) or 0)
+    for message in messages:
+        link.send(message)
+    return Result.ACCEPTED if messages else Result.DENIED
 
 
 def _send_one(autopilot: Autopilot, number: int, link: Link) -> Result:
@@ -215,6 +238,19 @@ def _get_interval(_autopilot: Autopilot, command: _Command, link: Link) -> Resul
     return Result.ACCEPTED
 
 
+def _reboot(autopilot: Autopilot, command: _Command, link: Link) -> Result:
+    """Restart the simulation at its start, from the ground or as a wreck."""
+    if _whole(command.p1) != 1 or link.in_lockstep:
+        return Result.UNSUPPORTED
+    if autopilot.snapshot.stamp_us < GPS_FIX_US:
+        return Result.TEMPORARILY_REJECTED  # still booting
+    if autopilot.commander.armed and not autopilot.commander.terminated:
+        autopilot.commander.say(Severity.CRITICAL, "Reboot denied: armed")
+        return Result.TEMPORARILY_REJECTED
+    autopilot.restart_asked = True
+    return Result.ACCEPTED
+
+
 def _always(result: Result) -> _Handler:
     return lambda _autopilot, _command, _link: result
 
@@ -234,6 +270,7 @@ _COMMANDS: dict[int, _Handler] = {
     dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _send(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION),
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
+    dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _always(Result.ACCEPTED),
     dialect.MAV_CMD_MISSION_START: _always(Result.DENIED),  # there is no mission
 }
@@ -242,18 +279,21 @@ _COMMANDS: dict[int, _Handler] = {
 # Other messages.
 
 
-def _position_target(autopilot: Autopilot, message: Any, _link: Link) -> None:
+def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Take a setpoint of SET_POSITION_TARGET_LOCAL_NED or _GLOBAL_INT."""
     now = autopilot.snapshot
     try:
         if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
-            now.offboard = local_setpoint(message, now.euler_rad[2])
+            setpoint = local_setpoint(message, now.euler_rad[2])
         else:
-            now.offboard = global_setpoint(message, now.origin, float(now.home_ned_m[2]))
+            setpoint = global_setpoint(message, now.origin, float(now.home_ned_m[2]))
     except SetpointRefused as refusal:
         autopilot.commander.say(Severity.CRITICAL, str(refusal))
         return
-    autopilot.commander.offboard_setpoint_arrived()
+    silence_us = autopilot.parameters.effective("COM_OF_LOSS_T") * 1e6
+    if autopilot.authority.follows(message, link, now.stamp_us, silence_us):
+        now.offboard = setpoint
+        autopilot.commander.offboard_setpoint_arrived()
 
 
 def _attitude_target(autopilot: Autopilot, _message: Any, _link: Link) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Any
 
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.telemetry import BUILDERS, Builder, Snapshot
 
-TICK_US = 20_000  # period of the control loop, which is the highest rate of any stream
+TICK_US = 20_000  # period of the control loop
+STEPS_A_TICK = 5
+STEP_US = TICK_US // STEPS_A_TICK  # step of the physics, the shortest interval of any stream
+_OUTBOX = 500  # messages that wait for a client; the oldest are dropped first
 
 _SLOW: Mapping[str, float] = {
     "HEARTBEAT": 1.0,
@@ -71,11 +74,13 @@ class Link:
         preset: Default rates of the client.
 
     Attributes:
+        in_lockstep: Simulated time stands still while the client thinks.
         outbox: Pending messages, oldest first.
         parameters_left: Indices of parameters still to be listed.
     """
 
     def __init__(self, preset: Preset) -> None:
+        self.in_lockstep = preset is Preset.LOCKSTEP
         self.outbox: list[Any] = []
         self.parameters_left: deque[int] = deque()
         self._rates_hz = _RATES_HZ[preset]
@@ -83,10 +88,13 @@ class Link:
             number: _Stream(build, self._default_us(number)) for number, build in BUILDERS.items()
         }
         self._active: tuple[_Stream, ...] = ()
+        self._fast: tuple[_Stream, ...] = ()
         self._choose_active()
 
     def send(self, message: Any) -> None:
         """Queue a message for this client."""
+        if len(self.outbox) >= _OUTBOX:
+            del self.outbox[0]
         self.outbox.append(message)
 
     def interval_us(self, message_id: int) -> int | None:
@@ -104,7 +112,8 @@ class Link:
         elif interval_us == 0:
             stream.interval_us = self._default_us(message_id)
         else:
-            stream.interval_us = int(min(max(interval_us, TICK_US), 3.6e9))
+            shortest_us = TICK_US if self.in_lockstep else STEP_US
+            stream.interval_us = int(min(max(interval_us, shortest_us), 3.6e9))
         stream.due_us = stamp_us
         self._choose_active()
         return True
@@ -113,10 +122,22 @@ class Link:
         """Make a streamed message due now, because its contents have changed."""
         self._streams[message_id].due_us = stamp_us
 
+    @property
+    def is_fast(self) -> bool:
+        """True if a stream has an interval below a tick."""
+        return bool(self._fast)
+
     def due(self, stamp_us: int, snapshot: Snapshot) -> list[Any]:
-        """Return the messages due at a stamp. A late stream skips missed messages."""
+        """Return the messages due at a tick. A late stream skips missed messages."""
+        return self._due(self._active, stamp_us, snapshot)
+
+    def due_between(self, stamp_us: int, snapshot: Snapshot) -> list[Any]:
+        """Return the messages of fast streams due at a stamp between two ticks."""
+        return self._due(self._fast, stamp_us, snapshot)
+
+    def _due(self, streams: Sequence[_Stream], stamp_us: int, snapshot: Snapshot) -> list[Any]:
         messages = []
-        for stream in self._active:
+        for stream in streams:
             if stream.due_us > stamp_us:
                 continue
             stream.due_us += stream.interval_us
@@ -133,3 +154,4 @@ class Link:
 
     def _choose_active(self) -> None:
         self._active = tuple(s for s in self._streams.values() if s.interval_us)
+        self._fast = tuple(s for s in self._active if s.interval_us < TICK_US)

@@ -16,7 +16,17 @@ from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import Transport, open_transport
 from sitl.camera.component import Camera
 from sitl.camera.station import PoseTracker, Station
-from sitl.command_line import CONTEXT, Place, Size, Triple, exit_code, stop_on_signals
+from sitl.command_line import (
+    CONTEXT,
+    Place,
+    Size,
+    Triple,
+    allow_unsigned,
+    camera_heartbeat,
+    exit_code,
+    key_file,
+    stop_on_signals,
+)
 from sitl.world import load_world
 
 
@@ -51,14 +61,9 @@ from sitl.world import load_world
     metavar="F,L,U",
     help="Offset of the lens from the vehicle's position: forward, left, up in m.",
 )
-@click.option(
-    "--key-file",
-    "--passphrase-file",
-    "key_file",
-    type=click.Path(path_type=Path),
-    help="File with the signing passphrase.",
-)
-@click.option("--allow-unsigned", is_flag=True, help="Allow unsigned links beyond loopback.")
+@camera_heartbeat
+@key_file
+@allow_unsigned
 def _camera(
     name: str,
     seed: int,
@@ -70,6 +75,7 @@ def _camera(
     rate_hz: float,
     hfov_deg: float,
     mount: Triple,
+    camera_heartbeat_hz: float,
     key_file: Path | None,
     allow_unsigned: bool,
 ) -> None:
@@ -88,6 +94,7 @@ def _camera(
         hfov_rad=math.radians(hfov_deg),
         mount_offset_flu_m=(forward, left, up),
         rate_hz=rate_hz,
+        heartbeat_hz=camera_heartbeat_hz,
     )
     key = None if key_file is None else key_from_file(key_file)
     transports: list[Transport] = []

@@ -26,7 +26,6 @@ _SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding err
 COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
 MAX_RATE_HZ = 50.0  # one frame per control tick
 _MAX_SIDE_PX = 2048
-_HEARTBEAT_S = 1.0
 _HOME = Origin()
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -81,6 +80,7 @@ class Camera:
         hfov_rad: Horizontal field of view, rad.
         mount_offset_flu_m: Offset of the optical centre from the vehicle's position.
         rate_hz: Default frame rate, at most 50 Hz.
+        heartbeat_hz: Heartbeats per second; 0 for none.
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
         origin: Geographic origin of the world, for the position fields.
 
@@ -97,6 +97,7 @@ class Camera:
         hfov_rad: float = math.pi / 2.0,
         mount_offset_flu_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
         rate_hz: float = 10.0,
+        heartbeat_hz: float = 1.0,
         system: int = 1,
         origin: Origin = _HOME,
     ) -> None:
@@ -119,7 +120,9 @@ class Camera:
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
         self._pose: tuple[Vector, Vector] | None = None  # optical centre (3,) and attitude (4,)
         self._stamp_s = 0.0
-        self._heartbeat = PeriodicSchedule(interval_s=_HEARTBEAT_S)
+        self._heartbeat = (
+            PeriodicSchedule(interval_s=1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
+        )
         self._frames: PeriodicSchedule | None = None
         self._frames_left = 0  # 0: unlimited
         self._streams: dict[int, PeriodicSchedule] = {}
@@ -164,7 +167,8 @@ class Camera:
         self._stamp_s = stamp_s
         offset_m = rotation_matrix(quaternion_flu_enu) @ self.mount_offset_flu_m
         self._pose = position_enu_m + offset_m, quaternion_flu_enu
-        due = [_heartbeat()] if self._heartbeat.due(stamp_s) else []
+        beats = self._heartbeat is not None and self._heartbeat.due(stamp_s)
+        due = [_heartbeat()] if beats else []
         for message_id, stream in self._streams.items():
             answer = self._request(message_id) if stream.due(stamp_s) else None
             if answer is not None:
@@ -178,9 +182,9 @@ class Camera:
         return [_heartbeat()]
 
     def _reboot(self) -> None:
-        self._heartbeat.restart()
-        for schedule in [*self._streams.values(), *([self._frames] if self._frames else [])]:
-            schedule.restart()
+        for schedule in (self._heartbeat, self._frames, *self._streams.values()):
+            if schedule is not None:
+                schedule.restart()
 
     def _take_frame(self, position_enu_m: Vector, quaternion_flu_enu: Vector) -> list[Message]:
         """Return the messages of one frame in the order of sending.

@@ -50,6 +50,8 @@ class FirmwareAutopilot:
         terminated: True after a collision.
     """
 
+    restart_asked = False  # a reboot is the firmware's own
+
     def __init__(
         self, transport: Transport, origin: Origin, *, system_id: int = 1, echoes: bool = True
     ) -> None:

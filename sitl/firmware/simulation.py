@@ -70,7 +70,7 @@ class FirmwareSimulation(Simulation):
         """End the firmware."""
         self._firmware.close()
 
-    def _fly(self) -> None:
+    def _fly(self, _between: Callable[[int], None] | None) -> None:
         autopilot = self._firmware.autopilot
         autopilot.deliver()
         for stamp_us in range(

@@ -113,6 +113,7 @@ class Referee:
         body_box_m: Length, width and height of the vehicle's body box, centred on its position.
         vehicle: Name of the vehicle, for the report.
         physics: Mass and thrust of the vehicle, for the report.
+        logs: Keep a row of truth for each observation, for `save`.
     """
 
     def __init__(
@@ -122,10 +123,12 @@ class Referee:
         *,
         vehicle: str = "",
         physics: Mapping[str, float] | None = None,
+        logs: bool = True,
     ) -> None:
         self.world = world
         self.vehicle = vehicle
         self.physics = dict(physics or {})
+        self._logs = logs
         self.collision: Collision | None = None
         self.distance_m = 0.0
         self.min_clearance_m = math.inf
@@ -184,11 +187,12 @@ class Referee:
             position, quaternion, velocity, on_ground=on_ground, may_land=may_land
         )
         found = self._judge(stamp_s, position, quaternion, velocity, armed=armed, crashed=crashed)
-        gap_m, _ = clearance(position, quaternion, self._half, self._boxes)
-        powers = (power_regression_w, power_propeller_w)
-        self._rows.append(
-            (stamp_s, position, velocity, quaternion, gap_m, *powers, armed, on_ground)
-        )
+        if self._logs:
+            gap_m, _ = clearance(position, quaternion, self._half, self._boxes)
+            powers = (power_regression_w, power_propeller_w)
+            self._rows.append(
+                (stamp_s, position, velocity, quaternion, gap_m, *powers, armed, on_ground)
+            )
         return found
 
     def _judge(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import Any
 
 from mavfi_cli.link.codec import Codec, Signing, dialect
 from mavfi_cli.link.transport import Transport
-from sitl.autopilot.autopilot import COMPONENT
+from sitl.autopilot.autopilot import COMPONENT, Autopilot
 from sitl.autopilot.streams import Preset
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.server.simulation import Simulation
@@ -18,8 +19,7 @@ _FRAMES = (
     dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE,
     dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA,
 )
-_OVERHEARD = 100  # number of newest texts to keep
-_RECEIVES_A_TICK = 1000
+_OVERHEARD = 10  # number of newest texts to keep
 
 
 class Client:
@@ -31,6 +31,7 @@ class Client:
     Attributes:
         overheard: frames of received STATUSTEXTs for the other clients, unchanged, as an
             autopilot forwards its companion's texts to the ground station.
+        heard_s: `time.monotonic` of the newest valid frame, at first of the client's arrival.
     """
 
     def __init__(
@@ -42,7 +43,9 @@ class Client:
         signing: Signing | None = None,
     ) -> None:
         self.transport = transport
+        self.heard_s = time.monotonic()
         self._simulation = simulation
+        self._preset = preset
         self._link = simulation.autopilot.open_link(preset)
         system = simulation.autopilot.system_id
         self._codec = Codec(system, COMPONENT, signing=signing)
@@ -50,6 +53,10 @@ class Client:
         self._camera_answers: list[Any] = []
         self._wants_frames = False
         self.overheard: deque[bytes] = deque(maxlen=_OVERHEARD)
+
+    def rejoin(self) -> None:
+        """Begin again with the preset's streams, after the simulation has restarted."""
+        self._link = self._simulation.autopilot.open_link(self._preset)
 
     def close(self) -> None:
         """Leave the autopilot and release the connection."""
@@ -66,17 +73,16 @@ class Client:
             data = self.transport.receive(timeout_s)
         return self._take(data) if data else []
 
-    def drain(self) -> None:
-        """Handle the waiting bytes, up to a limit, so that a flood cannot stop the clock.
+    def hear(self) -> bool:
+        """Handle a few waiting bytes. Return True if there were any.
 
         Raises:
             LinkLost: The peer is gone.
         """
-        for _ in range(_RECEIVES_A_TICK):
-            data = self.transport.receive(0.0)
-            self._take(data)
-            if not data:
-                return
+        data = self.transport.receive(0.0)
+        if data and self._take(data):
+            self.heard_s = time.monotonic()
+        return bool(data)
 
     def _take(self, data: bytes) -> list[Any]:
         with self._simulation.wall.measure("link"):
@@ -102,6 +108,17 @@ class Client:
                 if self._wants_frames or message.get_msgId() not in _FRAMES
             ]
             return self._send(due, self._simulation.autopilot.collect(self._link))
+
+    def send_between(self, stamp_us: int) -> None:
+        """Send the streams that are faster than a tick, at a stamp between two ticks."""
+        autopilot = self._simulation.autopilot
+        if self._link.is_fast and isinstance(autopilot, Autopilot):
+            self._send([], autopilot.collect_between(self._link, stamp_us))
+
+    @property
+    def is_fast(self) -> bool:
+        """True if the client has asked for more than one message a tick."""
+        return self._link.is_fast
 
     def send_answers(self) -> None:
         """Send answers without waiting for the tick."""

@@ -16,12 +16,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import click
+
+from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.errors import LinkLost, RecordError, VehicleProcessError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.link.codec import Signing, dialect, key_from_file
+from mavfi_cli.link.codec import Signing, begins_with_frame, dialect, key_from_file
+from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import Listener, memory_pair, open_listener, open_transport
-from sitl.autopilot.streams import TICK_US, Preset
+from sitl.autopilot.streams import STEP_US, TICK_US, Preset
 from sitl.command_line import exit_code, stop_on_signals
+from sitl.control.cascade import control_step
 from sitl.firmware.simulation import FirmwareSimulation
 from sitl.firmware.start import PARAMETERS, open_firmware
 from sitl.server.client import Client
@@ -33,6 +38,8 @@ from sitl.world import load_world
 _PATIENCE_S = 0.5
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
 _LOOK_UP_S = 0.2  # interval at which a silent wait checks for a stop
+_SILENCE_S = 30.0  # time after which a UDP client that says nothing valid is forgotten
+_SHARE = 0.25  # share of a tick's time that clients get when the tick is overdue
 
 
 class _Pace:
@@ -46,12 +53,12 @@ class _Pace:
     """
 
     def __init__(self, speed: float) -> None:
-        self._speed = speed
+        self.speed = speed
         self._due_s = time.monotonic()
 
     def next_tick(self, tick_s: float) -> None:
         """Count one more simulated tick."""
-        self._due_s = max(self._due_s + tick_s / self._speed, time.monotonic() - _PATIENCE_S)
+        self._due_s = max(self._due_s + tick_s / self.speed, time.monotonic() - _PATIENCE_S)
 
     def remaining_s(self) -> float:
         """Time until the tick is due; zero or less if it is."""
@@ -183,7 +190,8 @@ class _Door:
 
     listener: Listener
     preset: Preset
-    key: bytes | None  # each client signs with it
+    signing: Signing | None  # one for all clients, so that no frame counts twice
+    forgets: bool  # silent clients leave
     ends_with_peer: bool  # an inherited connection; the server ends with it
 
 
@@ -196,7 +204,9 @@ class _Realtime:
         self._doors: list[_Door] = []
         self._pace = _Pace(options.speed or 1.0)
         self._clients: list[tuple[Client, _Door]] = []
+        self._turns = 0
         self._over = False
+        self._told_collision = False
 
     def open(self) -> None:
         """Open every endpoint.
@@ -206,13 +216,17 @@ class _Realtime:
             ConfigError: The file of the signing key cannot be read.
         """
         file, allowed = self._options.key_file, self._options.allow_unsigned
-        key = None if file is None else key_from_file(file)
+        signing = None if file is None else Signing(key_from_file(file), clock=time.time)
+        admits = begins_with_frame if signing is None else signing.vouches
         for preset, url in self._options.links:
-            inherited = url.startswith("fd:")
-            listener = open_listener(url, signed=key is not None, allow_unsigned=allowed)
+            scheme = parse_endpoint(url).scheme
+            listener = open_listener(
+                url, signed=signing is not None, allow_unsigned=allowed, admits=admits
+            )
+            inherited = scheme == "fd"
             door = _Door(
-                listener=listener, preset=preset, key=None if inherited else key,
-                ends_with_peer=inherited,
+                listener=listener, preset=preset, signing=None if inherited else signing,
+                forgets=scheme == "udpin", ends_with_peer=inherited,
             )  # fmt: skip
             self._doors.append(door)
 
@@ -222,9 +236,33 @@ class _Realtime:
         self._welcome()
         while not stopped() and not self._over:
             self._each(Client.send_tick)
-            self._pace.next_tick(TICK_US * 1e-6)
-            self._serve(stopped)
-            self._simulation.advance()
+            if any(client.is_fast for client, _ in self._clients):
+                self._serve(STEP_US, stopped)
+                self._simulation.advance(partial(self._between, stopped=stopped))
+            else:
+                self._serve(TICK_US, stopped)
+                self._simulation.advance()
+            self._tell_collision()
+            if self._simulation.autopilot.restart_asked:
+                self._restart()
+
+    def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
+        """Send the fast streams at a stamp within a tick, and wait for the next step."""
+        self._each(partial(Client.send_between, stamp_us=stamp_us))
+        self._serve(STEP_US, stopped)
+
+    def _restart(self) -> None:
+        self._simulation.restart()
+        self._each(Client.rejoin)
+        self._told_collision = False
+        click.echo("restarted")
+
+    def _tell_collision(self) -> None:
+        """Print the first collision of a flight."""
+        collision = self._simulation.referee.collision
+        if collision is not None and not self._told_collision:
+            self._told_collision = True
+            click.echo(f"{collision.text}; the vehicle stays there until a client reboots it")
 
     def close(self) -> None:
         """Close every client and door."""
@@ -233,16 +271,38 @@ class _Realtime:
         for door in self._doors:
             door.listener.close()
 
-    def _serve(self, stopped: Callable[[], bool]) -> None:
-        """Answer clients until the next tick is due; at least once."""
+    def _serve(self, duration_us: int, stopped: Callable[[], bool]) -> None:
+        """Answer clients for a part of the tick; at least once, also if it is overdue.
+
+        The time for all clients is bounded, so that a flood cannot stop the clock.
+        """
+        self._pace.next_tick(duration_us * 1e-6)
+        share_s = _SHARE * duration_us * 1e-6 / self._pace.speed
+        until_s = time.monotonic() + max(self._pace.remaining_s(), share_s)
         while True:
             self._wait(max(self._pace.remaining_s(), 0.0))
             self._welcome()
-            self._each(Client.drain)
+            self._hear(until_s)
             self._forward()
             self._each(Client.send_answers)
             if self._pace.remaining_s() <= 0.0 or stopped() or self._over:
-                return
+                break
+        self._forget_silent()
+
+    def _hear(self, until_s: float) -> None:
+        """Handle the bytes of all clients by turns, until nothing waits or the time is over."""
+        quiet = 0
+        while quiet < len(self._clients) and time.monotonic() < until_s:
+            self._turns = (self._turns + 1) % len(self._clients)
+            client, door = self._clients[self._turns]
+            heard = self._try(Client.hear, client, door)
+            quiet = 0 if heard else quiet + 1
+
+    def _forget_silent(self) -> None:
+        since_s = time.monotonic() - _SILENCE_S
+        for client, door in list(self._clients):
+            if door.forgets and client.heard_s < since_s:
+                self._remove(client, door)
 
     def _forward(self) -> None:
         """Forward the status texts of each client to all others."""
@@ -262,19 +322,26 @@ class _Realtime:
     def _welcome(self) -> None:
         for door in self._doors:
             for transport in door.listener.accept_ready():
-                signing = None if door.key is None else Signing(door.key, clock=time.time)
-                client = Client(self._simulation, transport, door.preset, signing=signing)
+                client = Client(self._simulation, transport, door.preset, signing=door.signing)
                 self._clients.append((client, door))
 
     def _each(self, action: Callable[[Client], object]) -> None:
         """Call a function with every client, and remove disconnected ones."""
         for client, door in list(self._clients):
-            try:
-                action(client)
-            except LinkLost:
-                client.close()
-                self._clients.remove((client, door))
-                self._over = self._over or door.ends_with_peer
+            self._try(action, client, door)
+
+    def _try(self, action: Callable[[Client], object], client: Client, door: _Door) -> object:
+        """Call a function with a client. Remove a disconnected one, and return None."""
+        try:
+            return action(client)
+        except LinkLost:
+            self._remove(client, door)
+            self._over = self._over or door.ends_with_peer
+            return None
+
+    def _remove(self, client: Client, door: _Door) -> None:
+        client.close()
+        self._clients.remove((client, door))
 
 
 def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
@@ -316,7 +383,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _serve(options: ServerOptions) -> None:
     """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
     stopped = stop_on_signals()
-    simulation = _simulation(options)
+    if not options.lockstep and not in_cache(control_step):
+        click.echo("the first start compiles the vehicle, about half a minute", err=True)
+        warm_up()
+    simulation = _simulation(options, logs=options.truth is not None)
     if options.truth is not None:
         _write_briefing(simulation, options.truth)
     run = _lockstep if options.lockstep else _realtime
@@ -338,7 +408,7 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
     Raises:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
     """
-    simulation = _simulation(parse(arguments))
+    simulation = _simulation(parse(arguments), logs=True)
     _write_briefing(simulation, truth_folder)
     return _EmbeddedVehicle(simulation, truth_folder)
 
@@ -350,7 +420,7 @@ def warm_up() -> None:
         simulation.advance()
 
 
-def _simulation(options: ServerOptions) -> Simulation:
+def _simulation(options: ServerOptions, *, logs: bool) -> Simulation:
     world = load_world(
         options.world,
         seed=options.seed,
@@ -364,6 +434,9 @@ def _simulation(options: ServerOptions) -> Simulation:
         "camera_columns": columns,
         "camera_rows": rows,
         "camera_rate_hz": options.camera_rate_hz,
+        "camera_heartbeat_hz": options.camera_heartbeat_hz,
+        "trusted": options.trusted,
+        "logs": logs,
     }
     if options.firmware_kind is None:
         return Simulation(world, profile, **settings)
@@ -392,6 +465,7 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
     lines = [
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
         f"system {options.system_id}, {options.speed:g} x real time",
+        f"commands: {_who(options)}",
         *(line.rstrip() for line in links),
         *_wanted(options),
         "Ctrl-C ends it.",
@@ -410,6 +484,13 @@ def _wanted(options: ServerOptions) -> list[str]:
         "and needs these parameters:",
         *(f"  {name} {value:.6g}" for name, value in parameters.items()),
     ]
+
+
+def _who(options: ServerOptions) -> str:
+    """Whose commands count."""
+    if options.trusted:
+        return f"of system {', '.join(map(str, sorted(options.trusted)))} only"
+    return "of anyone" + ("" if options.key_file is None else " who signs")
 
 
 def _how(url: str) -> list[str]:

@@ -11,7 +11,16 @@ from typing import Any
 import click
 
 from sitl.autopilot.streams import Preset
-from sitl.command_line import CONTEXT, Place, Positive, Size, Triple
+from sitl.command_line import (
+    CONTEXT,
+    Place,
+    Positive,
+    Size,
+    Triple,
+    allow_unsigned,
+    camera_heartbeat,
+    key_file,
+)
 from sitl.firmware.start import LINK, FirmwareKind
 
 # As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
@@ -59,6 +68,7 @@ class ServerOptions:
     truth: Path | None
     camera_size: tuple[int, int]  # columns, rows
     camera_rate_hz: float
+    camera_heartbeat_hz: float
     system_id: int
     key_file: Path | None
     allow_unsigned: bool
@@ -66,6 +76,7 @@ class ServerOptions:
     firmware: Path | None
     firmware_link: str
     firmware_seed: int
+    trusted: Sequence[int]
 
 
 @click.command(context_settings=CONTEXT)
@@ -98,14 +109,13 @@ class ServerOptions:
 @click.option(
     "--camera-rate", "camera_rate_hz", type=Positive(), default=10.0, show_default=True, help="Hz."
 )
+@camera_heartbeat
 @click.option(
     "--sysid", "system_id", type=click.IntRange(1, 255), default=1, show_default=True,
     help="MAVLink system id.",
 )  # fmt: skip
-@click.option(
-    "--key-file", type=click.Path(path_type=Path), help="File with the signing passphrase."
-)
-@click.option("--allow-unsigned", is_flag=True, help="Allow unsigned links beyond this machine.")
+@key_file
+@allow_unsigned
 @click.option("--hil", type=click.Choice(["px4"]), help="PX4 flies, on its simulator link (TCP).")
 @click.option(
     "--json", "json_backend", type=click.Choice(["ardupilot"]),
@@ -122,6 +132,10 @@ class ServerOptions:
 @click.option(
     "--firmware-seed", type=click.IntRange(min=0), default=1, show_default=True,
     help="Seed of the noise of the firmware's sensors.",
+)  # fmt: skip
+@click.option(
+    "--trust", "trusted", type=click.IntRange(1, 255), multiple=True, metavar="SYSTEM",
+    help="MAVLink system id that may command; repeatable  [all].",
 )  # fmt: skip
 def _sitl() -> None:
     """Run a simulated quadrotor that speaks MAVLink as a PX4 does."""
@@ -166,6 +180,8 @@ def _firmware_kind(given: dict[str, Any]) -> FirmwareKind | None:
         raise click.UsageError("--hil and --json exclude each other")
     if not named and given["firmware"] is not None:
         raise click.UsageError("--firmware needs --hil or --json")
+    if named and given["trusted"]:
+        raise click.UsageError("--trust is for our own autopilot")
     if named and given["lockstep"]:
         raise click.UsageError("--lockstep is for our own autopilot")
     return FirmwareKind(named[0]) if named else None

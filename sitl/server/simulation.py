@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.core.wall import WallClock
 from sitl.autopilot.autopilot import Autopilot
-from sitl.autopilot.streams import TICK_US
+from sitl.autopilot.streams import STEP_US, STEPS_A_TICK, TICK_US
 from sitl.camera.component import Camera
 from sitl.firmware.autopilot import FirmwareAutopilot
 from sitl.referee.referee import Referee
@@ -21,14 +21,13 @@ from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Quadrotor, Truth
 from sitl.world import World
 
-STEPS_A_TICK = 5
 HOST_FILE = "host.json"
 """Where this machine's time went; beside the truth, and no part of it."""
 
 _FARTHEST_M = 1e6
 _FASTEST_RADPS = 1e4
 _GROUND_M = 0.3  # highest centre of a fallen vehicle
-_STEP_S = TICK_US * 1e-6 / STEPS_A_TICK
+_STEP_S = STEP_US * 1e-6
 
 
 class Simulation:
@@ -43,6 +42,9 @@ class Simulation:
         camera_rate_hz: frames per second for clients that request no interval.
         step_s: physics step.
         autopilot: makes the autopilot of the vehicle at its start; None for our own.
+        camera_heartbeat_hz: heartbeats of the camera per second; 0 for none.
+        trusted: MAVLink systems that may command; empty for all.
+        logs: keep the truth of every tick for `save_truth`.
 
     Attributes:
         stamp_us: boot clock at the newest tick.
@@ -63,49 +65,75 @@ class Simulation:
         camera_rate_hz: float = 10.0,
         step_s: float = _STEP_S,
         autopilot: FirmwareAutopilot | None = None,
+        camera_heartbeat_hz: float = 1.0,
+        trusted: Sequence[int] = (),
+        logs: bool = True,
     ) -> None:
-        to_goal = world.goal_enu_m - world.start_enu_m
-        self.vehicle = Quadrotor(
-            profile,
-            position_enu_m=world.start_enu_m,
-            yaw_enu_rad=math.atan2(to_goal[1], to_goal[0]),
-            dt_s=step_s,
-        )
-        self.autopilot: Autopilot | FirmwareAutopilot = autopilot or Autopilot(
-            self.vehicle.truth, system_id=system_id
-        )
+        self._world, self._profile = world, profile
+        self._system_id, self._trusted, self._logs = system_id, trusted, logs
+        self._step_s, self._firmware_autopilot = step_s, autopilot
         self.camera = Camera(
             world.boxes_enu_m,
             columns=camera_columns,
             rows=camera_rows,
             mount_offset_flu_m=profile.camera_mount_flu_m,
             rate_hz=camera_rate_hz,
+            heartbeat_hz=camera_heartbeat_hz,
             system=system_id,
         )
-        self.referee = Referee(
-            world, profile.body_box_m, vehicle=profile.name, physics=profile.physics
-        )
         self.wall = WallClock()
+        self.camera_due: list[Any] = []
+        self._set_up()
+
+    def _set_up(self) -> None:
+        world, profile = self._world, self._profile
+        to_goal = world.goal_enu_m - world.start_enu_m
+        self.vehicle = Quadrotor(
+            profile,
+            position_enu_m=world.start_enu_m,
+            yaw_enu_rad=math.atan2(to_goal[1], to_goal[0]),
+            dt_s=self._step_s,
+        )
+        self.autopilot: Autopilot | FirmwareAutopilot = self._firmware_autopilot or Autopilot(
+            self.vehicle.truth, system_id=self._system_id, trusted=self._trusted
+        )
+        self.referee = Referee(
+            world, profile.body_box_m, vehicle=profile.name, physics=profile.physics,
+            logs=self._logs,
+        )  # fmt: skip
         self.stamp_us = 0
         self._wreck: Truth | None = None
-        self.camera_due: list[Any] = []
         self._look()
 
-    def advance(self) -> None:
-        """Fly one control tick with the autopilot's command, then judge the result."""
-        self._fly()
+    def restart(self) -> None:
+        """Begin again at the start as after a reboot, which only the parameters survive."""
+        before = self.autopilot
+        self._set_up()
+        assert isinstance(before, Autopilot)
+        assert isinstance(self.autopilot, Autopilot)
+        self.autopilot.parameters.restore(before.parameters)
+
+    def advance(self, between: Callable[[int], None] | None = None) -> None:
+        """Fly one control tick with the autopilot's command, then judge the result.
+
+        Args:
+            between: Called with the stamp of each physics step within the tick, us.
+        """
+        self._fly(between)
         self.stamp_us += TICK_US
         self._look()
 
-    def _fly(self) -> None:
+    def _fly(self, between: Callable[[int], None] | None) -> None:
         autopilot, vehicle = self.autopilot, self.vehicle
         assert isinstance(autopilot, Autopilot)
         autopilot.fly()
         setpoint, motors_on = autopilot.setpoint, autopilot.motors_on
-        if self._wreck is None:
-            with self.wall.measure("physics"):
-                for _ in range(STEPS_A_TICK):
+        for step in range(1, STEPS_A_TICK + 1):
+            if self._wreck is None:
+                with self.wall.measure("physics"):
                     vehicle.step(setpoint, motors_on)
+            if between is not None and step < STEPS_A_TICK:
+                between(self.stamp_us + step * STEP_US)
 
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Wait until the autopilot can fly, or until stopped."""

@@ -49,6 +49,7 @@ class Bench:
     """An autopilot on a point vehicle with one client, all of it over encoded frames."""
 
     def __init__(self, preset=Preset.LOCKSTEP):
+        self.link_preset = preset
         self.vehicle = PointVehicle()
         self.autopilot = Autopilot(self.vehicle)
         self.link = self.autopilot.open_link(preset)

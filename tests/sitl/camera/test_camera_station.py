@@ -190,7 +190,7 @@ def test_as_a_process_over_udp_until_it_is_stopped() -> None:
         (["--link", "carrier-pigeon:1"], "unknown kind of endpoint"),
         (["--size", "5000x3"], "camera size"),
         (["--rate", "900"], "camera rate"),
-        (["--passphrase-file", "/nonexistent"], "No such file"),
+        (["--key-file", "/nonexistent"], "No such file"),
     ],
 )
 def test_a_known_error_is_one_line(
