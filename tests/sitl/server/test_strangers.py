@@ -1,7 +1,6 @@
 """Who is served: peers after a valid frame, signed where asked; a flood; a restart."""
 
 import select
-import shutil
 import socket
 import subprocess
 import sys
@@ -20,6 +19,7 @@ import itertools
 from hostile_frames import flood, running_server
 
 KEY = "a passphrase of this benchmark"
+MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 HEARTBEAT = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
 
 
@@ -91,14 +91,14 @@ def test_pymavlink_signs_for_the_server(signing_server):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("mavproxy.py") is None, reason="needs MAVProxy")
+@pytest.mark.skipif(not MAVPROXY.exists(), reason="needs MAVProxy")
 def test_mavproxy_signs_for_the_server(signing_server, tmp_path):
     key = "a" + KEY.replace(" ", "")  # MAVProxy takes a word
     path = tmp_path / "key"
     path.write_text(key)
     with running_server("--key-file", str(path)) as server:
         line = [
-            sys.executable, shutil.which("mavproxy.py"), f"--master=tcp:127.0.0.1:{server.tcp}",
+            sys.executable, str(MAVPROXY), f"--master=tcp:127.0.0.1:{server.tcp}",
             "--non-interactive", f"--cmd=signing key {key}; param fetch",
             f"--state-basedir={tmp_path}",
         ]  # fmt: skip
