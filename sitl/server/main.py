@@ -324,6 +324,7 @@ class _Realtime:
             for transport in door.listener.accept_ready():
                 client = Client(self._simulation, transport, door.preset, signing=door.signing)
                 self._clients.append((client, door))
+                self._try(Client.hear, client, door)  # else a copy of its frame is as new
 
     def _each(self, action: Callable[[Client], object]) -> None:
         """Call a function with every client, and remove disconnected ones."""

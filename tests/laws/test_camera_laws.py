@@ -9,12 +9,21 @@ from hypothesis import strategies as st
 from mavfi_cli.core.frames import quaternion_from_euler
 from sitl.camera.depth import render_depth
 
-metres = st.floats(-30, 30)
+
+def lengths(least: float, most: float) -> st.SearchStrategy[float]:
+    """On a grid of 2^-10 m, so that moving them by whole metres rounds nothing.
+
+    Else the camera may stand in a plane of a box before it is moved and beside it afterwards.
+    """
+    return st.integers(math.ceil(least * 1024), int(most * 1024)).map(lambda n: n / 1024)
+
+
+metres = lengths(-30, 30)
 angles = st.floats(-3.1, 3.1)
-boxes = st.lists(
-    st.tuples(metres, metres, st.floats(0, 8), *[st.floats(0.01, 9)] * 3), max_size=6
-).map(lambda rows: np.array([[*r[:3], *np.add(r[:3], r[3:])] for r in rows]).reshape(-1, 6))
-poses = st.tuples(st.tuples(metres, metres, st.floats(0, 12)), st.tuples(angles, angles, angles))
+boxes = st.lists(st.tuples(metres, metres, lengths(0, 8), *[lengths(0.01, 9)] * 3), max_size=6).map(
+    lambda rows: np.array([[*r[:3], *np.add(r[:3], r[3:])] for r in rows]).reshape(-1, 6)
+)
+poses = st.tuples(st.tuples(metres, metres, lengths(0, 12)), st.tuples(angles, angles, angles))
 
 
 def render(world: np.ndarray, pose: tuple, hfov: float = math.pi / 2.0) -> np.ndarray:
