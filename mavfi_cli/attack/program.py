@@ -387,7 +387,7 @@ class Workplace:
         if watched.lacked_memory and limit_bytes is not None:
             return f"{how}: it needs more than {limit_bytes / (1 << 30):g} GB; --memory allows more"
         if watched.terminal and silent:
-            return f"{how}: it wants a terminal, and a campaign gives it none"
+            return f"{how}: it may want a terminal, and a campaign gives none, or input (--stdin)"
         return how if ended.signal is not None else ""
 
     def _last_words(self) -> str:
