@@ -173,7 +173,7 @@ def test_a_changed_frame_is_never_taken_for_itself(
     assert bytes(frame) not in [bytes(m.get_msgbuf()) for m in found]
 
 
-@given(st.binary(max_size=255), st.integers(0, 2**24 - 1).filter(lambda n: n not in KNOWN))
+@given(st.binary(max_size=255), st.integers(0, 2**24 - 1).filter(lambda n: not is_known(n)))
 def test_unknown_messages_are_counted_and_skipped_whole(payload: bytes, number: int) -> None:
     head = struct.pack(
         "<BBBBBBBHB", 0xFD, len(payload), 0, 0, 0, 1, 1, number & 0xFFFF, number >> 16
@@ -186,7 +186,9 @@ def test_unknown_messages_are_counted_and_skipped_whole(payload: bytes, number: 
     assert (codec.unknown, codec.bad_bytes) == (1, 0)
 
 
-KNOWN = frozenset(dialect.mavlink_map)
+def is_known(number: int) -> bool:
+    """Ask the dialect itself: other modules add messages to it when they are imported."""
+    return number in dialect.mavlink_map
 
 
 @given(messages(SMALL), st.binary(min_size=1, max_size=40))
