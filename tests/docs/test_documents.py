@@ -64,25 +64,6 @@ def test_a_command_of_the_readme_runs(line, mavfi, tmp_path):
         assert (tmp_path / line[line.index("--output") + 1]).is_file()
 
 
-@pytest.mark.slow
-def test_the_first_ten_minutes_print_what_the_page_says(mavfi, tmp_path):
-    """Every line of every flight; the campaign flies a tenth of its missions."""
-    page = ROOT / "docs" / "start.md"
-    (specification,) = blocks(page, "toml")
-    (tmp_path / "mine.toml").write_text(specification)
-    for block in blocks(page, "console"):
-        command, *expected = block.splitlines()
-        line = shlex.split(command)[2:]
-        if line[0] == "campaign":
-            done = mavfi(*line, "--scale", "0.1", cwd=tmp_path)
-            assert "12 of 12 missions" in done.stdout
-        else:
-            done = mavfi(*line, cwd=tmp_path)
-            told = done.stdout.splitlines()
-            assert [each for each in expected if each and each not in told] == []
-        assert done.returncode == 0, done.stderr
-
-
 def test_the_vehicle_alone(tmp_path, free_port):
     """With its onboard link on a free port, for others may fly on this machine."""
     (line,) = named("sitl")

@@ -1,0 +1,142 @@
+"""Every code block of the documents runs, or says why it does not.
+
+The blocks of a page run one after the other in one empty folder, as a reader would run them.
+docs/contributing.md explains the comments before a block ("Add a page").
+"""
+
+import contextlib
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from markdown_it import MarkdownIt
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+COMMENT = re.compile(r"<!-- (not run|slow|run with|file)(?:: (.+?))? -->", re.DOTALL)
+COMMAND = re.compile(r"^(mavfi (?:[^#\n\\]|\\\n)*)", re.MULTILINE)
+LONGEST_S = 900.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block:
+    """A fenced block; `notes` are its comments by their first words."""
+
+    place: str
+    language: str
+    text: str
+    notes: dict[str, str]
+
+    @property
+    def is_run(self):
+        return self.language != "text" and "not run" not in self.notes
+
+
+def blocks(page):
+    """The blocks of a page, without those that sphinx runs."""
+    notes = {}
+    for token in MarkdownIt().parse(page.read_text()):
+        if token.type == "html_block":
+            notes |= dict(COMMENT.findall(token.content))
+            continue
+        if token.type == "fence" and not token.info.startswith("{"):
+            place = f"{page.relative_to(ROOT)}:{token.map[0] + 1}"
+            yield Block(place=place, language=token.info.strip(), text=token.content, notes=notes)
+        notes = {}
+
+
+class Session:
+    """A reader who does what a page says, in a folder."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.names = {"__name__": "__main__"}
+        installed = folder / "installed"
+        self.environment = os.environ | {
+            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+            "PYTHONPATH": f"{installed}{os.pathsep}{folder}",
+            "PIP_TARGET": str(installed),
+            "PIP_NO_INDEX": "1",
+            "PIP_NO_DEPS": "1",
+            "PIP_NO_BUILD_ISOLATION": "0",  # pip reads this as: without isolation
+        }
+
+    def run(self, block):
+        if "file" in block.notes:
+            path = self.folder / block.notes["file"]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.text)
+        if block.language == "toml":
+            tomllib.loads(block.text)
+        elif "file" not in block.notes:
+            {"sh": self._script, "console": self._console, "python": self._python}[block.language](
+                block
+            )
+
+    def _python(self, block):
+        with contextlib.chdir(self.folder):
+            exec(compile(block.text, block.place, "exec"), self.names)
+
+    def _script(self, block):
+        self._bash(block.text, block)
+
+    def _console(self, block):
+        """A command is expected to fail if it shows an error."""
+        for command, shown in commands(block.text):
+            told = self._bash(command, block, fails=any(each.startswith("error") for each in shown))
+            missing = [] if "run with" in block.notes else [x for x in shown if x not in told]
+            assert missing == [], (block.place, command, told)
+
+    def _bash(self, script, block, *, fails=False):
+        """Run a script; the lines that it prints, without white space around them."""
+        words = block.notes.get("run with", "")
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", COMMAND.sub(rf"\1 {words} ", script)],
+            cwd=self.folder, env=self.environment, check=False, timeout=LONGEST_S,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, text=True,
+        )  # fmt: skip
+        assert (done.returncode != 0) == fails, (block.place, script, done.stdout)
+        return {line.strip() for line in done.stdout.splitlines()}
+
+
+def commands(text):
+    """The commands of a console block, each with the lines that it shows below it."""
+    for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
+        command, shown = re.fullmatch(r"((?:.*\\\n)*.*\n)((?s:.*))", part).groups()
+        lines = {line.strip() for line in shown.splitlines()} - {"", "..."}
+        yield command, sorted(lines)
+
+
+def sessions():
+    """For each page with blocks that run: those blocks, as parameters of a test."""
+    pages = {page: [block for block in blocks(page) if block.is_run] for page in PAGES}
+    return [
+        pytest.param(
+            run,
+            id=str(page.relative_to(ROOT)),
+            marks=[pytest.mark.slow] if any("slow" in block.notes for block in run) else [],
+        )
+        for page, run in pages.items() if run
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_block_runs_or_says_why_not(page):
+    known = ("sh", "console", "python", "toml")
+    wrong = [
+        block.place for block in blocks(page)
+        if block.is_run and block.language not in known and "file" not in block.notes
+    ]  # fmt: skip
+    assert wrong == []
+
+
+@pytest.mark.parametrize("run", sessions())
+def test_the_blocks_of_a_page_run(run, tmp_path):
+    session = Session(tmp_path)
+    for block in run:
+        session.run(block)
