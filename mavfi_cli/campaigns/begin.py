@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -253,12 +253,16 @@ def flyable(spec: Spec) -> list[PlannedMission]:
     Raises:
         MavfiError: no mission can be flown with a world, vehicle, planner, target or other choice.
     """
-    _check(spec.kinds())
+    check_kinds(spec.kinds())
     return spec.missions()
 
 
-def _check(missions: list[PlannedMission]) -> None:
-    """Check each kind of mission once, and each kind of vehicle process once."""
+def check_kinds(missions: Iterable[PlannedMission]) -> None:
+    """Check each kind of mission once, and each kind of vehicle process once.
+
+    Raises:
+        MavfiError: as `check_names`; names the setting.
+    """
     seen: set[str] = set()
     for mission in missions:
         config = mission.config

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +39,23 @@ class PlannedMission:
 
     def __post_init__(self) -> None:
         if not self.pair:
-            text = canonical(changes_of(golden_of(self.config)))
-            digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-            object.__setattr__(self, "pair", digest)
+            object.__setattr__(self, "pair", _pair_of(_shared(self.config)))
 
 
 _DEFAULT = MissionConfig()
 _BASE: Mapping[str, Any] = json.loads(json.dumps(asdict(_DEFAULT)))
 # Faults and protection, which a golden run does not have.
 _TREATMENT = ("fault", "instruction", "detector", "isolate")
+_NAMES = tuple(each.name for each in fields(MissionConfig))
+_SHARED = tuple(name for name in _NAMES if name not in _TREATMENT)
+_shared = attrgetter(*_SHARED)
+
+
+@functools.lru_cache(maxsize=4096)
+def _pair_of(shared: tuple[Any, ...]) -> str:
+    """The digest of the golden mission with these values of _SHARED."""
+    golden = MissionConfig(**dict(zip(_SHARED, shared, strict=True)))
+    return hashlib.sha256(canonical(changes_of(golden)).encode()).hexdigest()[:16]
 
 
 def canonical(value: Any) -> str:
@@ -56,12 +66,19 @@ def canonical(value: Any) -> str:
 def changes_of(config: MissionConfig) -> dict[str, Any]:
     """The values of a mission that differ from the defaults, as plain values."""
     changed = {
-        each.name: value
-        for each in fields(MissionConfig)
-        if (value := getattr(config, each.name)) != getattr(_DEFAULT, each.name)
+        name: _plain(value)
+        for name in _NAMES
+        if (value := getattr(config, name)) != getattr(_DEFAULT, name)
     }
-    plain = json.loads(json.dumps(changed, default=asdict))
-    return {name: value for name, value in plain.items() if value != _BASE[name]}
+    return {name: value for name, value in changed.items() if value != _BASE[name]}
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON gives it back; `asdict` copies, which is slow for long lists."""
+    if isinstance(value, tuple | list):
+        return [_plain(each) for each in value]
+    names = getattr(value, "__dataclass_fields__", None)
+    return value if names is None else {name: _plain(getattr(value, name)) for name in names}
 
 
 def golden_of(config: MissionConfig) -> MissionConfig:

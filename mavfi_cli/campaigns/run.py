@@ -59,6 +59,8 @@ class Options:
         task: module that does the work.
         errors: fly missions again that could not begin.
         cluster: address of a scheduler of dask.distributed, instead of workers on this machine.
+        only: numbers of the missions to fly; None flies all.
+        kept: numbers of missions whose run folders are kept whatever `keep` says.
     """
 
     jobs: int = 0  # as many as there are cores
@@ -67,6 +69,8 @@ class Options:
     task: str = TASK
     errors: bool = False
     cluster: str | None = None
+    only: frozenset[int] | None = None
+    kept: frozenset[int] = frozenset()
 
 
 def run_campaign(
@@ -200,7 +204,9 @@ class _Run:
             None if stop is None else BatchLimiter(stop, ledger.cell_of_each(), ledger.fates())
         )
         self._jobs = options.jobs or len(os.sched_getaffinity(0))
-        self._queue = Queue(ledger.missing(errors=options.errors), self._gate)
+        only = options.only
+        missing = ledger.missing(errors=options.errors)
+        self._queue = Queue((e for e in missing if only is None or e[0] in only), self._gate)
         self._again: list[Entry] = []
         self._flying: dict[int, Entry] = {}
         self._attempts: Counter[int] = Counter()
@@ -209,6 +215,9 @@ class _Run:
         self._errors = self._repeated = 0
         self._inside_s = 0.0
         self._total, self._before = ledger.planned(), ledger.over()
+        if only is not None:
+            self._total = len(only)
+            self._before = sum(number in only for number, _ in ledger.fates())
         self._over = self._before
         self._begun = time.monotonic()
 
@@ -294,7 +303,8 @@ class _Run:
         assert verdict.state is not None
         number, result = ended.number, verdict.result
         path, outcome = None, record_of(result).outcome or None
-        if verdict.run is not None and self._options.keep.wants(number, outcome):
+        keeps = number in self._options.kept or self._options.keep.wants(number, outcome)
+        if verdict.run is not None and keeps:
             place = _put_away(verdict.run, self._folder / RUNS, number)
             path = str(place.relative_to(self._folder))
         flown = verdict.state is ResultState.FLOWN

@@ -216,11 +216,16 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
             raise ConfigError(f"{key} is set twice", key="set")
         seen.add(key)
         _replace(data, key, _values(key, text))
-        data["name"] += "-" + _ODD.sub("-", change).strip("-")
+        data["name"] += "-" + folder_name(change)
     if len(data["name"]) > _LONGEST:
         digest = hashlib.sha256("\n".join(changes).encode()).hexdigest()[:8]
         data["name"] = f"{data['name'][: _LONGEST - 9]}-{digest}"
     return _read_spec(data, Path(f"{spec.name}.toml"))
+
+
+def folder_name(text: str) -> str:
+    """The text without the characters that do not belong into a folder's name."""
+    return _ODD.sub("-", text).strip("-")
 
 
 def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:

@@ -21,6 +21,7 @@ _COMMANDS = {
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
     "detect": ("mavfi_cli.cli.detect", "List the detectors and evaluate them."),
     "campaign": ("mavfi_cli.cli.campaign", "Plan, run and summarise thousands of missions."),
+    "reproduce": ("mavfi_cli.cli.reproduce", "Fly every experiment of the paper."),
     "compare": ("mavfi_cli.cli.compare", "Fly the same missions on several platforms."),
     "vpm": ("mavfi_cli.cli.vpm", "Model the cost of DMR and TMR in speed, time and energy."),
     "platforms": ("mavfi_cli.cli.platforms", "List the compute platforms and their latencies."),

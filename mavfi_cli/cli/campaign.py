@@ -31,8 +31,8 @@ _KEEP = ("none", "failures", "sampled", "all")
 def campaign() -> None:
     """Plan, fly and evaluate thousands of paired missions.
 
-    WHAT is a preset (fig7 fig8 fig9 table3 table4 fig13 fig14 fig16 speeds hardening ablation), a
-    campaign.toml, or the folder of an existing campaign. Presets and files fly into
+    WHAT is a preset (fig7 fig8 fig9 fig11 fig13 fig14 fig16 table3 table4 speeds hardening
+    ablation), a campaign.toml, or the folder of an existing campaign. Presets and files fly into
     campaigns/NAME, where status, draw and export look for them. Write ./NAME for a folder with
     the name of a preset.
     """

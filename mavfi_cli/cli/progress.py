@@ -140,7 +140,7 @@ def progress_line(progress: Progress) -> str:
     if progress.eta_s is not None:
         parts.append(f"{progress.rate_per_h:.0f} an hour")
         if progress.over < progress.total:
-            parts.append(f"{_duration(progress.eta_s)} to go")
+            parts.append(f"{duration(progress.eta_s)} to go")
     if progress.success_rate is not None:
         parts.append(f"{_percent(progress.success_rate)} % success{_by_setting(progress)}")
     if progress.again:
@@ -165,12 +165,13 @@ def _end_line(progress: Progress) -> str:
     flown = progress.over - progress.before
     if not flown:
         return ""
-    line = f"{flown} missions in {_duration(progress.elapsed_s)}, {progress.rate_per_h:.0f} an hour"
+    line = f"{flown} missions in {duration(progress.elapsed_s)}, {progress.rate_per_h:.0f} an hour"
     outside = progress.outside
     return line if outside is None else f"{line}, {100.0 * outside:.1f} % of it outside missions"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time as minutes or hours."""
     minutes, left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{left:02d} h" if hours else f"{minutes}:{left:02d} min"

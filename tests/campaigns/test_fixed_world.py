@@ -39,7 +39,8 @@ def spec_of(text=SPEC):
 @pytest.fixture
 def begun(campaign, monkeypatch):
     """Begin a campaign of flights that fly nothing; its stored rule and missions."""
-    monkeypatch.setattr(beginning, "_check", lambda missions: None)  # no vehicle knows the worlds
+    # No vehicle knows the worlds.
+    monkeypatch.setattr(beginning, "check_kinds", lambda missions: None)
 
     def of(spec, **how):
         with begin(

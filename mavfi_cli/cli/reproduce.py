@@ -1,0 +1,71 @@
+"""`mavfi reproduce`: every experiment of the paper, or some of them."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+
+if TYPE_CHECKING:
+    from mavfi_cli.reproduction.flying import Forecast
+
+_what = partial(click.option, cls=GroupedOption, group="Missions")
+_execution = partial(click.option, cls=GroupedOption, group="Execution")
+_output = partial(click.option, cls=GroupedOption, group="Output")
+
+
+@click.command(cls=GroupedCommand)
+@click.argument("names", metavar="[ITEM...]", nargs=-1)
+@_what("--scale", type=click.FloatRange(min=0.0, min_open=True, max=1.0), default=1.0,
+       show_default=True,
+       help="Fraction of the paper's number of missions. A folder may grow to a larger "
+            "one.")  # fmt: skip
+@_what("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+       help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
+@_execution("--jobs", type=click.IntRange(min=1),
+            help="Number of parallel missions  [one per core].")  # fmt: skip
+@_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("reproduction"),
+         show_default=True, help="Folder of all stacks.")  # fmt: skip
+@_output("--quiet", is_flag=True, help="No progress on stderr.")
+def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
+    """Fly the experiments of the paper, and print the results beside the paper's.
+
+    ITEM is fig6 fig7 fig8 fig9 fig11 fig12 fig13 fig14 fig15 fig16 table3 table4 table5; all of
+    them by default. Missions that items share are flown once. The same command resumes after an
+    interruption.
+    """
+    from mavfi_cli.campaigns.run import Options
+    from mavfi_cli.cli.progress import missions_view
+    from mavfi_cli.reproduction.flying import FlightsPlan, fly_items
+    from mavfi_cli.reproduction.items import items_named
+
+    items = items_named(names)
+    plan = FlightsPlan(
+        items=items, stack=options["stack"], scale=options["scale"], out=options["out"]
+    )
+    with missions_view(quiet=quiet) as view:
+        fly_items(
+            plan,
+            Options(jobs=options["jobs"] or 0),
+            view,
+            lambda forecast: view.on_note(forecast_line(forecast)),
+        )
+
+
+def forecast_line(forecast: Forecast) -> str:
+    """What is left to fly, and what it takes."""
+    from mavfi_cli.cli.progress import duration
+
+    left = forecast.missions - forecast.over
+    done = f"{forecast.missions} missions, {forecast.over} of them flown"
+    if not left:
+        return done
+    return (
+        f"{done}; the other {left} take about {duration(forecast.seconds)} with "
+        f"{forecast.jobs} at a time on this machine (from {forecast.measured} missions) and "
+        f"{forecast.disk_bytes / 1e9:.2g} GB"
+    )
