@@ -121,6 +121,7 @@ class AutopilotOnUdp:
         muted: kinds of messages that it no longer sends.
         extra: messages that it sends at every tick besides.
         noise: makes bytes to send at every tick, or None.
+        pause_s: wall time that every tick takes besides.
     """
 
     def __init__(self, autopilot, port):
@@ -128,6 +129,7 @@ class AutopilotOnUdp:
         self.muted = set()
         self.extra = []
         self.noise = None
+        self.pause_s = 0.0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(("127.0.0.1", port))
         self._over = threading.Event()
@@ -146,6 +148,7 @@ class AutopilotOnUdp:
                 except ConnectionError:  # nobody listens yet
                     self._over.wait(TICK_WALL_S)
                     break
+            self._over.wait(self.pause_s)
             messages = [*self.autopilot.advance(inbox), *self.extra]
             frames = [encoder.encode(m) for m in messages if m.get_type() not in self.muted]
             for frame in [self.noise(), *frames] if self.noise else frames:

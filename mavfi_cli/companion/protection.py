@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
+from mavfi_cli.detect.preprocess import take_tick
 from mavfi_cli.spec.detector import DetectorConfig, detector_of, watch_of
 
 MAX_LISTED_ALARMS = 100
@@ -111,7 +113,6 @@ class Protection(NoProtection):
     def __init__(self, config: DetectorConfig, stack: str, wall: WallClock) -> None:
         self._config = config
         self._wall = wall
-        _warm_up(Gate(detector_of(config, stack)))
         detector = detector_of(config, stack)
         stages = frozenset(Stage(name) for name in config.protect)
         self.gate: Gate = Gate(detector, stages, watch=watch_of(config, detector))
@@ -259,8 +260,15 @@ class Protection(NoProtection):
         }
 
 
-def _warm_up(gate: Gate) -> None:
-    """Load and compile everything before the flight. Afterwards the gate is unusable."""
+def is_compiled(config: DetectorConfig, stack: str) -> bool:
+    """Return True if the gate's kernels are compiled. Otherwise `warm_up` takes many seconds."""
+    judge = getattr(detector_of(config, stack), "tick_judge", None)
+    return in_cache(judge or take_tick)
+
+
+def warm_up(config: DetectorConfig, stack: str) -> None:
+    """Load and compile everything that a gate runs. Raises as `detector_of`."""
+    gate = Gate(detector_of(config, stack))
     report = CollisionReport(
         stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
     )

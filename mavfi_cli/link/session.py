@@ -104,7 +104,7 @@ class _Replies:
     def take(self, stamp_s: float) -> list[Message]:
         """Return the collected replies and texts, and our own HEARTBEAT once a second."""
         out, self._answers = self._answers, []
-        if stamp_s >= self._next_heartbeat_s:
+        if not self._next_heartbeat_s - _HEARTBEAT_INTERVAL_S <= stamp_s < self._next_heartbeat_s:
             self._next_heartbeat_s = stamp_s + _HEARTBEAT_INTERVAL_S
             out.append(_heartbeat())
         return out

@@ -159,7 +159,6 @@ def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> Vehic
     )
 
 
-HEARTBEAT_LOSS_S = 5.0  # 4 to 5 missing ones (mavlink.io/en/services/heartbeat.html)
 _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 
@@ -204,7 +203,6 @@ class Telemetry:
         self.battery_voltage_v: float | None = None
         self.texts = TextCollector()
         self.collision_text: str | None = None
-        self.heartbeat_s = -math.inf
         self.history = _StateHistory()
         self._quaternion: FloatArray | None = None  # body FLU -> ENU
 
@@ -212,11 +210,6 @@ class Telemetry:
     def heard(self) -> bool:
         """True once an autopilot has sent a HEARTBEAT."""
         return self.system != 0
-
-    @property
-    def link_lost(self) -> bool:
-        """True if no HEARTBEAT of a known autopilot has arrived for `HEARTBEAT_LOSS_S`."""
-        return self.heard and self.now_s - self.heartbeat_s >= HEARTBEAT_LOSS_S
 
     @property
     def in_air(self) -> bool:
@@ -244,7 +237,6 @@ class Telemetry:
             self.autopilot = ARDUCOPTER if ardupilot else PX4
 
     def _heartbeat(self, message: Message) -> None:
-        self.heartbeat_s = self.now_s
         self.armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
         self.mode = self.autopilot.mode_name(message.custom_mode)
 

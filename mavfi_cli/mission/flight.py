@@ -26,11 +26,12 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Message, Signing, dialect, key_from_file
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
-from mavfi_cli.link.telemetry import HEARTBEAT_LOSS_S, Telemetry
+from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission.briefing import require_flyable
 from mavfi_cli.mission.flight_logger import FlightLogger
+from mavfi_cli.mission.foreign_clock import ForeignClock
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.tables import Trace
@@ -41,7 +42,6 @@ from mavfi_cli.spec.stack import Stack
 SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts as lost
 IDLE_S = 0.1  # period of messages to a silent foreign autopilot
 CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
-LOST_S = 5.0  # time without a new state after which a foreign autopilot counts as lost
 _POSITION = dialect.MAVLink_local_position_ned_message
 _PACKET = dialect.MAVLink_encapsulated_data_message
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -82,8 +82,8 @@ class Flight:
         self.images = ImageReceiver()
         self._frames: list[ImageFrame] = []
         self._camera_asked = False
-        self._unheard_s = self._unspoken_s = 0.0
-        self._on_clock = config.link is None
+        self._clock = None if config.link is None else ForeignClock()
+        self._unspoken_s = 0.0
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
         self.injection = NoInjection()
@@ -229,18 +229,30 @@ class Flight:
 
     def _turn(self) -> None:
         """Receive messages and run the control tick of every state among them."""
-        foreign = self._config.link is not None
-        begun = time.monotonic()
-        with self.wall.measure("wait"):
-            data = self.link.receive(IDLE_S if foreign else SILENCE_S)
-        waited_s = time.monotonic() - begun
-        stamp_s = self._take(data) if data else None
-        if stamp_s is not None and self._tick(stamp_s):
-            self._unheard_s = self._unspoken_s = 0.0
-        elif foreign:
-            self._go_without(waited_s)
-        elif not data:
+        if self._clock is not None:
+            self._turn_by_wall(self._clock)
+        elif data := self._receive(SILENCE_S):
+            self._tick(self._take(data))
+        else:
             raise LinkLost(f"the simulated vehicle said nothing for {SILENCE_S:g} s")
+
+    def _turn_by_wall(self, clock: ForeignClock) -> None:
+        """Run a tick for a foreign autopilot, also without a new state, until it counts as lost."""
+        begun_s = time.monotonic()
+        data = self._receive(IDLE_S)
+        waited_s = time.monotonic() - begun_s
+        stamp_s = self._take(data) if data else None
+        if stamp_s is not None and not clock.heard:
+            self._take_clock(stamp_s)
+        if self._tick(stamp_s):
+            clock.hear(self.stamp_s)
+            self._unspoken_s = 0.0
+        else:
+            self._go_without(clock, waited_s)
+
+    def _receive(self, timeout_s: float) -> bytes:
+        with self.wall.measure("wait"):
+            return self.link.receive(timeout_s)
 
     def _take(self, data: bytes) -> float | None:
         """Handle the messages in the data. Return the stamp of the newest state, s, or None."""
@@ -262,28 +274,31 @@ class Flight:
             and message.get_srcSystem() == system
         )
 
-    def _go_without(self, waited_s: float) -> None:
-        """Run a tick without a new state of a foreign autopilot, until it counts as lost."""
-        self._unheard_s += waited_s
+    def _go_without(self, clock: ForeignClock, waited_s: float) -> None:
+        clock.wait(waited_s)
         self._unspoken_s += waited_s
-        if self._unheard_s >= LOST_S and self._on_clock:
-            raise LinkLost(f"{self._config.link}: no new state was heard for {LOST_S:g} s")
+        limit_s = self._config.loss_limit_s
+        if clock.heard and clock.silence_s >= limit_s:
+            raise LinkLost(f"{self._config.link}: no new state was heard for {limit_s:g} s")
         if self._unspoken_s < IDLE_S:
             return
         self._unspoken_s = 0.0
-        self.stamp_s += IDLE_S
-        self.link.send(self._session.tick(self.stamp_s), self.stamp_s)
+        self.link.send(self._session.tick(clock.now_s), clock.now_s)
         if isinstance(self._session.failure, NoAutopilot):
             raise self._session.failure
 
-    def _tick(self, stamp_s: float) -> bool:
+    def _take_clock(self, stamp_s: float) -> None:
+        """Adopt the foreign vehicle's clock at its first state and restart the session."""
+        telemetry = self._session.telemetry
+        telemetry.now_s = stamp_s
+        self._session = self._new_session(telemetry)
+
+    def _tick(self, stamp_s: float | None) -> bool:
         """Run one control tick: publish due outputs, decide, send the setpoint, then compute.
 
-        Returns False without any effect if the stamp is not new.
+        Returns False without any effect if there is no new stamp.
         """
-        if not self._on_clock:
-            self._take_clock(stamp_s)
-        if stamp_s <= self.stamp_s and len(self.trace):
+        if stamp_s is None or (stamp_s <= self.stamp_s and len(self.trace)):
             return False
         self.stamp_s = stamp_s
         state, companion = self._session.state, self.companion
@@ -302,13 +317,6 @@ class Flight:
             self._session.start_camera(1.0 / self._config.camera_rate_hz)
         self.logger.tell(stamp_s, self._session, companion, self.injection)
         return True
-
-    def _take_clock(self, stamp_s: float) -> None:
-        """Adopt the foreign vehicle's clock at its first state and restart the session."""
-        self._on_clock = True
-        telemetry = self._session.telemetry
-        telemetry.heartbeat_s = telemetry.now_s = stamp_s
-        self._session = self._new_session(telemetry)
 
     def _nearly_up(self, state: VehicleState | None) -> bool:
         """Return True near the take-off height, early enough for a map at the take-over."""
@@ -368,8 +376,6 @@ class Flight:
             )
         elif session.failsafe_text is not None:
             self.end(Outcome.FAILSAFE, session.failsafe_text)
-        elif session.telemetry.link_lost:
-            self.end(Outcome.LINK_LOST, f"no heartbeat for {HEARTBEAT_LOSS_S:g} s")
         elif companion is not None and companion.mode is PilotMode.ARRIVED:
             self.end(Outcome.SUCCESS)
         elif companion is not None and companion.mode is PilotMode.GAVE_UP:

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.autonomy import planners
-from mavfi_cli.autonomy.warm import is_compiled, warm_up
+from mavfi_cli.autonomy import planners, warm
+from mavfi_cli.companion import protection
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
@@ -70,9 +70,7 @@ def fly_mission(
     platform, stack = load_platform(config.platform), stack_of(config)
     planner = planners.find(config.planner)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
-    if not is_compiled():  # first: else a link is full of stale messages by then
-        watcher.on_note(COMPILING)
-    warm_up()
+    _warm_up(config, watcher)  # first: else a link is full of stale messages by then
     with (
         _injection(config, out, repeat, for_debugger, launch) as injection,
         interruptible() as interrupt,
@@ -99,6 +97,17 @@ def fly_mission(
         }
         _write(config, flight, folder, host, *_read_truth(vehicle), crash)
     return folder
+
+
+def _warm_up(config: MissionConfig, watcher: Watcher) -> None:
+    """Load and compile everything that the companion will run."""
+    detector = config.detector
+    known = detector is None or protection.is_compiled(detector, config.stack)
+    if not (warm.is_compiled() and known):
+        watcher.on_note(COMPILING)
+    warm.warm_up()
+    if detector is not None:
+        protection.warm_up(detector, config.stack)
 
 
 def _begin(

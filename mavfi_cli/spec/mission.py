@@ -19,6 +19,7 @@ FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}
 """Real autopilots, and the environment variables that name their SITL binaries."""
 
 OWN_AUTOPILOT = "ours"
+_LOSS_LIMIT_S = 5.0
 Vector3 = tuple[float, float, float]
 LIMITS = {  # minimum and maximum of each number
     "takeoff_height_m": (1.0, 50.0),
@@ -31,6 +32,7 @@ LIMITS = {  # minimum and maximum of each number
     "node_restart_s": (0.0, 3600.0),
     "node_watchdog_s": (0.1, 3600.0),
     "camera_rate_hz": (0.1, 50.0),
+    "loss_limit_s": (0.1, 3600.0),
 }
 
 
@@ -51,6 +53,8 @@ class MissionConfig:
         autopilot: Which autopilot flies the simulated vehicle: ours, or real firmware.
         firmware: SITL binary of a real autopilot; None for that of its environment variable.
         key_file: File with the signing passphrase of the link; None for an unsigned link.
+        loss_limit_s: Time without a new state of a foreign autopilot after which the link counts as
+            lost, on its clock and on the wall's, s.
         realtime: Run the simulated vehicle at wall-clock speed.
         land: Land and disarm at the goal.
         fault: Source-level fault to inject; None for a golden run.
@@ -84,6 +88,7 @@ class MissionConfig:
     autopilot: str = OWN_AUTOPILOT
     firmware: str | None = None
     key_file: str | None = None
+    loss_limit_s: float = _LOSS_LIMIT_S
     land: bool = False
     node_restart_s: float = 1.0
     node_watchdog_s: float = 5.0
@@ -108,7 +113,7 @@ class MissionConfig:
             raise ConfigError("one mission takes one fault", key="instruction")
         if self.fault is not None:
             self.fault.check_within(self.time_limit_s)
-        self._check_key()
+        self._check_link()
         self._check_platform()
         self._check_autopilot()
         for node in self.isolate:
@@ -127,9 +132,13 @@ class MissionConfig:
             if seed is not None and not 0 <= seed < 2**31:
                 raise ConfigError(f"must be within 0 and 2^31 - 1, got {seed}", key=name)
 
-    def _check_key(self) -> None:
-        if self.key_file is not None and self.link is None:
+    def _check_link(self) -> None:
+        if self.link is not None:
+            return
+        if self.key_file is not None:
             raise ConfigError("signs a link to a foreign autopilot: needs --link", key="key_file")
+        if self.loss_limit_s != _LOSS_LIMIT_S:
+            raise ConfigError("is for a foreign autopilot: needs --link", key="loss_limit_s")
 
     def _check_platform(self) -> None:
         if measured_factor(self.platform) is None:
@@ -167,6 +176,8 @@ class MissionConfig:
         del values["isolate"], values["key_file"]
         if self.autopilot == OWN_AUTOPILOT:
             del values["autopilot"], values["firmware"]
+        if self.link is None:
+            del values["loss_limit_s"]
         return values
 
     @property

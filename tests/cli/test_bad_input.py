@@ -17,7 +17,7 @@ from mavfi_cli.mission import flight
 @pytest.fixture
 def refused(command_line, tmp_path, monkeypatch):
     """Run `mavfi fly`, which must end with one line; the line. Also without --quiet."""
-    monkeypatch.setattr("mavfi_cli.mission.run.is_compiled", lambda: True)  # else a line says so
+    monkeypatch.setattr("mavfi_cli.autonomy.warm.is_compiled", lambda: True)  # else a line says so
 
     def run(*arguments, code=1):
         left, out, err = command_line("fly", *arguments)

@@ -5,6 +5,7 @@ import json
 import pytest
 from missions import RECORD, SHORT_LINE
 
+from mavfi_cli.autonomy import warm
 from mavfi_cli.mission import run
 from mavfi_cli.mission.record.run_folder import load_run
 
@@ -12,11 +13,11 @@ from mavfi_cli.mission.record.run_folder import load_run
 @pytest.fixture
 def compiled(monkeypatch):
     """Whatever numba's cache holds on the machine of the tests."""
-    monkeypatch.setattr(run, "is_compiled", lambda: True)
+    monkeypatch.setattr(warm, "is_compiled", lambda: True)
 
 
 def test_the_first_flight_on_a_machine_says_why_it_waits(command_line, monkeypatch):
-    monkeypatch.setattr(run, "is_compiled", lambda: False)
+    monkeypatch.setattr(warm, "is_compiled", lambda: False)
     short = (*SHORT_LINE, "--no-picture", "--time-limit=1")
     _, _, err = command_line(*short)
     assert err.splitlines()[:2] == [run.COMPILING, "Flying solo in farm, seed 5"]

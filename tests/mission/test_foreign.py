@@ -1,36 +1,19 @@
 """Missions with an autopilot at the far end of a UDP socket."""
 
-import contextlib
 import signal
 import socket
-import subprocess
-import sys
 
+import fake_autopilot
 import numpy as np
 import pytest
 from fake_autopilot import FakeArduCopter, FakePX4
 
+from mavfi_cli.autonomy import warm
 from mavfi_cli.core.errors import CommandRefused, ConfigError, Interrupted, NoAutopilot
 from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.session import SessionSettings
-from mavfi_cli.mission import flight, run
+from mavfi_cli.mission import flight
 from mavfi_cli.mission.record.run_folder import load_run
-
-SPEED = 2.0
-
-
-@pytest.fixture
-def sitl_on_udp(free_port):
-    """A stand-alone simulated vehicle that sends to a port; the URL to hear it."""
-    line = [
-        sys.executable, "-m", "sitl", "--world", "farm", "--seed", "5", "--start=2,2,0",
-        "--goal=10,6,5", "--link", f"onboard=udpout:127.0.0.1:{free_port}", "--speed", str(SPEED),
-    ]  # fmt: skip
-    with contextlib.ExitStack() as stack:
-        process = subprocess.Popen(line, stderr=subprocess.DEVNULL)
-        stack.callback(process.wait)
-        stack.callback(process.kill)
-        yield f"udpin:127.0.0.1:{free_port}"
 
 
 def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_event):
@@ -56,12 +39,6 @@ def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_eve
 def test_a_goal_must_be_named(fly_short, free_port):
     with pytest.raises(ConfigError, match="needs --goal"):
         fly_short(link=f"udpin:127.0.0.1:{free_port}", goal=None)
-
-
-@pytest.fixture
-def hurried(monkeypatch):
-    """Seconds of patience are for people; 0.3 s will do for a test."""
-    monkeypatch.setattr(flight, "LOST_S", 0.3)
 
 
 @pytest.fixture
@@ -116,32 +93,51 @@ EVERYTHING = ("HEARTBEAT", "LOCAL_POSITION_NED", "ATTITUDE_QUATERNION", "SYS_STA
               "EXTENDED_SYS_STATE", "HOME_POSITION", "COMMAND_ACK", "STATUSTEXT")  # fmt: skip
 
 
-def test_a_stream_that_stops_in_flight_is_a_lost_link(
-    autopilot_on_udp, fly_short, at_event, hurried
-):
+def test_a_stream_that_stops_in_flight_is_a_lost_link(autopilot_on_udp, fly_short, at_event):
     link, url = autopilot_on_udp(FakePX4())
-    folder = fly_short(at_event("offboard", cut(link, *EVERYTHING)), link=url)
+    folder = fly_short(at_event("offboard", cut(link, *EVERYTHING)), link=url, loss_limit_s=0.3)
     result = load_run(folder.path).result
     assert result["outcome"] == "link_lost"
     assert result["reason"] == f"{url}: no new state was heard for 0.3 s"
 
 
 def test_states_that_stop_while_the_rest_goes_on_are_a_lost_link(
-    autopilot_on_udp, fly_short, at_event, hurried
+    autopilot_on_udp, fly_short, at_event
 ):
     """There never is a silence, only nothing to fly by."""
     link, url = autopilot_on_udp(FakePX4())
     link.extra.append(dialect.MAVLink_vfr_hud_message(0, 0, 0, 0, 0, 0))
-    folder = fly_short(at_event("offboard", cut(link, "LOCAL_POSITION_NED")), link=url)
+    folder = fly_short(
+        at_event("offboard", cut(link, "LOCAL_POSITION_NED")), link=url, loss_limit_s=0.3
+    )
     result = load_run(folder.path).result
     assert result["outcome"] == "link_lost"
     assert "no new state was heard" in result["reason"]
 
 
-def test_heartbeats_that_stop_are_a_lost_link(autopilot_on_udp, fly_short, at_event):
+def test_heartbeats_that_stop_are_no_lost_link(autopilot_on_udp, fly_short, at_event):
+    """Everything else of the autopilot is still heard."""
     link, url = autopilot_on_udp(FakePX4())
-    result = load_run(fly_short(at_event("offboard", cut(link, "HEARTBEAT")), link=url).path).result
-    assert (result["outcome"], result["reason"]) == ("link_lost", "no heartbeat for 5 s")
+    watcher = at_event("offboard", cut(link, "HEARTBEAT"))
+    folder = fly_short(watcher, link=url, loss_limit_s=0.5, time_limit_s=3.0)
+    assert load_run(folder.path).result["outcome"] == "timeout"
+
+
+def test_a_simulator_slower_than_real_time_is_no_lost_link(
+    autopilot_on_udp, fly_short, at_event, monkeypatch
+):
+    """A state every 0.3 s of the wall's clock, 0.1 s of the vehicle's."""
+    monkeypatch.setattr(fake_autopilot, "DT_S", 0.1)
+    link, url = autopilot_on_udp(FakePX4())
+
+    def slow():
+        link.pause_s = 0.3
+
+    watcher = at_event("offboard", slow)
+    folder = fly_short(watcher, link=url, loss_limit_s=1.0, time_limit_s=2.0)
+    result = load_run(folder.path).result
+    assert (result["outcome"], result["config"]["loss_limit_s"]) == ("timeout", 1.0)
+    assert result["host"]["flight_wall_s"] > 3 * result["config"]["time_limit_s"]
 
 
 def test_an_autopilot_that_talks_much_but_tells_no_position_is_not_waited_for_for_ever(
@@ -189,7 +185,7 @@ def test_the_link_opens_only_when_everything_is_loaded(
             probe.bind(("127.0.0.1", free_port))
         loaded.append(True)
 
-    monkeypatch.setattr(run, "warm_up", warm_up)
+    monkeypatch.setattr(warm, "warm_up", warm_up)
     with pytest.raises(NoAutopilot):
         fly_short(link=f"udpin:127.0.0.1:{free_port}")
     assert loaded == [True]

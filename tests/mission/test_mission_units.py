@@ -42,17 +42,27 @@ LIMITED = {
     "takeoff_height_m": (1.0, 50.0), "v_max_mps": (0.1, 12.0), "a_max_mps2": (0.5, 8.0),
     "goal_tolerance_m": (0.1, 50.0), "time_limit_s": (1.0, 86400.0),
     "map_resolution_m": (0.05, 1.0), "map_range_m": (2.0, 25.0), "camera_rate_hz": (0.1, 50.0),
+    "loss_limit_s": (0.1, 3600.0),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", LIMITED)
 def test_limits_are_inclusive_and_named_where_broken(name):
     low, high = LIMITED[name]
+    needed = {"link": "udpin:127.0.0.1:1"} if name == "loss_limit_s" else {}
     for good in (low, high):
-        assert getattr(MissionConfig(**{name: good}), name) == good
+        assert getattr(MissionConfig(**{name: good}, **needed), name) == good
     for bad in (math.nextafter(low, -1), math.nextafter(high, math.inf), math.nan, -math.inf):
         with pytest.raises(ConfigError, match=f"^{name}: must be within"):
             MissionConfig(**{name: bad})
+
+
+def test_a_limit_on_loss_is_for_a_link_and_in_its_record_only():
+    with pytest.raises(ConfigError, match=r"^loss_limit_s: .* needs --link"):
+        MissionConfig(loss_limit_s=10.0)
+    assert "loss_limit_s" not in MissionConfig().to_dict()
+    config = MissionConfig(link="udpin:127.0.0.1:1", loss_limit_s=10.0)
+    assert config.to_dict()["loss_limit_s"] == 10.0
 
 
 @pytest.mark.parametrize("seed", [-1, 2**31])

@@ -1,0 +1,45 @@
+"""The first flight on a machine: everything is compiled before the link opens."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+FLIGHT = """
+import json, sys
+from numba.core import event
+import mavfi_cli as mavfi
+from mavfi_cli.mission import vehicle
+
+class Late(event.Listener):
+    kernels = []
+    def on_start(self, told):
+        self.kernels.append(told.data["dispatcher"].py_func.__name__)
+    def on_end(self, told):
+        pass
+
+def opened(*given, **options):
+    event.register("numba:compile", Late())
+    return real(*given, **options)
+
+real, vehicle.open_transport = vehicle.open_transport, opened
+link, detector, out = sys.argv[1:]
+run = mavfi.fly(
+    link=link, detector={"name": detector}, goal=(8.0, 4.0, 5.0), stack="hardened", out=out
+)
+print(json.dumps({"outcome": run.result["outcome"], "late": Late.kernels}))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("detector", ["gad", "aad"])
+def test_nothing_is_compiled_once_the_link_is_open(sitl_on_udp, tmp_path, detector):
+    cache = tmp_path / "cache"
+    line = [sys.executable, "-c", FLIGHT, sitl_on_udp, detector, str(tmp_path)]
+    done = subprocess.run(
+        line, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, stdout=subprocess.PIPE, check=True
+    )
+    assert json.loads(done.stdout) == {"outcome": "success", "late": []}
+    assert list(cache.rglob("*.nbc"))
