@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.progress import Recorder, Watcher
     from mavfi_cli.mission.record.run_folder import Run
     from mavfi_cli.spec.mission import MissionConfig
 
@@ -22,6 +22,7 @@ def fly(
     *,
     out: str | Path = "runs",
     watcher: Watcher | None = None,
+    recorder: Recorder | None = None,
     **settings: Any,
 ) -> Run:
     """Fly one mission and return its loaded run. A mission that fails is a result, not an error.
@@ -30,6 +31,7 @@ def fly(
         config: Mission; None selects the defaults of `MissionConfig`.
         out: Folder in which the run folder is made.
         watcher: Receives progress and events.
+        recorder: Keeps what the nodes receive: depth frames, clouds, maps and plan requests.
         settings: Fields of `MissionConfig` that replace those of `config`. `fault`, `instruction`
             and `detector` are their dataclasses or mappings with the same keys.
 
@@ -42,7 +44,8 @@ def fly(
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.run import fly_mission
 
-    folder = fly_mission(_mission(config, settings), Path(out), watcher or Watcher())
+    mission = _mission(config, settings)
+    folder = fly_mission(mission, Path(out), watcher or Watcher(), recorder=recorder)
     return load_run(folder.path)
 
 

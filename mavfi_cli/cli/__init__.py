@@ -28,6 +28,7 @@ _COMMANDS = {
     "stacks": ("mavfi_cli.cli.stacks", "List and compare the stacks of the companion."),
     "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),
     "show": ("mavfi_cli.cli.show", "Summarise a recorded run."),
+    "view": ("mavfi_cli.cli.view", "Look at a recorded run in rerun or Foxglove."),
     "doctor": ("mavfi_cli.cli.doctor", "Test what works on this machine."),
 }
 

@@ -159,6 +159,9 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
                 "and the sequence numbers of plans.")  # fmt: skip
 @_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
          show_default=True, help="Parent of the new run folder.")  # fmt: skip
+@_output("--record", metavar="mcap|rrd", type=click.Choice(["mcap", "rrd"]),
+         help="Keep the whole flight with depth frames, clouds and maps, too: flight.mcap for "
+              "Foxglove, flight.rrd for rerun.")  # fmt: skip
 @_output("--picture/--no-picture", default=True, help="Draw flight.svg.", show_default=True)
 @_output("--expect", type=click.Choice(_OUTCOMES),
          help="Exit with code 1 if the outcome differs.")  # fmt: skip
@@ -166,6 +169,7 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def fly(
     out: Path,
+    record: str | None,
     picture: bool,
     expect: str | None,
     as_json: bool,
@@ -179,14 +183,25 @@ def fly(
     """
     from mavfi_cli import library
     from mavfi_cli.cli.progress import progress_view
+    from mavfi_cli.mission.progress import Recorder
+    from mavfi_cli.report import view as viewers
     from mavfi_cli.report.drawing import write_svg
     from mavfi_cli.report.summary import folder_lines, outcome_line, summary_lines
     from mavfi_cli.report.top_view import draw_top_view
+    from mavfi_cli.report.view.entries import ViewedFlight
 
     mission = _mission_of(config)
+    recorder = Recorder() if record else None
+    if record:
+        viewers.require_viewer(Path(f"flight.{record}"))
     with progress_view(mission, quiet=quiet) as view:
-        run = library.fly(mission, out=out, watcher=view)
+        run = library.fly(mission, out=out, watcher=view, recorder=recorder)
     folder = run.folder
+    if record:
+        viewers.save(
+            [ViewedFlight(name="flight", run=run, recorder=recorder)],
+            folder.path / f"flight.{record}",
+        )
     if picture:
         write_svg(draw_top_view(run), folder.picture)
     if as_json:

@@ -29,16 +29,14 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     from mavfi_cli.core.errors import Interrupted
     from mavfi_cli.core.files import file_digest
     from mavfi_cli.core.versions import installed_versions, version_differences
-    from mavfi_cli.fi.tracer.record import read
-    from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.mission.repetition import fly_again
     from mavfi_cli.mission.replay import (
         config_of,
         differing_results,
         first_difference,
         interrupted,
     )
-    from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.report.summary import difference_lines, outcome_line
 
     recorded = load_run(run)
@@ -47,11 +45,8 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
     config = config_of(recorded, with_fault=not without_fault)
     what = "without its fault" if without_fault else "again"
     click.echo(f"flying {config.world}, seed {config.seed}, {what}", err=True)
-    repeat = read(recorded.folder.fault) if config.instruction is not None else None
-    again = load_run(
-        fly_mission(
-            config, out, Watcher(), repeat=repeat, for_debugger=_say_where if gdb else None
-        ).path
+    again = fly_again(
+        recorded, out, with_fault=not without_fault, for_debugger=_say_where if gdb else None
     )
     if interrupted(again):
         shutil.rmtree(again.folder.path)

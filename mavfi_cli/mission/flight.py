@@ -10,8 +10,9 @@ from __future__ import annotations
 import contextlib
 import functools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +58,14 @@ def _signing(config: MissionConfig) -> Signing | None:
     if config.key_file is None:
         return None
     return Signing(key_from_file(Path(config.key_file)), clock=time.time)
+
+
+def _start(
+    before: Callable[[Any, float], None], recorder: Recorder, node: str, value: Any, start_s: float
+) -> None:
+    """Tell the start of an invocation to whoever is told already, and to a recorder."""
+    before(value, start_s)
+    recorder.on_start(node, value, start_s)
 
 
 class Flight:
@@ -149,7 +158,7 @@ class Flight:
         assert self.companion is not None
         recorder.briefing = self._briefing
         for name, node in self.companion.executor.nodes.items():
-            node.on_start = functools.partial(recorder.on_start, name)
+            node.on_start = functools.partial(_start, node.on_start, recorder, name)
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """Return a lower bound of the flight time.

@@ -17,6 +17,14 @@ INK = "#1d232b"
 NOTE = "#5b6573"
 GRID = "#edf0f4"
 # The same thing has the same colour in all pictures. No two kinds of things share a colour.
+OBSTACLE = "#c9ced6"
+PLAN = "#7a8699"
+GOAL = "#1b7f4b"
+FAULT = "#c22f2f"
+ALARM = "#5b8def"
+# Flights of one mission, in the order of their names: golden and faulty flights are blue and
+# orange, as in the paper. Protected flights have their detector's colour.
+FLIGHTS = ("#3a7bd5", "#e8751a", "#b8860b", "#00838f", "#c2185b", "#5d4037")
 NONE = "#8b93a1"  # no protection
 DETECTORS = {"gad": "#6a4fb3", "aad": "#1b7f4b", "range": "#a3a032", "l2": "#c77fae"}
 _PLUG_INS = ("#7f5539", "#4a6d8c", "#5d7052", "#a67c52")  # plug-in detectors, cyclically
@@ -39,6 +47,13 @@ def detector_colours(names: Sequence[str]) -> dict[str, str]:
     return {
         name: known.get(name) or _PLUG_INS[others.index(name) % len(_PLUG_INS)] for name in names
     }
+
+
+def rgb(colour: str) -> tuple[float, float, float]:
+    """Return red, green and blue of a colour, each from 0 to 1."""
+    from matplotlib.colors import to_rgb
+
+    return to_rgb(colour)
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

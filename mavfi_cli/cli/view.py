@@ -1,0 +1,77 @@
+"""`mavfi view`: look at a recorded run in rerun or Foxglove."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from mavfi_cli.mission.progress import Recorder
+    from mavfi_cli.mission.record.run_folder import Run
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--save", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+              help="Write a file instead of opening a window: .rrd for rerun, .mcap for "
+                   "Foxglove.")  # fmt: skip
+def view(run: Path, save: Path | None) -> None:
+    """Show RUN, a run folder, in rerun: world, camera, map, plans, path and all states over time.
+
+    The mission is flown again, because depth frames, clouds and maps are not in the record. A
+    flight with a fault is shown together with its golden flight, which is flown once and kept.
+    """
+    from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.report import view as viewers
+    from mavfi_cli.report.view.entries import ViewedFlight
+
+    viewers.require_viewer(save)
+    recorded = load_run(run)
+    golden = _golden(recorded) if recorded.record.fault else None
+    named = {"golden": golden, "faulty": recorded} if golden else {"flight": recorded}
+    flights = [
+        ViewedFlight(name=name, run=each, recorder=_again(each)) for name, each in named.items()
+    ]
+    if save is None:
+        from mavfi_cli.report.view.rerun_file import show
+
+        show(flights)
+    else:
+        viewers.save(flights, save)
+        click.echo(save)
+
+
+def _golden(run: Run) -> Run | None:
+    """Return the golden flight of the pair; None if it cannot be flown."""
+    from mavfi_cli.core.errors import RecordError
+    from mavfi_cli.mission.golden import paired_golden
+
+    try:
+        return paired_golden(run, _note)
+    except RecordError as error:
+        _note(f"without the golden flight: {error}")
+        return None
+
+
+def _again(run: Run) -> Recorder | None:
+    """Fly a run again and return what its nodes received; None if it does not repeat."""
+    from mavfi_cli.core.errors import RecordError
+    from mavfi_cli.mission.repetition import watch_again
+
+    config = run.record.config
+    _note(f"flying again: {config['world']}, seed {config['seed']}")
+    try:
+        recorder, same = watch_again(run)
+    except RecordError as error:
+        _note(f"without depth frames, cloud and map: {error}; `mavfi fly --record` keeps them")
+        return None
+    if not same:
+        _note(f"warning: {run.folder.path}: the repetition differs: depth frames, cloud and map "
+              "are those of the repetition")  # fmt: skip
+    return recorder
+
+
+def _note(text: str) -> None:
+    click.echo(text, err=True)

@@ -1,0 +1,55 @@
+"""Looking at flights: one stream of entries, and the formats of two viewers that show it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mavfi_cli.core.errors import ConfigError, MavfiError
+
+if TYPE_CHECKING:
+    from mavfi_cli.report.view.entries import ViewedFlight
+
+# Suffix of a file, or None for rerun's window -> what it needs, and the extra that installs it.
+_NEEDED = {
+    None: ("rerun", "view"),
+    ".rrd": ("rerun", "view"),
+    ".mcap": ("mcap_protobuf", "mcap"),
+}
+
+
+def require_viewer(path: Path | None) -> None:
+    """Check that flights can be written to a file of this name, or shown if it is None.
+
+    Raises:
+        ConfigError: The name has another suffix.
+        MavfiError: A package is not installed. Says how to install it.
+    """
+    suffix = None if path is None else path.suffix.lower()
+    if suffix not in _NEEDED:
+        raise ConfigError("name a file that ends in .rrd (rerun) or .mcap (Foxglove)", path=path)
+    package, extra = _NEEDED[suffix]
+    if find_spec(package) is None:
+        what = "rerun's window" if path is None else f"a {suffix} file"
+        raise MavfiError(f"{what} needs more packages: pip install 'mavfi[{extra}]'")
+
+
+def save(flights: Sequence[ViewedFlight], path: Path) -> None:
+    """Write flights for a viewer, atomically, in the format of the file's suffix.
+
+    Raises:
+        ConfigError: The name has another suffix.
+        RecordError: The file could not be written.
+        MavfiError: A package is not installed. Says how to install it.
+    """
+    require_viewer(path)
+    if path.suffix.lower() == ".rrd":
+        from mavfi_cli.report.view.rerun_file import write_rrd
+
+        write_rrd(flights, path)
+    else:
+        from mavfi_cli.report.view.mcap_file import write_mcap
+
+        write_mcap(flights, path)

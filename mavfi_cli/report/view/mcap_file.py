@@ -1,0 +1,263 @@
+"""Flights as an MCAP file for Foxglove, in Foxglove's own schemas.
+
+The states of a tick are one JSON object, because Foxglove has no schema for them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Pose_pb2 import Pose as PoseMessage
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
+from google.protobuf.timestamp_pb2 import Timestamp
+from mcap.writer import Writer
+from mcap_protobuf.schema import register_schema
+
+from mavfi_cli.core.files import plain, write_atomically
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.link.tlog import EPOCH_UNIX_S
+from mavfi_cli.report.drawing import rgb
+from mavfi_cli.report.view.entries import (
+    Boxes,
+    Depth,
+    Entry,
+    Line,
+    Marks,
+    Note,
+    Points,
+    Pose,
+    Values,
+    ViewedFlight,
+    entries_of,
+)
+
+_STATES = "mavfi.States"  # schema of the states of a tick
+_WORLD = "world"  # the frame of all positions
+_AXES = [
+    PackedElementField(name=name, offset=4 * place, type=PackedElementField.FLOAT32)
+    for place, name in enumerate("xyz")
+]
+
+
+def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
+    """Write flights as an MCAP file, atomically. Equal flights give equal bytes.
+
+    The time of a message is that of the flight's tlog: stamp 0 is EPOCH_UNIX_S.
+
+    Raises:
+        RecordError: The file could not be written.
+    """
+    write_atomically(path, lambda file: _write(entries_of(flights), file))
+
+
+def _write(entries: Iterable[Entry], file: BinaryIO) -> None:
+    writer = Writer(file)
+    writer.start(library="mavfi")
+    schemas: dict[str, int] = {}
+    channels: dict[str, int] = {}
+    for entry in entries:
+        time_ns = _time_ns(entry)
+        for topic, message in _messages(entry):
+            if topic not in channels:
+                channels[topic] = _channel(writer, schemas, topic, message)
+            writer.add_message(channels[topic], time_ns, _encoded(message), time_ns)
+    writer.finish()
+
+
+def _time_ns(entry: Entry) -> int:
+    return EPOCH_UNIX_S * 10**9 + round(entry.stamp_s * 1e9)
+
+
+def _encoded(message: Message | dict[str, Any]) -> bytes:
+    if isinstance(message, Message):
+        data: bytes = message.SerializeToString(deterministic=True)
+        return data
+    return json.dumps(plain(message), allow_nan=False).encode()
+
+
+def _channel(
+    writer: Writer, schemas: dict[str, int], topic: str, message: Message | dict[str, Any]
+) -> int:
+    """Register the channel of a topic, and the schema of its messages if it is new."""
+    if isinstance(message, Message):
+        encoding, name = "protobuf", message.DESCRIPTOR.full_name
+        if name not in schemas:
+            schemas[name] = register_schema(writer, type(message))
+    else:
+        encoding, name = "json", _STATES
+        if name not in schemas:
+            schemas[name] = writer.register_schema(name, "jsonschema", _schema(message))
+    channel: int = writer.register_channel(topic, encoding, schemas[name])
+    return channel
+
+
+def _schema(message: dict[str, Any]) -> bytes:
+    """Return the JSON schema of an object of numbers."""
+    properties = {name: {"type": ["number", "boolean", "null"]} for name in message}
+    return json.dumps({"type": "object", "properties": properties}).encode()
+
+
+def _messages(entry: Entry) -> Iterator[tuple[str, Message | dict[str, Any]]]:
+    """Yield what an MCAP file holds of an entry, each with its topic."""
+    topic = f"/{entry.path}"
+    match entry:
+        case Boxes():
+            yield topic, _scene(entry, cubes=_cubes(entry))
+        case Marks():
+            size = Vector3(**dict.fromkeys("xyz", 2.0 * entry.radius_m))
+            colour = _colour(entry.colour)
+            spheres = [
+                SpherePrimitive(pose=_pose(centre), size=size, color=colour)
+                for centre in entry.centres_enu_m
+            ]
+            yield topic, _scene(entry, spheres=spheres)
+        case Line():
+            yield topic, _scene(entry, lines=[_strip(entry)])
+        case Points():
+            yield topic, _cloud(entry)
+        case Pose():
+            half = entry.yaw_rad / 2.0
+            pose = _pose(entry.position_enu_m, (math.cos(half), 0.0, 0.0, math.sin(half)))
+            yield topic, PoseInFrame(timestamp=_timestamp(entry), frame_id=_WORLD, pose=pose)
+        case Note():
+            level = Log.WARNING if entry.urgent else Log.INFO
+            yield (
+                topic,
+                Log(timestamp=_timestamp(entry), level=level, message=entry.text, name=entry.kind),
+            )
+        case Values():
+            yield topic, dict(entry.values)
+        case Depth():
+            yield from _camera(entry)
+
+
+# Messages ----------------------------------------------------------------------------------------
+
+
+def _timestamp(entry: Entry) -> Timestamp:
+    seconds, nanos = divmod(_time_ns(entry), 10**9)
+    return Timestamp(seconds=seconds, nanos=nanos)
+
+
+def _colour(colour: str) -> Color:
+    red, green, blue = rgb(colour)
+    return Color(r=red, g=green, b=blue, a=1.0)
+
+
+def _pose(position: FloatArray, quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> PoseMessage:
+    """Return a pose from a position (3,) and a quaternion w x y z."""
+    return PoseMessage(position=_vector(position), orientation=_turn(quaternion))
+
+
+def _vector(vector: FloatArray) -> Vector3:
+    x, y, z = vector.tolist()
+    return Vector3(x=x, y=y, z=z)
+
+
+def _turn(quaternion: Sequence[float]) -> Quaternion:
+    w, x, y, z = quaternion
+    return Quaternion(w=w, x=x, y=y, z=z)
+
+
+def _optical(quaternion: FloatArray) -> tuple[float, float, float, float]:
+    """Turn a camera's axes (4,) from x forward, y left to z forward, x right."""
+    w, x, y, z = (quaternion / 2.0).tolist()
+    return w + x - y + z, x - w - y - z, w + x + y - z, x - w + y + z
+
+
+def _scene(entry: Entry, **primitives: Any) -> SceneUpdate:
+    """Return the scene of an entry's primitives. It replaces what the entry's path had before."""
+    entity = SceneEntity(timestamp=_timestamp(entry), frame_id=_WORLD, id=entry.path, **primitives)
+    return SceneUpdate(entities=[entity])
+
+
+def _cubes(entry: Boxes) -> list[CubePrimitive]:
+    colour = _colour(entry.colour)
+    return [
+        CubePrimitive(pose=_pose(centre), size=_vector(size), color=colour)
+        for centre, size in zip(entry.centres_enu_m, entry.sizes_m, strict=True)
+    ]
+
+
+def _strip(entry: Line) -> LinePrimitive:
+    return LinePrimitive(
+        type=LinePrimitive.LINE_STRIP,
+        pose=_pose(np.zeros(3)),
+        thickness=entry.width_m,
+        points=[Point3(x=x, y=y, z=z) for x, y, z in entry.points_enu_m.tolist()],
+        color=_colour(entry.colour),
+    )
+
+
+def _cloud(entry: Points) -> PointCloud:
+    return PointCloud(
+        timestamp=_timestamp(entry),
+        frame_id=_WORLD,
+        pose=_pose(np.zeros(3)),
+        point_stride=12,
+        fields=_AXES,
+        data=entry.points_enu_m.astype("<f4").tobytes(),
+    )
+
+
+def _camera(entry: Depth) -> Iterator[tuple[str, Message]]:
+    """Yield the frame in metres, the lens, and the pose of the optical frame."""
+    frame, stamp = entry.frame, _timestamp(entry)
+    name = entry.path
+    rows, columns = frame.depth_m.shape
+    focal = columns / 2.0 / math.tan(frame.hfov_rad / 2.0)
+    across, down = columns / 2.0, rows / 2.0
+    yield (
+        f"/{name}/pose",
+        FrameTransform(
+            timestamp=stamp,
+            parent_frame_id=_WORLD,
+            child_frame_id=name,
+            translation=_vector(frame.position_enu_m),
+            rotation=_turn(_optical(frame.quaternion)),
+        ),
+    )
+    yield (
+        f"/{name}/calibration",
+        CameraCalibration(
+            timestamp=stamp,
+            frame_id=name,
+            width=columns,
+            height=rows,
+            K=[focal, 0.0, across, 0.0, focal, down, 0.0, 0.0, 1.0],
+            P=[focal, 0.0, across, 0.0, 0.0, focal, down, 0.0, 0.0, 0.0, 1.0, 0.0],
+        ),
+    )
+    yield (
+        f"/{name}/depth",
+        RawImage(
+            timestamp=stamp,
+            frame_id=name,
+            width=columns,
+            height=rows,
+            encoding="32FC1",
+            step=4 * columns,
+            data=frame.depth_m.astype("<f4").tobytes(),
+        ),
+    )

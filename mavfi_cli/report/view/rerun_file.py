@@ -1,0 +1,216 @@
+"""Flights in rerun: in its viewer, or as an .rrd file that it opens."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.states import of_stage
+from mavfi_cli.core.types import Stage
+from mavfi_cli.report.drawing import rgb
+from mavfi_cli.report.view.entries import (
+    Boxes,
+    Depth,
+    Entry,
+    Line,
+    Marks,
+    Note,
+    Points,
+    Pose,
+    Values,
+    ViewedFlight,
+    entries_of,
+)
+
+_TIME = "simulated_time"
+_BODY_M = (0.25, 0.25, 0.08)  # half sizes of the box that stands for the vehicle
+_VEHICLE = {  # plots of columns that are no states
+    "position": ("x_m", "y_m", "z_m"),
+    "velocity": ("vx_mps", "vy_mps", "vz_mps"),
+    "clearance": ("truth_clearance_m",),
+    "power": ("power_regression_w", "power_propeller_w"),
+}
+
+
+def write_rrd(flights: Sequence[ViewedFlight], path: Path) -> None:
+    """Write flights as an .rrd file, atomically.
+
+    Raises:
+        RecordError: The file could not be written.
+    """
+    recording = _recording(flights)
+    stream = recording.binary_stream()
+    _log(recording, flights)
+    write_atomically(path, lambda file: file.write(stream.read(flush=True) or b""))
+
+
+def show(flights: Sequence[ViewedFlight]) -> None:
+    """Open flights in rerun's viewer, which stays open.
+
+    Raises:
+        MavfiError: There is no display.
+    """
+    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        raise MavfiError("there is no display for rerun's window: use --save FILE.rrd")
+    recording = _recording(flights)
+    recording.spawn()
+    _log(recording, flights)
+    recording.flush()
+
+
+def _recording(flights: Sequence[ViewedFlight]) -> Any:
+    import rerun as rr
+
+    return rr.RecordingStream("mavfi", recording_id=flights[-1].run.folder.path.resolve().name)
+
+
+def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
+    import rerun as rr
+
+    recording.send_blueprint(_blueprint(flights))
+    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for flight in flights:
+        body = rr.Boxes3D(half_sizes=[_BODY_M], colors=[rgb(flight.colour)], fill_mode="solid")
+        recording.log(f"{flight.name}/vehicle", body, static=True)
+    _log_entries(recording, entries_of(flights))
+
+
+def _log_entries(recording: Any, entries: Iterable[Entry]) -> None:
+    """Log entries one by one, but the numbers of all ticks at the end: a column at a time."""
+    import rerun as rr
+
+    numbers: dict[str, list[Values]] = {}
+    for entry in entries:
+        if isinstance(entry, Values):
+            numbers.setdefault(entry.path, []).append(entry)
+            continue
+        recording.set_time(_TIME, duration=entry.stamp_s)
+        for path, archetype in _archetypes(entry):
+            recording.log(path, archetype)
+    for path, ticks in numbers.items():
+        for name in ticks[0].values:
+            told = [(tick.stamp_s, tick.values[name]) for tick in ticks]
+            stamps, values = zip(*((s, float(v)) for s, v in told if v is not None), strict=True)
+            time = rr.TimeColumn(_TIME, duration=stamps)
+            recording.send_columns(f"{path}/{name}", [time], rr.Scalars.columns(scalars=values))
+
+
+def _archetypes(entry: Entry) -> list[tuple[str, Any]]:
+    """Return what rerun logs of an entry, with the path of each part."""
+    import rerun as rr
+
+    match entry:
+        case Boxes():
+            shown: Any = rr.Boxes3D(
+                centers=entry.centres_enu_m,
+                half_sizes=entry.sizes_m / 2.0,
+                colors=[rgb(entry.colour)],
+                fill_mode="solid",
+            )
+        case Marks():
+            shown = rr.Points3D(
+                entry.centres_enu_m, radii=[entry.radius_m], colors=[rgb(entry.colour)]
+            )
+        case Points():
+            shown = rr.Points3D(entry.points_enu_m, radii=[0.03], colors=[rgb(entry.colour)])
+        case Line():
+            shown = rr.LineStrips3D(
+                [entry.points_enu_m], radii=[entry.width_m / 2.0], colors=[rgb(entry.colour)]
+            )
+        case Pose():
+            turn = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=entry.yaw_rad)
+            shown = rr.Transform3D(translation=entry.position_enu_m, rotation=turn)
+        case Note():
+            shown = rr.TextLog(
+                f"{entry.kind}: {entry.text}", level="WARN" if entry.urgent else "INFO"
+            )
+        case Depth():
+            return _camera(entry)
+        case _:
+            raise TypeError(entry)
+    return [(entry.path, shown)]
+
+
+def _camera(entry: Depth) -> list[tuple[str, Any]]:
+    """Return the camera's pose and lens, and the frame; pixels without a measurement are 0."""
+    import rerun as rr
+
+    frame = entry.frame
+    rows, columns = frame.depth_m.shape
+    w, x, y, z = frame.quaternion
+    depth_m = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0).astype(np.float32)
+    return [
+        (entry.path, rr.Transform3D(translation=frame.position_enu_m, quaternion=[x, y, z, w])),
+        (
+            entry.path,
+            rr.Pinhole(
+                focal_length=columns / 2.0 / math.tan(frame.hfov_rad / 2.0),
+                width=columns,
+                height=rows,
+                camera_xyz=rr.ViewCoordinates.FLU,
+                image_plane_distance=1.0,
+            ),
+        ),
+        (f"{entry.path}/depth", rr.DepthImage(depth_m, meter=1.0)),
+    ]
+
+
+def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
+    """Return the layout: world, cameras and events on the left, a tab of plots a stage beside."""
+    import rerun.blueprint as rrb
+
+    names = [flight.name for flight in flights]
+
+    def plots(groups: dict[str, Sequence[str]]) -> list[Any]:
+        return [
+            rrb.TimeSeriesView(
+                name=group,
+                contents=[f"/{name}/states/{state}" for name in names for state in states],
+            )
+            for group, states in groups.items()
+        ]
+
+    tabs = [rrb.Vertical(*plots(_groups(stage)), name=stage.value) for stage in Stage]
+    cameras = [rrb.Spatial2DView(origin=f"/{name}/camera", name=f"{name}: depth") for name in names]
+    events = rrb.TextLogView(contents=[f"/{name}/events" for name in names], name="events")
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                rrb.Spatial3DView(name="world", eye_controls=_eye(flights[0])),
+                rrb.Horizontal(*cameras, events),
+                row_shares=[3, 1],
+            ),
+            rrb.Tabs(*tabs, rrb.Vertical(*plots(dict(_VEHICLE)), name="vehicle")),
+            column_shares=[3, 2],
+        ),
+        collapse_panels=True,
+    )
+
+
+def _eye(flight: ViewedFlight) -> Any:
+    """Look at the middle of the way from the south-west, from above; None without a way."""
+    import rerun.blueprint as rrb
+
+    record = flight.run.record
+    start, goal = record.world.get("start"), record.goal_enu_m
+    if start is None or goal is None:
+        return None
+    middle, far_m = np.add(start, goal) / 2.0, math.dist(start, goal)
+    away = far_m * np.array([-0.6, -0.8, 0.8])
+    return rrb.EyeControls3D(position=middle + away, look_target=middle)
+
+
+def _groups(stage: Stage) -> dict[str, Sequence[str]]:
+    """Return the states of a stage by the group that one plot shows."""
+    groups: dict[str, Sequence[str]] = {}
+    for state in of_stage(stage):
+        groups[state.group] = (*groups.get(state.group, ()), state.name)
+    return groups
