@@ -57,7 +57,7 @@ def test_a_configuration_and_settings_go_together(short_config, monkeypatch, tmp
     class Flown(Exception):
         pass
 
-    def fly_mission(config, out, watcher):
+    def fly_mission(config, out, watcher, recorder):
         flown.append((config, out))
         raise Flown
 
