@@ -17,6 +17,7 @@ import itertools
 import re
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
@@ -38,8 +39,8 @@ MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
 
 _MARKER = re.compile(rb"[\xfd\xfe]")
 _SIGNED = 0x01
-_HEADER = struct.Struct("<BBBBBBBHB")
 _INCOMPLETE = -1
+_PACKET = "ENCAPSULATED_DATA"  # half of all messages; its array stays in one piece
 
 _KINDS: dict[int, _Kind] = {}
 
@@ -160,8 +161,9 @@ __all__ = ["MAX_FRAME_LENGTH", "Codec", "Message", "Signing", "dialect"]
 Message = Any  # an instance of one of pymavlink's generated message classes
 
 
-_V1, _V2 = 0xFE, 0xFD
-_V2_HEADER = 10  # bytes
+_MARKERS = _V1, _V2 = 0xFE, 0xFD
+_V2_MARKER = bytes([_V2])
+_V1_HEADER, _V2_HEADER = 6, 10  # bytes
 
 
 def _slow_crc(data: bytes, initial: int = 0xFFFF) -> int:
@@ -184,71 +186,86 @@ class _Kind:
     An array of bytes is packed and unpacked in one piece, which is faster than byte by byte.
     """
 
-    __slots__ = ("build", "crc_extra", "message_id", "pack", "read", "size", "unpack", "values")
+    __slots__ = ("build", "crc_extra", "number", "pack", "read", "size", "unpack", "values")
 
     def __init__(self, cls: Any) -> None:
         layout = struct.Struct(re.sub(r"(\d+)B", r"\1s", cls.unpacker.format))
         self.build: Callable[..., Message] = cls
-        self.message_id: int = cls.id
+        self.number: bytes = cls.id.to_bytes(3, "little")
         self.crc_extra = bytes([cls.crc_extra])
         self.size: int = layout.size
         self.unpack: Callable[[bytes], tuple[Any, ...]] = layout.unpack
         self.pack: Callable[..., bytes] = layout.pack
-        self.read = _reader(cls)
-        self.values = _writer(cls)
+        types = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
+        fields = [
+            _Field(cls.msgname, name, types[name], length)
+            for name, length in zip(cls.ordered_fieldnames, cls.lengths, strict=True)
+        ]
+        self.read = _reader(fields, cls.orders)
+        self.values = _writer(fields)
 
 
-def _byte_arrays(cls: Any) -> set[str]:
-    """The fields of a message class that are arrays of bytes."""
-    lengths = dict(zip(cls.ordered_fieldnames, cls.lengths, strict=True))
-    types = zip(cls.fieldnames, cls.fieldtypes, strict=True)
-    return {name for name, kind in types if kind == "uint8_t" and lengths[name] > 1}
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """A field of a message. A text, like a number, has length 1."""
+
+    message: str
+    name: str
+    type: str
+    length: int
+
+    @property
+    def values(self) -> int:
+        """Number of values on the wire, where an array of bytes is one."""
+        return 1 if self.type == "uint8_t" else self.length
+
+    @property
+    def is_plain(self) -> bool:
+        """True if the value on the wire is the constructor's argument."""
+        packet = self.message == _PACKET and self.values == 1
+        return packet or (self.length == 1 and self.type != "char")
 
 
-def _reader(cls: Any) -> Callable[[tuple[Any, ...]], Sequence[Any]]:
-    """Turns unpacked wire values into the constructor's arguments."""
-    of_bytes = [name in _byte_arrays(cls) for name in cls.ordered_fieldnames]
-    widths = [1 if whole else n for whole, n in zip(of_bytes, cls.lengths, strict=True)]
-    starts = [0, *itertools.accumulate(widths)]
-    spans = [(starts[order], cls.lengths[order], of_bytes[order]) for order in cls.orders]
-    has_text = "char" in cls.fieldtypes
-    if not has_text and len(spans) > 1 and all(length == 1 for _, length, _ in spans):
-        getter: Callable[[tuple[Any, ...]], Sequence[Any]] = itemgetter(*(s for s, _, _ in spans))
+def _reader(
+    fields: Sequence[_Field], orders: Sequence[int]
+) -> Callable[[tuple[Any, ...]], Sequence[Any]]:
+    """Return a function from unpacked wire values to the constructor's arguments."""
+    starts = [0, *itertools.accumulate(field.values for field in fields)]
+    wire = [(starts[order], fields[order]) for order in orders]
+    if len(wire) > 1 and all(field.is_plain for _, field in wire):
+        getter: Callable[[tuple[Any, ...]], Sequence[Any]] = itemgetter(*(s for s, _ in wire))
         return getter
+    spans = [(start, start + each.values, each.length, each.type == "char") for start, each in wire]
 
     def read(values: tuple[Any, ...]) -> Sequence[Any]:
         """Return arrays as lists and texts without padding."""
-        fields = [
-            values[start]
-            if length == 1
-            else list(values[start] if whole else values[start : start + length])
-            for start, length, whole in spans
-        ]
-        if has_text:
-            return [f.rstrip(b"\0") if isinstance(f, bytes) else f for f in fields]
-        return fields
+        arguments = []
+        for start, end, length, text in spans:
+            value = values[start]
+            if length > 1:
+                value = list(value if end == start + 1 else values[start:end])
+            arguments.append(value.rstrip(b"\0") if text else value)
+        return arguments
 
     return read
 
 
-def _writer(cls: Any) -> Callable[[Message], Sequence[Any]]:
+def _writer(fields: Sequence[_Field]) -> Callable[[Message], Sequence[Any]]:
     """Return a function that converts a message to the values of its wire layout."""
-    texts = {n for n, t in zip(cls.fieldnames, cls.fieldtypes, strict=True) if t == "char"}
-    names = [f"_{name}_raw" if name in texts else name for name in cls.ordered_fieldnames]
-    if len(names) > 1 and all(length == 1 for length in cls.lengths):
+    names = [f"_{each.name}_raw" if each.type == "char" else each.name for each in fields]
+    if len(names) > 1 and all(field.length == 1 for field in fields):
         getter: Callable[[Message], Sequence[Any]] = attrgetter(*names)
         return getter
-    of_bytes = _byte_arrays(cls)
-    fields = [(n, length, n in of_bytes) for n, length in zip(names, cls.lengths, strict=True)]
+    shapes = [(n, each.length, each.values) for n, each in zip(names, fields, strict=True)]
 
     def values(message: Message) -> Sequence[Any]:
         """Return the values with arrays flattened."""
         flat: list[Any] = []
-        for name, length, whole in fields:
+        for name, length, count in shapes:
             value = getattr(message, name)
             if length == 1:
                 flat.append(value)
-            elif whole:
+            elif count == 1:
                 flat.append(bytes(value[:length]))
             else:
                 flat.extend(value[:length])
@@ -309,14 +326,11 @@ class Codec:
             raise ValueError(f"{type(message).__name__} is not a message of the dialect")
         payload = kind.pack(*kind.values(message)).rstrip(b"\0") or b"\0"
         flags = 0 if self._signing is None else _SIGNED
-        number = kind.message_id
-        head = _HEADER.pack(
-            _V2, len(payload), flags, 0, self._sequence, self.system, self.component,
-            number & 0xFFFF, number >> 16,
-        )  # fmt: skip
+        header = (len(payload), flags, 0, self._sequence, self.system, self.component)
         self._sequence = (self._sequence + 1) & 0xFF
-        frame = head + payload
-        frame += _crc(frame[1:] + kind.crc_extra).to_bytes(2, "little")
+        checked = bytes(header) + kind.number + payload
+        crc = _crc(checked + kind.crc_extra)
+        frame = _V2_MARKER + checked + crc.to_bytes(2, "little")
         return frame if self._signing is None else frame + self._signing.sign(frame)
 
     def decode(self, data: bytes, *, datagram: bool = False) -> list[Message]:
@@ -329,7 +343,7 @@ class Codec:
         messages: list[Message] = []
         position, end = 0, len(buffer)
         while position < end:
-            if buffer[position] not in (_V2, _V1):
+            if buffer[position] not in _MARKERS:
                 marker = _MARKER.search(buffer, position)
                 following = marker.start() if marker else end
                 self.bad_bytes += following - position
@@ -338,32 +352,32 @@ class Codec:
             length = _frame_length(buffer, position, end)
             if length == _INCOMPLETE and not datagram:
                 break
-            after = position + length
-            bounded = after == end or (after < end and buffer[after] in (_V2, _V1))
-            if length <= 0 or not self._take(buffer[position:after], messages, bounded):
+            if length > 0 and self._take(buffer, position, position + length, messages):
+                position += length
+            else:
                 self.bad_bytes += 1
                 position += 1
-            else:
-                position = after
         self._rest = buffer[position:]
         self.decoded += len(messages)
         return messages
 
-    def _take(self, frame: bytes, messages: list[Message], bounded: bool) -> bool:
+    def _take(self, buffer: bytes, start: int, end: int, messages: list[Message]) -> bool:
         """Append the message of a candidate frame. Return False if its checksum is wrong.
 
         The checksum includes a byte that is unknown for an id that the dialect lacks, so noise
-        passes the check once in 256 times. Such a frame must also be `bounded` by another frame or
+        passes the check once in 256 times. Such a frame must also be followed by another frame or
         the end.
         """
-        header = 10 if frame[0] == _V2 else 6
-        signed = header == 10 and bool(frame[2] & _SIGNED)
+        frame = buffer[start:end]
+        header = _V2_HEADER if frame[0] == _V2 else _V1_HEADER
+        signed = header == _V2_HEADER and bool(frame[2] & _SIGNED)
         crc_at = header + frame[1]
         crc = frame[crc_at] | frame[crc_at + 1] << 8
-        number = frame[5] if header == 6 else frame[7] | frame[8] << 8 | frame[9] << 16
+        number = frame[5] if header == _V1_HEADER else frame[7] | frame[8] << 8 | frame[9] << 16
         kind = _KINDS.get(number) or _kind(number)
         if kind is None:
             # Test whether any extra byte makes the checksum right.
+            bounded = buffer[end : end + 1] in (b"", b"\xfd", b"\xfe")
             if not bounded or crc ^ (_crc(frame[1:crc_at]) >> 8) not in _CRC_TABLE:
                 return False
             self.unknown += 1
@@ -406,12 +420,11 @@ def _build(kind: _Kind, frame: bytes, header: int, crc: int) -> Message:
     values = kind.unpack(payload.ljust(size, b"\0")[:size])
     message = kind.build(*kind.read(values))
     head = message._header
-    head.mlen = frame[1]
-    if header == 10:
-        head.incompat_flags, head.compat_flags, *source = frame[2:7]
+    if header == _V2_HEADER:
+        head.mlen, head.incompat_flags, head.compat_flags = frame[1:4]
+        head.seq, head.srcSystem, head.srcComponent = frame[4:7]
     else:
-        source = list(frame[2:5])
-    head.seq, head.srcSystem, head.srcComponent = source
+        head.mlen, head.seq, head.srcSystem, head.srcComponent = frame[1:5]
     message._msgbuf = frame
     message._payload = payload
     message._crc = crc

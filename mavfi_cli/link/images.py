@@ -52,9 +52,6 @@ def _hfov_of(message: Message) -> float | None:
     return None
 
 
-_DATA_AT, _DATA_BYTES = 2, 253  # in the payload of ENCAPSULATED_DATA, behind `seqnr`
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageFrame:
     """A complete image from the camera."""
@@ -111,7 +108,7 @@ class _Assembly:
         if self.trials_left <= 0:
             return None
         self.trials_left -= 1
-        image = b"".join(data[: shape.payload] for data in packets)[: shape.size]
+        image = b"".join([data[: shape.payload] for data in packets])[: shape.size]
         agreed = self.checksum is None or zlib.crc32(image) == self.checksum
         return image if agreed else None
 
@@ -136,6 +133,8 @@ class ImageReceiver:
         self.hfov_rad: float | None = None
         self.received = 0
         self._shape: _Shape | None = None
+        self._places = _RECENT_PACKETS  # packets in a frame of this shape
+        self._reach = _RECENT_PACKETS  # a packet's largest distance from its due time, in messages
         self._open: list[_Assembly] = []  # oldest first
         self._count = 0  # messages of the protocol so far
         self._recent: deque[tuple[int, int, bytes]] = deque(maxlen=_RECENT_PACKETS)
@@ -177,8 +176,8 @@ class ImageReceiver:
         stamp_s = message.time_boot_ms / 1e3
         frame = _Assembly(message.image_index, stamp_s, checksum, self._count)
         for count, place, data in self._recent:
-            if self._fits(place):
-                frame.offer(place, data, count, self._reach())
+            if place < self._places:
+                frame.offer(place, data, count, self._reach)
         self._open.append(frame)
         self._open.sort(key=lambda each: each.index)
         while self._open and self._open[0].index <= self._newest - _OPEN_FRAMES:
@@ -209,6 +208,7 @@ class ImageReceiver:
             return []
         if shape != self._shape:
             self._shape = shape
+            self._places, self._reach = shape.packets, shape.packets + 2
             self._latest = {p: data for p, data in self._latest.items() if p < shape.packets}
             self._fresh &= self._latest.keys()
             for frame in self._open:
@@ -216,33 +216,29 @@ class ImageReceiver:
                 frame.strays = sum(off > _STRAY for off, _ in frame.near.values())
         return self._finish(self._open)
 
-    def _fits(self, place: int) -> bool:
-        """Return True if the place exists in a frame of the known size, or the size is unknown."""
-        return place < (_RECENT_PACKETS if self._shape is None else self._shape.packets)
-
-    def _reach(self) -> int:
-        """Return a packet's maximum distance from its due time, in messages: about one frame."""
-        return _RECENT_PACKETS if self._shape is None else self._shape.packets + 2
-
     def _packet(self, message: Message) -> list[ImageFrame]:
-        place, data = message.seqnr, _data(message)
+        place, data = message.seqnr, bytes(message.data)
         self._count += 1
-        if not self._fits(place):
+        if place >= self._places:
             return []
         self._recent.append((self._count, place, data))
         self._latest[place] = data
         self._fresh.add(place)
-        reach = self._reach()
         for frame in self._open:
-            frame.offer(place, data, self._count, reach)
+            frame.offer(place, data, self._count, self._reach)
         if self._shape is None:
             return []
-        if len(self._fresh) >= self._shape.packets:
+        if len(self._fresh) >= self._places:
             return self._finish(self._open)
-        last = self._count - 1 - self._shape.packets  # announced then, a frame has had its time
-        return self._finish(
-            [f for f in self._open if f.improved and (not f.strays or f.announced <= last)]
-        )
+        last = self._count - 1 - self._places  # announced then, a frame has had its time
+        ready = [
+            frame
+            for frame in self._open
+            if frame.improved
+            and len(frame.near) == self._places
+            and (not frame.strays or frame.announced <= last)
+        ]
+        return self._finish(ready) if ready else []
 
     def _finish(self, frames: list[_Assembly]) -> list[ImageFrame]:
         """Close and return the complete ones of some open frames."""
@@ -289,14 +285,6 @@ _HANDLERS: dict[type, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
 }
 
 
-def _data(message: Message) -> bytes:
-    """The data of a packet, from the payload that was received: faster than from a list."""
-    payload: bytes | None = message.get_payload()
-    if payload is None:
-        return bytes(message.data)
-    return payload[_DATA_AT:].ljust(_DATA_BYTES, b"\0")
-
-
 def _shape_of(message: Message) -> _Shape | None:
     """Return the announced size, or None if it is inconsistent or too large."""
     columns, rows, payload = message.width, message.height, message.payload
@@ -327,7 +315,7 @@ def depth_frame(
     offset_enu_m = rotation_matrix(state.quaternion) @ np.asarray(mount_offset_flu_m, np.float64)
     return DepthFrame(
         stamp_s=image.stamp_s,
-        depth_m=_DEPTH_M[image.pixels],
+        depth_m=_DEPTH_M.take(image.pixels),
         hfov_rad=hfov_rad if image.hfov_rad is None else image.hfov_rad,
         position_enu_m=state.position_enu_m + offset_enu_m,
         quaternion=state.quaternion,

@@ -7,7 +7,7 @@ Lockstep, real time and tests drive it the same way. Call `handle` with every re
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -40,36 +40,6 @@ _HEIGHT_REACHED_M = 0.3  # tolerance below the take-off height
 _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the vehicle itself
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Target:
-    """A setpoint for the autopilot. The default holds position and heading."""
-
-    velocity_enu_mps: Sequence[float] = (0.0, 0.0, 0.0)
-    yaw_enu_rad: float | None = None  # None: keep the heading
-    acceleration_enu_mps2: Sequence[float] | None = None  # feed-forward
-
-    def message(self, stamp_s: float, system: int, component: int) -> Message:
-        """Return the message for one stamp.
-
-        A value beyond float32 becomes infinity, as in a C++ companion, and NaN stays NaN. The
-        autopilot decides how to handle a corrupted command.
-        """
-        mask, yaw, ax, ay, az = _IGNORED, 0.0, 0.0, 0.0, 0.0
-        east, north, up = map(_float32, self.velocity_enu_mps)
-        if self.acceleration_enu_mps2 is None:
-            mask |= _NO_ACCELERATION
-        else:
-            ay, ax, az = map(_float32, self.acceleration_enu_mps2)
-        if self.yaw_enu_rad is None:
-            mask |= _NO_YAW
-        else:
-            yaw = ned_yaw_from_enu(self.yaw_enu_rad)
-        return dialect.MAVLink_set_position_target_local_ned_message(
-            round(stamp_s * 1e3) & 0xFFFF_FFFF, system, component, dialect.MAV_FRAME_LOCAL_NED,
-            mask, 0.0, 0.0, 0.0, north, east, -up, ax, ay, -az, yaw, 0.0,
-        )  # fmt: skip
-
-
 def _float32(value: float) -> float:
     number = float(value)
     return math.copysign(math.inf, number) if abs(number) > _LARGEST_FLOAT32 else number
@@ -83,18 +53,10 @@ class _Replies:
         self._next_heartbeat_s = -math.inf
         self._texts = 0
 
-    def handle(self, message: Message, now_s: float) -> None:
-        """Handle a message. Replies to our own requests need no reply."""
-        if len(self._answers) >= _MAX_ANSWERS:
-            return
-        if _asks_time(message):
-            own_ns = round(now_s * 1e9)
-            self._answers.append(dialect.MAVLink_timesync_message(own_ns, message.ts1))
-        elif _pings(message):
-            asker = (message.get_srcSystem(), message.get_srcComponent())
-            self._answers.append(
-                dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
-            )
+    def add(self, answer: Message) -> None:
+        """Add a reply, unless too many wait already."""
+        if len(self._answers) < _MAX_ANSWERS:
+            self._answers.append(answer)
 
     def announce(self, severity: int, text: str) -> None:
         """Broadcast a STATUSTEXT, mainly for ground stations."""
@@ -108,15 +70,6 @@ class _Replies:
             self._next_heartbeat_s = stamp_s + _HEARTBEAT_INTERVAL_S
             out.append(_heartbeat())
         return out
-
-
-def _asks_time(message: Message) -> bool:
-    return isinstance(message, dialect.MAVLink_timesync_message) and message.tc1 == 0
-
-
-def _pings(message: Message) -> bool:
-    asked = isinstance(message, dialect.MAVLink_ping_message)
-    return asked and message.target_system == message.target_component == 0
 
 
 def _heartbeat() -> Message:
@@ -169,7 +122,6 @@ class OffboardSession:
         failsafe_text: Reason why the autopilot no longer follows (it changed its mode or disarmed);
             None while it follows. Never reset.
         telemetry: Newest telemetry of the autopilot.
-        camera_heard: True once the camera (MAV_COMP_ID_CAMERA) of the system has sent a HEARTBEAT.
     """
 
     def __init__(
@@ -186,9 +138,9 @@ class OffboardSession:
         self.failure: LinkError | None = None
         self.failsafe_text: str | None = None
         self._commands = CommandChannel(self._settings.system, self._settings.component)
-        self.camera_heard = False
+        self._camera_heard = False
         self._requests = Requests(self._commands, self.telemetry)
-        self._target = _Target()
+        self.hold()
         self._replies = _Replies()
         self._now_s = 0.0
         self._phase_since_s: float | None = None
@@ -215,20 +167,29 @@ class OffboardSession:
     ) -> None:
         """Set the target from the next tick on.
 
+        A value beyond float32 becomes infinity, as in a C++ companion, and NaN stays NaN. The
+        autopilot decides how to handle a corrupted command.
+
         Args:
             velocity_enu_mps: Velocity (3,), m/s.
             yaw_enu_rad: Yaw, counter-clockwise from east; None keeps the heading.
             acceleration_enu_mps2: Feed-forward acceleration (3,), m/s^2; None for none.
         """
-        self._target = _Target(
-            velocity_enu_mps=velocity_enu_mps,
-            yaw_enu_rad=yaw_enu_rad,
-            acceleration_enu_mps2=acceleration_enu_mps2,
-        )
+        mask, yaw, ax, ay, az = _IGNORED, 0.0, 0.0, 0.0, 0.0
+        east, north, up = map(_float32, velocity_enu_mps)
+        if acceleration_enu_mps2 is None:
+            mask |= _NO_ACCELERATION
+        else:
+            ay, ax, az = map(_float32, acceleration_enu_mps2)
+        if yaw_enu_rad is None:
+            mask |= _NO_YAW
+        else:
+            yaw = ned_yaw_from_enu(yaw_enu_rad)
+        self._target = (mask, 0.0, 0.0, 0.0, north, east, -up, ax, ay, -az, yaw, 0.0)
 
     def hold(self) -> None:
         """Hold position and heading from the next tick on."""
-        self._target = _Target()
+        self.set_target((0.0, 0.0, 0.0))
 
     def announce(self, text: str) -> None:
         """Send a STATUSTEXT with severity WARNING to ground stations."""
@@ -250,21 +211,39 @@ class OffboardSession:
 
     def handle(self, message: Message) -> None:
         """Handle a received message. Messages for other receivers are ignored."""
-        telemetry = self.telemetry
-        telemetry.handle(message)
-        if telemetry.heard and message.get_srcSystem() == telemetry.system:
-            if isinstance(message, dialect.MAVLink_command_ack_message):
-                self._commands.acknowledge(message)
-            elif message.get_srcComponent() == _CAMERA and not self.camera_heard:
-                self._hear_camera(message)
-        self._replies.handle(message, self._now_s)
+        self.telemetry.handle(message)
+        handler = _HANDLERS.get(type(message))
+        if handler is not None:
+            handler(self, message)
 
-    def _hear_camera(self, message: Message) -> None:
+    def _acknowledged(self, message: Message) -> None:
+        if self._is_of_vehicle(message):
+            self._commands.acknowledge(message)
+
+    def _heartbeat(self, message: Message) -> None:
         """Ask the camera for its information at its first HEARTBEAT."""
-        if isinstance(message, dialect.MAVLink_heartbeat_message):
-            self.camera_heard = True
+        if message.get_srcComponent() != _CAMERA or self._camera_heard:
+            return
+        if self._is_of_vehicle(message):
+            self._camera_heard = True
             information = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
             self._commands.submit(dialect.MAV_CMD_REQUEST_MESSAGE, information, component=_CAMERA)
+
+    def _is_of_vehicle(self, message: Message) -> bool:
+        """Return True if a message comes from a component of the autopilot's system."""
+        return self.telemetry.heard and bool(message.get_srcSystem() == self.telemetry.system)
+
+    def _timesync(self, message: Message) -> None:
+        """Reply to a request; the reply to one of our own needs none."""
+        if message.tc1 == 0:
+            own_ns = round(self._now_s * 1e9)
+            self._replies.add(dialect.MAVLink_timesync_message(own_ns, message.ts1))
+
+    def _ping(self, message: Message) -> None:
+        """Reply to a request; the reply to one of our own needs none."""
+        if message.target_system == message.target_component == 0:
+            asker = (message.get_srcSystem(), message.get_srcComponent())
+            self._replies.add(dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker))
 
     # Sent messages ------------------------------------------------------------------------------
 
@@ -290,7 +269,12 @@ class OffboardSession:
             out += self._commands.poll(stamp_s, system)
         if self.telemetry.autopilot.early_setpoints or self.phase is Phase.OFFBOARD:
             component = dialect.MAV_COMP_ID_AUTOPILOT1 if system else 0
-            out.append(self._target.message(stamp_s, system, component))
+            out.append(
+                dialect.MAVLink_set_position_target_local_ned_message(
+                    round(stamp_s * 1e3) & 0xFFFF_FFFF, system, component,
+                    dialect.MAV_FRAME_LOCAL_NED, *self._target,
+                )
+            )  # fmt: skip
         return out
 
     # Phases -------------------------------------------------------------------------------------
@@ -421,4 +405,10 @@ _STEPS = {
     Phase.LANDING: OffboardSession._landing,
     Phase.DONE: OffboardSession._ended,
     Phase.FAILED: OffboardSession._ended,
+}
+_HANDLERS: dict[type, Callable[[OffboardSession, Message], None]] = {
+    dialect.MAVLink_command_ack_message: OffboardSession._acknowledged,
+    dialect.MAVLink_heartbeat_message: OffboardSession._heartbeat,
+    dialect.MAVLink_timesync_message: OffboardSession._timesync,
+    dialect.MAVLink_ping_message: OffboardSession._ping,
 }

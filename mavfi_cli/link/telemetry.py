@@ -216,18 +216,15 @@ class Telemetry:
         """True if the autopilot reports that it is in the air."""
         return self.landed_state in _IN_AIR
 
-    def handle(self, message: Message) -> bool:
-        """Handle a message. Return False if it is not the autopilot's."""
-        if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
-            return False
+    def handle(self, message: Message) -> None:
+        """Handle a message of the autopilot. Others are ignored."""
+        handler = _HANDLERS.get(type(message))
+        if handler is None or message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
+            return
         if not self.heard and isinstance(message, dialect.MAVLink_heartbeat_message):
             self._adopt(message)
-        if not self.heard or message.get_srcSystem() != self.system:
-            return False
-        handler = _HANDLERS.get(type(message))
-        if handler is not None:
+        if self.heard and message.get_srcSystem() == self.system:
             handler(self, message)
-        return True
 
     def _adopt(self, message: Message) -> None:
         """Follow the sender of a HEARTBEAT. An unknown autopilot is treated as PX4."""

@@ -66,7 +66,7 @@ class TextCollector:
     def since(self, total: int) -> list[_Text]:
         """Return the texts received since `total` had this value."""
         fresh = min(self.total - total, len(self.texts))
-        return list(self.texts)[len(self.texts) - fresh :]
+        return list(self.texts)[len(self.texts) - fresh :] if fresh else []
 
     def add(self, message: Message, stamp_s: float) -> None:
         """Handle a STATUSTEXT."""

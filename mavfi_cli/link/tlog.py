@@ -41,11 +41,10 @@ class TlogWriter:
         except OSError as error:
             raise self._error(error) from None
 
-    def write(self, stamp_s: float, frame: bytes) -> None:
-        """Record one frame, sent or received, at a stamp."""
+    def write(self, stamp_s: float, *frames: bytes) -> None:
+        """Record frames, sent or received, at a stamp."""
         time_us = EPOCH_UNIX_S * 1_000_000 + round(stamp_s * 1e6)
-        self._pending += time_us.to_bytes(8, "big")
-        self._pending += frame
+        self._pending += time_us.to_bytes(8, "big").join([b"", *frames])
         overdue = abs(stamp_s - self._flushed_s) >= _FLUSH_INTERVAL_S
         if overdue or len(self._pending) >= _FLUSH_BYTES:
             self._flushed_s = stamp_s
@@ -106,7 +105,7 @@ class RecordedLink:
         self._transport = transport
         self._codec = Codec(system, component, signing=signing)
         self._tlog: TlogWriter | None = None
-        self._early: list[tuple[float, bytes]] = []
+        self._early: list[tuple[float, list[bytes]]] = []
 
     @contextlib.contextmanager
     def recording(self, path: Path) -> Iterator[None]:
@@ -116,8 +115,8 @@ class RecordedLink:
             RecordError: The file cannot be written, now or at any later message.
         """
         with contextlib.closing(TlogWriter(path)) as self._tlog:
-            for stamp_s, frame in self._early:
-                self._tlog.write(stamp_s, frame)
+            for stamp_s, frames in self._early:
+                self._tlog.write(stamp_s, *frames)
             self._early.clear()
             yield
 
@@ -129,11 +128,11 @@ class RecordedLink:
         """
         return self._transport.receive(timeout_s)
 
-    def messages(self, data: bytes, stamp_s: float) -> Iterator[Message]:
-        """Yield the messages in received bytes. Each is recorded at the stamp after its use."""
-        for message in self._codec.decode(data, datagram=self._transport.datagram):
-            yield message
-            self._record(stamp_s, message.get_msgbuf())
+    def messages(self, data: bytes, stamp_s: float) -> list[Message]:
+        """Return the messages in received bytes, and record them at the stamp."""
+        messages = self._codec.decode(data, datagram=self._transport.datagram)
+        self._record(stamp_s, [message.get_msgbuf() for message in messages])
+        return messages
 
     def send(self, messages: Sequence[Message], stamp_s: float) -> None:
         """Send the messages in this order and record them at the stamp.
@@ -142,16 +141,15 @@ class RecordedLink:
             LinkLost: The other end closed the connection.
         """
         frames = [self._codec.encode(message) for message in messages]
-        for frame in frames:
-            self._record(stamp_s, frame)
+        self._record(stamp_s, frames)
         if self._transport.datagram:
             for frame in frames:
                 self._transport.send(frame)
         elif frames:
             self._transport.send(b"".join(frames))
 
-    def _record(self, stamp_s: float, frame: bytes) -> None:
+    def _record(self, stamp_s: float, frames: list[bytes]) -> None:
         if self._tlog is None:
-            self._early.append((stamp_s, frame))
+            self._early.append((stamp_s, frames))
         else:
-            self._tlog.write(stamp_s, frame)
+            self._tlog.write(stamp_s, *frames)
