@@ -1,4 +1,4 @@
-"""Top views: of one flight, and of all flights of one mission (paper, Fig. 13)."""
+"""Pictures of flights: one from above with its height, or all of one mission (paper, Fig. 13)."""
 
 from __future__ import annotations
 
@@ -12,25 +12,33 @@ import numpy as np
 
 from mavfi_cli.mission.record.measures import FlightRecord
 from mavfi_cli.mission.record.run_folder import Run
-from mavfi_cli.report.drawing import DETECTORS, INK, new_figure
+from mavfi_cli.report.drawing import (
+    ALARM,
+    DETECTORS,
+    FAULT,
+    FLIGHTS,
+    GOAL,
+    GRID,
+    INK,
+    OBSTACLE,
+    PLAN,
+    new_figure,
+    open_frame,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_OBSTACLE = "#c9ced6"
 _OBSTACLE_EDGE = "#8b93a1"
 _LOW = "#e3ead9"  # boxes that end below the flight, such as hedges
-_PLAN = "#7a8699"
-_GOOD = "#1b7f4b"
-_BAD = "#c22f2f"
 _MARKS: dict[str, dict[str, Any]] = {
     "replan": {"marker": "o", "s": 14, "facecolors": "white", "edgecolors": "#222831"},
     "slow": {"marker": "v", "s": 30, "facecolors": "#f2b134", "edgecolors": "#222831"},
     "stop": {"marker": "s", "s": 26, "facecolors": "#e4572e", "edgecolors": "#222831"},
 }
-_MARKS["fault"] = {"marker": "*", "s": 130, "facecolors": "#c22f2f", "edgecolors": "white"}
-_MARKS["alarm"] = {"marker": "D", "s": 34, "facecolors": "#5b8def", "edgecolors": "white"}
+_MARKS["fault"] = {"marker": "*", "s": 130, "facecolors": FAULT, "edgecolors": "white"}
+_MARKS["alarm"] = {"marker": "D", "s": 34, "facecolors": ALARM, "edgecolors": "white"}
 _LABELS = {
     "fault": "fault",
     "alarm": "alarm",
@@ -38,56 +46,66 @@ _LABELS = {
     "slow": "slows down",
     "stop": "stops",
 }
-# In the order of names: golden and faulty flights are blue and orange, as in the paper. Protected
-# flights have their detector's colour, which is the paper's green for AAD.
-_COLOURS = ("#3a7bd5", "#e8751a", "#b8860b", "#00838f", "#c2185b", "#5d4037")
 _WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # line widths in points, so that equal paths stay visible
 _COLUMNS = 3
 _MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # offset from the position, points
 _BESIDE = 11.0  # points between marks at the same position
+_PLANS = 6  # the newest plans, which one can tell apart
+_FROM_ABOVE, _OVER_TIME = [1, 2], [0, 3]  # what of stamp, x, y, z an axes shows
 
 
 # One flight: obstacles, path coloured by speed, plans and events ------------------------------
 
 
 def draw_top_view(run: Run) -> Figure:
-    """Draw a figure of the run in metres, with east to the right and north up."""
-    figure = new_figure(6.4, 6.0)
+    """Draw a figure of the run in metres: east to the right and north up, and height over time."""
+    figure = new_figure(5.6, 7.0)
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
-    axes = figure.add_subplot()
-    flight = run.record
-    world = flight.world
-    positions, speeds = _path_of(run)
-    _draw_obstacles(axes, world, positions)
+    axes, beside = figure.subplots(2, height_ratios=[4.2, 1.0])
+    flight, path = run.record, _path_of(run)
+    _draw_obstacles(axes, flight.world, path.positions_enu_m)
     _draw_plans(axes, flight.plans)
-    if len(positions) > 1:
-        _draw_path(figure, axes, positions, speeds, flight.config["v_max_mps"])
-    _draw_places(axes, flight, positions)
-    _draw_end(axes, flight, positions)
-    for kind in _MARKS:
-        _draw_marks(axes, flight.events, kind)
-    _frame(axes, world, positions)
+    for each, columns in ((axes, _FROM_ABOVE), (beside, _OVER_TIME)):
+        lines = _draw_path(each, path, columns, flight.config["v_max_mps"])
+        if lines is not None and each is axes:
+            _explain_speed(figure, axes, lines)
+        _draw_start(each, path, columns)
+        _draw_end(each, flight, path, columns)
+        for kind in _MARKS:
+            _draw_marks(each, flight.events, kind, columns)
+    _draw_goal(axes, flight)
+    _frame(axes, flight.world, path.positions_enu_m)
+    _frame_heights(beside, flight, path)
     _caption(figure, axes, flight)
     return figure
 
 
-def _path_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (n, 3) m and speeds (n,) m/s of the flight, from the truth if known."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Path:
+    """The path of a flight, from the truth if it is known."""
+
+    places: np.ndarray  # (n, 4) stamp in s, and position in m
+    speeds_mps: np.ndarray  # (n,)
+
+    @property
+    def positions_enu_m(self) -> np.ndarray:
+        """Positions (n, 3)."""
+        return self.places[:, 1:]
+
+
+def _path_of(run: Run) -> _Path:
     trace = run.trace
     if trace is None or trace.num_rows == 0:
-        return np.empty((0, 3)), np.empty(0)
+        return _Path(places=np.empty((0, 4)), speeds_mps=np.empty(0))
     prefix = "truth_" if "truth_x_m" in trace.column_names else ""
 
-    def columns(names: tuple[str, ...]) -> np.ndarray:
-        """Return columns of the trace (n, len(names)), from the truth if known."""
-        return np.column_stack(
-            [trace[f"{prefix}{n}"].to_numpy(zero_copy_only=False) for n in names]
-        )
+    def columns(*names: str) -> np.ndarray:
+        return np.column_stack([trace[name].to_numpy(zero_copy_only=False) for name in names])
 
-    positions = columns(("x_m", "y_m", "z_m"))
-    speeds = np.linalg.norm(columns(("vx_mps", "vy_mps", "vz_mps")), axis=1)
-    known = np.isfinite(positions).all(axis=1)
-    return positions[known], speeds[known]
+    places = columns("stamp_s", *(f"{prefix}{axis}_m" for axis in "xyz"))
+    speeds = np.linalg.norm(columns(*(f"{prefix}v{axis}_mps" for axis in "xyz")), axis=1)
+    known = np.isfinite(places).all(axis=1)
+    return _Path(places=places[known], speeds_mps=speeds[known])
 
 
 def _draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
@@ -100,77 +118,105 @@ def _draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray)
         axes.add_patch(
             Rectangle(
                 (box[0], box[1]), box[3] - box[0], box[4] - box[1], zorder=1, linewidth=0.6,
-                facecolor=_LOW if low else _OBSTACLE, edgecolor=_OBSTACLE_EDGE,
+                facecolor=_LOW if low else OBSTACLE, edgecolor=_OBSTACLE_EDGE,
             )
         )  # fmt: skip
 
 
 def _draw_plans(axes: Axes, plans: Sequence[Mapping[str, Any]]) -> None:
-    for number, plan in enumerate(plans):
+    """Draw the newest plans, older ones paler, and say how many there are."""
+    shown = [plan for plan in plans if len(plan["points_enu_m"])]
+    told = "planned" if len(shown) <= _PLANS else f"planned (newest {_PLANS} of {len(shown)})"
+    newest = shown[-_PLANS:]
+    for number, plan in enumerate(newest, 1):
         points = np.array(plan["points_enu_m"], dtype=float)
-        if len(points):
-            axes.plot(
-                points[:, 0], points[:, 1], color=_PLAN, linewidth=0.6, alpha=0.7,
-                linestyle=(0, (4, 3)), zorder=2, label="planned" if number == 0 else None,
-            )  # fmt: skip
+        axes.plot(
+            points[:, 0], points[:, 1], color=PLAN, linewidth=0.9, linestyle=(0, (4, 3)), zorder=2,
+            alpha=0.25 + 0.75 * number / len(newest), label=told if plan is newest[-1] else None,
+        )  # fmt: skip
 
 
-def _draw_path(
-    figure: Figure, axes: Axes, positions: np.ndarray, speeds: np.ndarray, v_max: float
-) -> None:
+def _draw_path(axes: Axes, path: _Path, columns: list[int], v_max_mps: float) -> Any:
+    """Draw the path coloured by speed. Return its lines; None without a path."""
     from matplotlib.collections import LineCollection
 
-    step = max(1, len(positions) // 400)
-    points, shown = positions[::step, :2], speeds[::step]
+    step = max(1, len(path.places) // 400)
+    points, shown = path.places[::step, columns], path.speeds_mps[::step]
     if len(points) < 2:
-        return
+        return None
     segments = np.stack([points[:-1], points[1:]], axis=1)
     lines = LineCollection(
         list(segments), array=shown[1:], cmap="viridis", linewidths=2.2, zorder=4, capstyle="round"
     )
-    lines.set_clim(0.0, v_max)
+    lines.set_clim(0.0, v_max_mps)
     axes.add_collection(lines)
+    return lines
+
+
+def _explain_speed(figure: Figure, axes: Axes, lines: Any) -> None:
     bar = figure.colorbar(lines, ax=axes, shrink=0.6, pad=0.02, aspect=28)
-    bar.set_label("speed, m/s")
+    bar.set_label("speed, m/s", fontsize=9)
+    bar.ax.tick_params(labelsize=8)
     bar.outline.set_linewidth(0.4)
 
 
-def _draw_places(axes: Axes, flight: FlightRecord, positions: np.ndarray) -> None:
-    """Mark start and goal of a flight with positions (n, 3) m."""
+def _draw_goal(axes: Axes, flight: FlightRecord) -> None:
+    """Mark the goal of a flight with its tolerance."""
     from matplotlib.patches import Circle
 
     goal = flight.goal_enu_m or flight.world.get("goal")
     if goal:
         tolerance = flight.config["goal_tolerance_m"]
         axes.add_patch(
-            Circle((goal[0], goal[1]), tolerance, fill=False, color=_GOOD, linewidth=1.0, zorder=3)
+            Circle((goal[0], goal[1]), tolerance, fill=False, color=GOAL, linewidth=1.0, zorder=3)
         )
-        axes.scatter([goal[0]], [goal[1]], marker="*", s=120, color=_GOOD, zorder=5, label="goal")
-    if len(positions):
+        axes.scatter([goal[0]], [goal[1]], marker="*", s=120, color=GOAL, zorder=5, label="goal")
+
+
+def _draw_start(axes: Axes, path: _Path, columns: list[int] = _FROM_ABOVE) -> None:
+    if len(path.places):
+        across, up = path.places[0, columns]
         axes.scatter(
-            [positions[0, 0]], [positions[0, 1]], marker="^", s=55, color="#222831",
+            across, up, marker="^", s=55, color="#222831",
             edgecolors="white", linewidths=0.8, zorder=6.5,  # above the mark of a fault
-            label="start",
+            label="start" if columns is _FROM_ABOVE else None,
         )  # fmt: skip
 
 
-def _draw_end(axes: Axes, flight: FlightRecord, positions: np.ndarray, colour: str = _BAD) -> None:
-    """Mark the end of a failed flight with positions (n, 3) m."""
-    if len(positions) and not flight.succeeded:
+def _draw_end(
+    axes: Axes,
+    flight: FlightRecord,
+    path: _Path,
+    columns: list[int] = _FROM_ABOVE,
+    colour: str = FAULT,
+) -> None:
+    """Mark the end of a failed flight."""
+    if len(path.places) and not flight.succeeded:
+        across, up = path.places[-1, columns]
         axes.scatter(
-            [positions[-1, 0]], [positions[-1, 1]], marker="X", s=90, color=colour,
-            edgecolors="white", linewidths=0.8, zorder=7, label=flight.outcome,
+            across, up, marker="X", s=90, color=colour,
+            edgecolors="white", linewidths=0.8, zorder=7,
+            label=flight.outcome if columns is _FROM_ABOVE else None,
         )  # fmt: skip
 
 
 def _draw_marks(
-    axes: Axes, events: Iterable[dict[str, Any]], kind: str, **style: Any
+    axes: Axes,
+    events: Iterable[dict[str, Any]],
+    kind: str,
+    columns: list[int] = _FROM_ABOVE,
+    **style: Any,
 ) -> np.ndarray:
-    """Mark events of a kind and return their positions (n, 2) m. `style` overrides the mark."""
-    found = [e["position_enu_m"] for e in events if e["kind"] == kind and e["position_enu_m"]]
-    places = np.array(found, dtype=float).reshape(-1, 3)[:, :2]
+    """Mark events of a kind and return their places (n, 2). `style` overrides the mark."""
+    found = [
+        (e["stamp_s"], *e["position_enu_m"])
+        for e in events
+        if e["kind"] == kind and e["position_enu_m"]
+    ]
+    places = np.array(found, dtype=float).reshape(-1, 4)[:, columns]
     if found:
-        look = {"linewidths": 0.9, "zorder": 6, "label": _LABELS[kind], **_MARKS[kind], **style}
+        label = _LABELS[kind] if columns is _FROM_ABOVE else None
+        look = {"linewidths": 0.9, "zorder": 6, "label": label, **_MARKS[kind], **style}
         axes.scatter(places[:, 0], places[:, 1], **look)
     return places
 
@@ -187,9 +233,27 @@ def _frame(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
         axes.set_xlim(middle[0] - side / 2.0, middle[0] + side / 2.0)
         axes.set_ylim(middle[1] - side / 2.0, middle[1] + side / 2.0)
     axes.set_aspect("equal")
-    axes.set_xlabel("east, m")
-    axes.set_ylabel("north, m")
-    axes.grid(visible=True, color="#edf0f4", linewidth=0.6, zorder=0)
+    axes.set_xlabel("east, m", fontsize=9)
+    axes.set_ylabel("north, m", fontsize=9)
+    _plain(axes)
+
+
+def _frame_heights(axes: Axes, flight: FlightRecord, path: _Path) -> None:
+    """Show ground, path and the height of the goal, and set plain axes."""
+    goal = flight.goal_enu_m or flight.world.get("goal")
+    heights_m = [0.0, *path.places[:, 3], *(goal[2:] if goal else ())]
+    if goal:
+        axes.axhline(goal[2], color=GOAL, linewidth=0.9, linestyle=(0, (2, 2)), zorder=3)
+    axes.margins(x=0.02)
+    axes.set_ylim(min(heights_m), max(1.0, 1.2 * max(heights_m)))
+    axes.set_xlabel("simulated time, s", fontsize=9)
+    axes.set_ylabel("height, m", fontsize=9)
+    _plain(axes)
+    open_frame(axes)
+
+
+def _plain(axes: Axes) -> None:
+    axes.grid(visible=True, color=GRID, linewidth=0.6, zorder=0)
     axes.set_axisbelow(True)
     for spine in axes.spines.values():
         spine.set_color("#aab1bd")
@@ -207,14 +271,35 @@ def _caption(figure: Figure, axes: Axes, flight: FlightRecord) -> None:
     qof = flight.quality_of_flight
     time_s, distance_m = qof["flight_time_s"], qof["distance_m"]
     figures = "" if time_s is None else f", {time_s:.1f} s, {distance_m:.1f} m"
-    axes.set_title(
-        f"{_place_of(flight)}: {flight.outcome.replace('_', ' ')}{figures}",
-        fontsize=10, loc="left",
-    )  # fmt: skip
+    title = f"{_place_of(flight)}: {flight.outcome.replace('_', ' ')}{figures}"
+    axes.set_title("\n".join([title, *_treatment(flight)]), fontsize=9.5, loc="left")
     figure.legend(
-        loc="outside lower center", ncols=8, frameon=False, fontsize=8,
-        handletextpad=0.3, columnspacing=0.9,
+        loc="outside lower center", ncols=4, frameon=False, fontsize=8,
+        handletextpad=0.3, columnspacing=1.5,
     )  # fmt: skip
+
+
+def _treatment(flight: FlightRecord) -> list[str]:
+    """Return the fault and the detector of a flight in one line; nothing if it has neither."""
+    told = []
+    if fault := flight.fault:
+        what = _struck(fault)
+        missed = " (not injected)" if fault["state"] == "not_injected" else ""
+        told.append(f"fault: {what}{missed}")
+    if detection := flight.detection:
+        count = detection["alarm_count"]
+        told.append(f"detector: {detection['detector']}, {count or 'no'} alarm{'s'[count == 1 :]}")
+    return ["; ".join(told)] if told else []
+
+
+def _struck(fault: Mapping[str, Any]) -> str:
+    """Return what a fault was to strike."""
+    if fault["level"] == "instruction":
+        return f"an instruction of the {fault['node']} node"
+    if fault["stage"] == "process":
+        return f"the process of {', '.join(fault['states'])} is killed"
+    states = fault["states"]
+    return states[0] if len(states) == 1 else f"{fault['request']['target']} ({len(states)} states)"
 
 
 # Flights of one mission: golden, with a fault, protected ---------------------------------------
@@ -255,7 +340,7 @@ def draw_trajectories(panels: Sequence[Panel]) -> Figure:
 def _colours(panels: Sequence[Panel]) -> dict[str, str]:
     """Return a colour per name: its detector's if still unused, else the next free one."""
     colours: dict[str, str] = {}
-    turn = itertools.cycle(_COLOURS)
+    turn = itertools.cycle(FLIGHTS)
     for name, run in (flight for panel in panels for flight in panel.flights):
         if name not in colours:
             detector = run.record.detection.get("detector")
@@ -281,21 +366,22 @@ def _draw_panel(
     figure: Figure, axes: Axes, panel: Panel, number: int, colours: Mapping[str, str]
 ) -> None:
     runs = [run for _, run in panel.flights]
-    paths = [_path_of(run)[0] for run in runs]
-    everywhere = np.concatenate(paths)
+    paths = [_path_of(run) for run in runs]
+    everywhere = np.concatenate([path.positions_enu_m for path in paths])
     first = runs[0].record
     golden_s = _golden_s(runs)
     _draw_obstacles(axes, first.world, everywhere)
     handles = []
-    for place, ((name, run), positions) in enumerate(zip(panel.flights, paths, strict=True)):
+    for place, ((name, run), path) in enumerate(zip(panel.flights, paths, strict=True)):
         handles += axes.plot(
-            positions[:, 0], positions[:, 1], color=colours[name], zorder=4.0 + 0.01 * place,
+            *path.places[:, _FROM_ABOVE].T, color=colours[name], zorder=4.0 + 0.01 * place,
             linewidth=max(_LEAST, _WIDEST - _STEP * place), alpha=0.5 if place == 0 else 1.0,
             solid_capstyle="round", solid_joinstyle="round", gid=f"flight-{number}-{place}",
             label=_legend_entry(name, run.record, golden_s),
         )  # fmt: skip
-        _draw_end(axes, run.record, positions, colours[name])
-    _draw_places(axes, first, paths[0])
+        _draw_end(axes, run.record, path, colour=colours[name])
+    _draw_goal(axes, first)
+    _draw_start(axes, paths[0])
     _draw_panel_marks(figure, axes, panel, colours)
     _frame(axes, first.world, everywhere)
     if panel.title:

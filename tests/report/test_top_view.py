@@ -56,6 +56,8 @@ def test_it_says_what_one_needs_to_know(run, tmp_path):
     assert {"east, m", "north, m", "speed, m/s", "goal", "start", "planned", "new plan"} <= set(
         said
     )
+    assert {"simulated time, s", "height, m"} <= set(said)
+    assert not any(text.startswith(("fault: ", "detector: ")) for text in said)
     assert not re.search(rb"\d{4}-\d\d-\d\dT", (tmp_path / "flight.svg").read_bytes())
 
 
@@ -83,7 +85,7 @@ def test_the_path_is_the_truth_coloured_by_speed(run, axes):
 
 
 def test_every_plan_and_every_mark_is_drawn(run, axes):
-    assert len(axes.lines) == len(run.result["plans"])
+    assert len(axes.lines) == len(run.result["plans"]) <= 6
     places = {
         label: collection.get_offsets()
         for collection in axes.collections
@@ -142,3 +144,71 @@ def test_without_referee_world_or_trace_there_is_a_picture_all_the_same(run, tmp
 def test_a_picture_that_cannot_be_written_is_one_line(run, tmp_path):
     with pytest.raises(RecordError, match="No such file"):
         write_svg(draw_top_view(run), tmp_path / "none" / "flight.svg")
+
+
+def test_no_more_plans_than_one_can_tell_apart_older_ones_paler(run):
+    plans = [{"stamp_s": k, "points_enu_m": [[0, k, 5], [9, k, 5]]} for k in range(23)]
+    lines = draw_top_view(changed(run, plans=plans)).axes[0].lines
+    assert [line.get_ydata()[0] for line in lines] == [17, 18, 19, 20, 21, 22]
+    alphas = [line.get_alpha() for line in lines]
+    assert alphas == sorted(alphas)
+    assert len(set(alphas)) == 6
+    labels = [line.get_label() for line in lines if not line.get_label().startswith("_")]
+    assert labels == ["planned (newest 6 of 23)"]
+
+
+def test_height_over_time_is_the_truth_with_the_same_marks(run):
+    above, beside = draw_top_view(run).axes[:2]
+    (path,) = [c for c in beside.collections if isinstance(c, LineCollection)]
+    points = np.array([segment[0] for segment in path.get_segments()])
+    np.testing.assert_array_equal(points[:, 0], run.trace["stamp_s"].to_numpy()[:-1])
+    np.testing.assert_array_equal(points[:, 1], run.trace["truth_z_m"].to_numpy()[:-1])
+    (goal,) = beside.lines
+    assert set(goal.get_ydata()) == {run.result["goal_enu_m"][2]}
+    low, high = beside.get_ylim()
+    assert low == 0.0
+    assert high > points[:, 1].max()
+    marks = [
+        [len(c.get_offsets()) for c in axes.collections if isinstance(c, PathCollection)]
+        for axes in (above, beside)
+    ]
+    assert sum(marks[0]) == sum(marks[1]) + 1  # the goal
+
+
+SOURCE = {
+    "level": "source", "stage": "planning", "states": ["waypoint_z"], "state": "applied",
+    "request": {"target": "planning"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"fault": SOURCE}, "fault: waypoint_z"),
+        (
+            {
+                "fault": SOURCE | {"states": ["waypoint_x", "waypoint_y", "waypoint_z"],
+                                   "request": {"target": "waypoint_position"}},
+                "detection": {"detector": "aad", "alarm_count": 1},
+            },
+            "fault: waypoint_position (3 states); detector: aad, 1 alarm",
+        ),
+        (
+            {"fault": SOURCE | {"state": "not_injected"},
+             "detection": {"detector": "gad", "alarm_count": 0}},
+            "fault: waypoint_z (not injected); detector: gad, no alarms",
+        ),
+        (
+            {"fault": SOURCE | {"stage": "process", "states": ["octomap"]}},
+            "fault: the process of octomap is killed",
+        ),
+        (
+            {"fault": {"level": "instruction", "node": "planner", "state": "applied"}},
+            "fault: an instruction of the planner node",
+        ),
+        ({"detection": {"detector": "l2", "alarm_count": 12}}, "detector: l2, 12 alarms"),
+    ],
+)  # fmt: skip
+def test_the_title_names_fault_and_detector(run, changes, told):
+    title = draw_top_view(changed(run, **changes)).axes[0].get_title("left")
+    assert title.splitlines()[1:] == [told]

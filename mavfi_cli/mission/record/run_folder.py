@@ -31,7 +31,7 @@ class RunFolder:
         self.plans = path / "plans.parquet"  # every waypoint of every plan
         self.kernels = path / "kernels.parquet"  # start and end of every invocation
         self.tlog = path / "flight.tlog"  # every MAVLink frame of both directions
-        self.picture = path / "flight.svg"  # top view of the flight
+        self.picture = path / "flight.svg"  # the flight from above, and its height
         self.fault = path / FAULT  # fault record, on disk before the fault strikes
         self.crash = path / "crash.txt"  # tracebacks of the companion and of nodes
 
