@@ -7,7 +7,7 @@ The list supplies the configuration of the missions, the records their results. 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from mavfi_cli.campaigns.missions import (
     changes_of,
 )
 from mavfi_cli.core.types import FloatArray, Outcome
+from mavfi_cli.mission.record.detection_cost import RECOMPUTED, detection_cost
 from mavfi_cli.mission.record.measures import STRUCK, measures_of
 from mavfi_cli.mission.record.quality import QUALITY
 from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
@@ -40,7 +41,8 @@ def flights(ledger: Ledger, missions: Iterable[PlannedMission] | None = None) ->
 
     Columns: what `mission.record.measures` tells of a record, of CONFIG and of the fault's FAULT
     what was asked for, each label as `label_NAME` and all of them as text in `labels`; `succeeded`;
-    and `counted`: golden, or with a fault that struck something that was read or caught.
+    `counted`: golden, or with a fault that struck something that was read or caught; and the shares
+    of the flight time that detection takes (`check_share`) and recovery (`recovery_share_STAGE`).
 
     Args:
         missions: selects these of the ledger.
@@ -64,7 +66,7 @@ def _names(labels: Sequence[str]) -> list[str]:
     own = ("number", "pair", "labels", *(f"label_{name}" for name in labels), *CONFIG, "level")
     asked = (*(f"fault_{name}" for name in FAULT), "detector", "protect", "changes")
     came = ("state", "outcome", "succeeded", "counted", "reason", "injected", "wall_s", "attempts")
-    return [*own, *asked, *came, "path", *measures_of({})]
+    return [*own, *asked, *came, "path", *measures_of({}), *_costs({})]
 
 
 def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
@@ -93,7 +95,17 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
         "attempts": entry.attempts,
         "path": None if entry.path is None else str(entry.path),
         **measures_of(entry.result),
+        **_costs(entry.result),
     }
+
+
+def _costs(record: Mapping[str, Any]) -> dict[str, float | None]:
+    """Shares of the flight time of checks and of each stage's recomputations; None without."""
+    cost = detection_cost(record)
+    if cost is None:
+        return {"check_share": None, **{f"recovery_share_{stage}": None for stage in RECOMPUTED}}
+    shares = {f"recovery_share_{stage}": s / cost.flight_s for stage, s in cost.recovery_s.items()}
+    return {"check_share": cost.detection_share, **shares}
 
 
 def _column(values: Sequence[Any]) -> pa.Array:

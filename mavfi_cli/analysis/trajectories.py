@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from mavfi_cli.analysis.groups import TREATMENT, untreated
@@ -17,13 +17,16 @@ from mavfi_cli.mission.record.run_folder import RESULT
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 
 
-def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
+def pair(
+    ledger: Ledger, number: int | None = None, among: Collection[int] | None = None
+) -> dict[str, Any]:
     """The flights that share world, start and noise with a mission, panel by panel.
 
     Args:
         number: number of the mission. None selects the pair in which a fault prolongs a flight
             most without failing it, relative to the golden flight time, among the pairs with all
             run folders; the first pair of the list if no fault does.
+        among: numbers of the missions to choose from and to draw; None means all.
 
     Returns:
         `panels`: a row a fault with its `title`, what is struck, empty of golden flights; and its
@@ -35,12 +38,13 @@ def pair(ledger: Ledger, number: int | None = None) -> dict[str, Any]:
         ConfigError: the list has no such mission.
         RecordError: its pair is not flown, or not all of its run folders were kept.
     """
-    number = _most_prolonged(ledger) if number is None else number
+    chosen = range(ledger.planned()) if among is None else among
+    number = _most_prolonged(ledger, chosen) if number is None else number
     if not 0 <= number < ledger.planned():
         last = ledger.planned() - 1
         raise ConfigError(f"no mission {number}: the list has 0 to {last}", path=ledger.folder)
     pairs = [(each, name) for each, _, name, _ in ledger.rows()]
-    mine = [each for each, name in pairs if name == pairs[number][1]]
+    mine = [each for each, name in pairs if name == pairs[number][1] and each in chosen]
     over = list(ledger.results(mine))
     flown = [each for each in over if each.state is ResultState.FLOWN]
     if not flown:
@@ -73,7 +77,7 @@ def _told(numbers: Sequence[int]) -> str:
     return f"mission{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
-def _most_prolonged(ledger: Ledger) -> int:
+def _most_prolonged(ledger: Ledger, among: Collection[int]) -> int:
     """A mission of the pair that is drawn by default."""
     kept: dict[str, bool] = {}
     first: dict[str, int] = {}
@@ -82,6 +86,8 @@ def _most_prolonged(ledger: Ledger) -> int:
     names = ("number", "changes", "pair", "outcome", "injected", "flight_time_s", "path")
     for portion in ledger.columns(names):
         for number, changes, name, outcome, injected, time_s, path in zip(*portion, strict=True):
+            if number not in among:
+                continue
             first.setdefault(name, number)
             kept[name] = kept.get(name, True) and path is not None
             watched = "detector" in json.loads(changes)

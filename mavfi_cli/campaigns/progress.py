@@ -68,6 +68,13 @@ def _share(outcomes: Counter[str]) -> float | None:
     return outcomes["success"] / flown if flown else None
 
 
+def duration(seconds: float) -> str:
+    """A time as minutes or hours."""
+    minutes, left = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{left:02d} h" if hours else f"{minutes}:{left:02d} min"
+
+
 class Spectator:
     """Watches a campaign. This base class ignores all events."""
 

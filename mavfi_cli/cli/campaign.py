@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options
 
 if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
@@ -25,6 +25,8 @@ _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
                   "Quote a value with a comma, or give all values as a TOML list. The change "
                   "becomes part of the folder name.")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
+# Options of `status` with which it prints everything.
+_FULL = {"full", "by", "confidence", "quality", "overhead", "failures"}
 
 
 @click.group()
@@ -109,17 +111,59 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 @click.option("--upsets", type=click.FloatRange(min=0.0),
               help="With --failures: bit flips per hour that reach the injection sites. "
                    "Adds failures per flight hour.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@click.option("--full", is_flag=True,
+              help="Print all settings and comparisons, not one screen. --by, --confidence, "
+                   "--quality, --overhead and --failures imply it.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the whole summary as JSON.")
 def status(what: str, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
-    """Summarise the results of a campaign, also while it runs."""
+    """Show what is flown, the time left and one table, also while the campaign runs.
+
+    The table is the paper's if the campaign is a preset of the paper, else that of the settings.
+    `mavfi campaign report` prints it in other formats and draws it.
+    """
     from mavfi_cli.campaigns.begin import folder_of
     from mavfi_cli.campaigns.ledger import Ledger
 
     if not options["failures"] and (options["kernels"] or options["upsets"] is not None):
         raise click.UsageError("--kernels and --upsets go with --failures")
+    full = bool(given_options().keys() & _FULL)
     with Ledger(folder_of(what)) as ledger:
         names = [name for name in (by or "").split(",") if name]
-        _show(ledger, names, confidence, as_json=as_json, more=options)
+        _show(ledger, names, confidence, as_json=as_json, more=options, full=full)
+
+
+@campaign.command()
+@click.argument("what", metavar="WHAT")
+@click.option("--item", metavar="ITEM",
+              help="Figure or table of the paper, such as fig12 of table4; needed for the folder "
+                   "of `mavfi reproduce`  [that of the preset].")  # fmt: skip
+@click.option("--format", "form", type=click.Choice(["text", "markdown", "latex", "csv"]),
+              default="text", show_default=True, help="Format of the table.")  # fmt: skip
+@click.option("--output", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+              help="Draw the figure into this .svg, .pdf or .png file.")  # fmt: skip
+@click.option("--columns", type=click.Choice(["one", "two"]), default="one", show_default=True,
+              help="Width of the figure in columns of a printed page.")  # fmt: skip
+def report(what: str, item: str | None, form: str, output: Path | None, columns: str) -> None:
+    """Print the paper's table or the numbers of its figure, ours beside the paper's.
+
+    A campaign that is not in the paper has the table of its settings.
+    """
+    from mavfi_cli.campaigns.begin import folder_of
+    from mavfi_cli.campaigns.ledger import Ledger
+    from mavfi_cli.report.paper_figures import require_picture, write_figure
+    from mavfi_cli.report.tables.paper_table import FORMATS
+    from mavfi_cli.reproduction.figures import draw
+    from mavfi_cli.reproduction.status import asked_item, table_of
+
+    if output is not None:
+        require_picture(output)
+    with Ledger(folder_of(what)) as ledger:
+        shown = asked_item(ledger, item)
+        table = table_of(ledger, shown)
+        click.echo(FORMATS[form](table), nl=False)
+        if output is not None:
+            write_figure(draw(table, ledger, shown, columns), output)
+            click.echo(f"figure: {output}", err=True)
 
 
 @campaign.command()
@@ -275,24 +319,43 @@ def _show(
     *,
     as_json: bool,
     more: Mapping[str, Any] | None = None,
+    full: bool = False,
 ) -> None:
+    from mavfi_cli.campaigns.begin import stopped, stored_spec
+    from mavfi_cli.core.files import plain
+    from mavfi_cli.report.tables.campaign import campaign_lines
+    from mavfi_cli.report.tables.paper_table import as_text
+    from mavfi_cli.reproduction.status import item_of, progress_lines, short, table_of
+
+    if as_json:
+        told = _summary(ledger, by, confidence, more or {})
+        click.echo(json.dumps(plain(told), indent=2))
+        return
+    lines, spec = progress_lines(ledger), stored_spec(ledger)
+    if spec is not None and spec.fixed_world is not None:
+        lines.append(spec.fixed_world.told())
+    lines += [f"known well enough, so not flown on: {text}" for text in stopped(ledger)]
+    if full:
+        lines += campaign_lines(_summary(ledger, by, confidence, more or {}))
+    else:
+        lines += ["", as_text(short(table_of(ledger, item_of(ledger)))).rstrip()]
+    click.echo("\n".join(lines))
+
+
+def _summary(
+    ledger: Ledger, by: Sequence[str], confidence: float, more: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Everything about a campaign, as plain values."""
     from dataclasses import asdict
 
     from mavfi_cli.analysis.summary import summarise
     from mavfi_cli.campaigns.begin import stopped, stored_spec
-    from mavfi_cli.core.files import plain
-    from mavfi_cli.report.tables.campaign import campaign_lines
 
-    ended, spec = stopped(ledger), stored_spec(ledger)
-    told = {**summarise(ledger, by, confidence), "stopped": ended}
-    lines = [f"{told['name']}: {told['over']} of {told['missions']} missions"]
+    spec = stored_spec(ledger)
+    told = {**summarise(ledger, by, confidence), "stopped": stopped(ledger)}
     if spec is not None and spec.fixed_world is not None:
         told["fixed_world"] = asdict(spec.fixed_world)
-        lines.append(spec.fixed_world.told())
-    told |= _more(ledger, by, confidence, more or {})
-    lines += [f"known well enough, so not flown on: {text}" for text in ended]
-    lines += campaign_lines(told)
-    click.echo(json.dumps(plain(told), indent=2) if as_json else "\n".join(lines))
+    return told | _more(ledger, by, confidence, more)
 
 
 def _more(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mavfi_cli.campaigns.progress import Progress, Spectator
+from mavfi_cli.campaigns.progress import Progress, Spectator, duration
 from mavfi_cli.mission.progress import Event, FlightProgress, Watcher
 
 if TYPE_CHECKING:
@@ -168,10 +168,3 @@ def _end_line(progress: Progress) -> str:
     line = f"{flown} missions in {duration(progress.elapsed_s)}, {progress.rate_per_h:.0f} an hour"
     outside = progress.outside
     return line if outside is None else f"{line}, {100.0 * outside:.1f} % of it outside missions"
-
-
-def duration(seconds: float) -> str:
-    """A time as minutes or hours."""
-    minutes, left = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{left:02d} h" if hours else f"{minutes}:{left:02d} min"

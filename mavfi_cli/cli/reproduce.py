@@ -58,7 +58,7 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
 
 def forecast_line(forecast: Forecast) -> str:
     """What is left to fly, and what it takes."""
-    from mavfi_cli.cli.progress import duration
+    from mavfi_cli.campaigns.progress import duration
 
     left = forecast.missions - forecast.over
     done = f"{forecast.missions} missions, {forecast.over} of them flown"

@@ -313,14 +313,15 @@ class Panel:
     flights: Sequence[tuple[str, Run]]
 
 
-def draw_trajectories(panels: Sequence[Panel]) -> Figure:
+def draw_trajectories(panels: Sequence[Panel], across: int = _COLUMNS) -> Figure:
     """Draw a figure with a top view per panel, in metres, east to the right and north up.
 
     Args:
         panels: At least one panel, each with at least one flight. The first flight without fault
             and detector is the reference for the flight times of the others.
+        across: At most so many panels side by side.
     """
-    columns = min(_COLUMNS, len(panels))
+    columns = min(across, len(panels))
     rows = -(-len(panels) // columns)
     most = max(len(panel.flights) for panel in panels)
     figure = new_figure(5.2 * columns, (5.3 + 0.19 * most) * rows)

@@ -12,7 +12,7 @@ from pathlib import Path
 from mavfi_cli.campaigns.begin import check_kinds
 from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
+from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
 from mavfi_cli.campaigns.specification_file import folder_name
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.reproduction.items import ITEMS, Item
@@ -107,15 +107,27 @@ def fly_items(
         fly_missing(ledger, options, spectator)
 
 
+def stored_plan(ledger: Ledger) -> FlightsPlan | None:
+    """The plan with which a reproduction was begun, for all items; None of another campaign."""
+    text = ledger.meta(_META)
+    if text is None:
+        return None
+    stored = json.loads(text)
+    return FlightsPlan(
+        items=ITEMS, stack=stored["stack"], scale=stored["scale"], out=ledger.folder.parent
+    )
+
+
 def _opened(plan: FlightsPlan) -> Ledger:
     """The ledger of the plan's stack with the list of all items at the plan's scale."""
-    stored = _stored(plan.folder)
-    if stored is None:
-        check_kinds(kinds_of(ITEMS, plan.stack))
+    if (plan.folder / LEDGER).is_file():
+        with Ledger(plan.folder) as ledger:
+            _require_same(plan, stored_plan(ledger))
     else:
-        _require_same(plan, stored)
+        check_kinds(kinds_of(ITEMS, plan.stack))
     ledger = Ledger(plan.folder, writing=True)
     try:
+        require_unchanged(ledger)
         asked = {"stack": plan.stack, "scale": plan.scale}
         ledger.set_meta({"name": plan.folder.name, _META: json.dumps(asked)})
         store_plan(ledger, missions_of(ITEMS, plan.stack, plan.scale), append=True)
@@ -125,32 +137,20 @@ def _opened(plan: FlightsPlan) -> Ledger:
     return ledger
 
 
-def _stored(folder: Path) -> dict[str, object] | None:
-    """Stack and scale of a folder; None if nothing was begun there.
-
-    Raises:
-        ConfigError: it holds a campaign that is no reproduction.
-    """
-    if not (folder / LEDGER).is_file():
-        return None
-    with Ledger(folder) as ledger:
-        text = ledger.meta(_META)
-    if text is None:
-        raise ConfigError("holds a campaign that is no reproduction", path=folder)
-    found: dict[str, object] = json.loads(text)
-    return found
-
-
-def _require_same(plan: FlightsPlan, stored: dict[str, object]) -> None:
-    if stored["stack"] != plan.stack:
+def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
+    """Refuse a folder that cannot grow to the plan."""
+    if stored is None:
         raise ConfigError(
-            f"flies the stack {stored['stack']}, not {plan.stack}; another --out starts anew",
+            "holds a campaign that is no reproduction; another --out starts anew", path=plan.folder
+        )
+    if stored.stack != plan.stack:
+        raise ConfigError(
+            f"flies the stack {stored.stack}, not {plan.stack}; another --out starts anew",
             path=plan.folder,
         )
-    scale = float(str(stored["scale"]))
-    if plan.scale < scale:
+    if plan.scale < stored.scale:
         raise ConfigError(
-            f"was begun at --scale {scale:g}, which cannot shrink to {plan.scale:g}; "
+            f"was begun at --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}; "
             "another --out starts anew",
             path=plan.folder,
         )

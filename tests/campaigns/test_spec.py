@@ -282,8 +282,8 @@ def test_every_preset_expands_to_its_numbers(name):
     )  # paper: 100
     assert set(cells.values()) == repetitions
     sizes = {
-        "fig7": 10, "fig8": 9, "fig9": 4, "table3": 4, "table4": 40, "fig11": 4, "fig13": 5, "fig14": 136,
-        "fig16": 20, "speeds": 21, "hardening": 84, "ablation": 72,
+        "fig7": 10, "fig8": 9, "fig9": 4, "table3": 4, "table4": 40, "fig11": 4, "fig13": 5,
+        "fig14": 136, "fig16": 20, "speeds": 21, "hardening": 84, "ablation": 72,
     }  # fmt: skip
     assert len(cells) == sizes[name]
     tenth = sum(round(count / 10) for count in cells.values())

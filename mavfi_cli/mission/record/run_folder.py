@@ -15,7 +15,7 @@ from mavfi_cli.spec.stack import FIRST
 if TYPE_CHECKING:
     import pyarrow as pa
 
-RESULT, FAULT = "result.json", "fault.json"
+RESULT, FAULT, TRACE = "result.json", "fault.json", "trace.parquet"
 _NEEDED = (
     "outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "versions", "host",
 )  # fmt: skip
@@ -27,7 +27,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.result = path / RESULT  # outcome, quality of flight, seeds, versions, configuration
-        self.trace = path / "trace.parquet"  # states at every control tick
+        self.trace = path / TRACE  # states at every control tick
         self.plans = path / "plans.parquet"  # every waypoint of every plan
         self.kernels = path / "kernels.parquet"  # start and end of every invocation
         self.tlog = path / "flight.tlog"  # every MAVLink frame of both directions

@@ -1,0 +1,102 @@
+"""What the items' tables are computed from: flown missions, runs of kernels, the model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import flights
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.report.tables.paper_table import PaperTable
+from mavfi_cli.reproduction.flying import FlightsPlan, stored_plan
+from mavfi_cli.reproduction.items import ITEMS, Item, Source
+from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
+from mavfi_cli.reproduction.missions import key_of, missions_of
+from mavfi_cli.vpm.model import schemes_with
+from mavfi_cli.vpm.report import Choices, report
+from mavfi_cli.vpm.vehicle import load_vehicle
+
+KERNELS, SUMMARY = "kernels", "kernels.json"  # folder beside those of the stacks
+_VEHICLES = ("airsim", "spark")
+
+
+def flights_of(item: Item, plan: FlightsPlan, table: pa.Table) -> pa.Table:
+    """The flights of an item among those of a reproduction.
+
+    Args:
+        table: all flights of the reproduction, as `analysis.flights.flights`.
+    """
+    keys = [key_of(each) for each in missions_of([item], plan.stack, plan.scale)]
+    return table.filter(pc.is_in(table["changes"], value_set=pa.array(keys, pa.string())))
+
+
+def items_of_preset(name: str) -> tuple[Item, ...]:
+    """The items that a preset flies; the one of its own name first."""
+    found = [item for item in ITEMS if item.preset == name]
+    return tuple(sorted(found, key=lambda item: item.name != name))
+
+
+def kernel_runs(out: Path) -> Mapping[str, Any]:
+    """The summary of the isolated kernels of a reproduction.
+
+    Raises:
+        RecordError: they were not run, or the file is damaged.
+    """
+    path = out / KERNELS / SUMMARY
+    try:
+        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecordError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise RecordError(f"{path}: damaged ({error})") from None
+    return found
+
+
+def model_report() -> Mapping[str, Any]:
+    """The performance model of the paper's two vehicles, with the paper's overheads."""
+    vehicles = [load_vehicle(name) for name in _VEHICLES]
+    return report(vehicles, Choices(), schemes_with({}))
+
+
+def item_flights(item: Item, ledger: Ledger) -> pa.Table:
+    """The flights of an item in a campaign: a reproduction, or one with the item's missions."""
+    table, plan = flights(ledger), stored_plan(ledger)
+    return table if plan is None else flights_of(item, plan, table)
+
+
+def table_of_item(item: Item, ledger: Ledger) -> PaperTable:
+    """The table of an item in a campaign.
+
+    Raises:
+        RecordError: the kernels were not run.
+    """
+    if item.source is not Source.FLIGHTS:
+        return _unflown(item, ledger.folder.parent)
+    return of_flights(item.name, item_flights(item, ledger))
+
+
+def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
+    """The table of each item of a plan, from what is there.
+
+    Raises:
+        RecordError: nothing was flown, or the kernels were not run.
+    """
+    table = None
+    for item in plan.items:
+        if item.source is not Source.FLIGHTS:
+            yield _unflown(item, plan.out)
+            continue
+        if table is None:
+            with Ledger(plan.folder) as ledger:
+                table = flights(ledger)
+        yield of_flights(item.name, flights_of(item, plan, table))
+
+
+def _unflown(item: Item, out: Path) -> PaperTable:
+    return of_model(model_report()) if item.source is Source.MODEL else of_kernels(kernel_runs(out))

@@ -1,0 +1,150 @@
+"""A campaign on one screen: what is done, the time left, and one table."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+from mavfi_cli.analysis.groups import METRICS, Group, groups
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.progress import duration
+from mavfi_cli.campaigns.specification_file import presets
+from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
+from mavfi_cli.reproduction.evidence import items_of_preset, table_of_item
+from mavfi_cli.reproduction.flying import stored_plan
+from mavfi_cli.reproduction.items import ITEMS, Item, items_named
+from mavfi_cli.reproduction.measures import mean_cell, share_cell
+from mavfi_cli.reproduction.missions import key_of, missions_of, numbers_of
+from mavfi_cli.stats.shares import rate
+
+ROWS = 14  # of a table on one screen
+
+
+def preset_of(ledger: Ledger) -> str | None:
+    """The preset that a campaign was begun from, with or without changes; None of others."""
+    name = ledger.meta("name") or ""
+    found = name.partition("-")[0]
+    return found if found in presets() else None
+
+
+def item_of(ledger: Ledger) -> Item | None:
+    """The paper's item of a campaign; None if the paper has none."""
+    preset = preset_of(ledger)
+    return next(iter(items_of_preset(preset)), None) if preset else None
+
+
+def asked_item(ledger: Ledger, name: str | None) -> Item | None:
+    """The named item of a campaign, or the one of its preset.
+
+    Raises:
+        UnknownName: the campaign flies no such item.
+        ConfigError: the paper has it, but it is no experiment.
+    """
+    if name is None:
+        return item_of(ledger)
+    preset = preset_of(ledger)
+    whole = stored_plan(ledger) is not None
+    known = [each.name for each in ITEMS if whole or (each.preset and each.preset == preset)]
+    (found,) = items_named([name])
+    if found.name not in known:
+        raise UnknownName("item of this campaign", name, known or ["none"])
+    return found
+
+
+def table_of(ledger: Ledger, item: Item | None = None) -> PaperTable:
+    """The one table of a campaign: the paper's, the items of a reproduction, or the settings."""
+    if item is not None:
+        return table_of_item(item, ledger)
+    if stored_plan(ledger) is not None:
+        return _progress_table(ledger)
+    return settings_table(ledger)
+
+
+def settings_table(ledger: Ledger) -> PaperTable:
+    """Success and quality of flight of each setting."""
+    scales = {"flight_time_s": ("time, s", 1.0), "distance_m": ("distance, m", 1.0),
+              "energy_regression_j": ("energy, kJ", 1e-3), "replans": ("replans", 1.0)}  # fmt: skip
+    assert tuple(scales) == METRICS
+    found = groups(ledger)
+    return PaperTable(
+        name="settings",
+        title=f"{ledger.meta('name') or ledger.folder.name}: settings",
+        labels=("setting",),
+        columns=(
+            PaperColumn(title="success, %", ends=0),
+            *(PaperColumn(title=title) for title, _ in scales.values()),
+        ),
+        rows=tuple(
+            PaperRow(
+                labels=(group.name,),
+                cells=(
+                    _success(group),
+                    *(mean_cell(scale * group.successes(name))
+                      for name, (_, scale) in scales.items()),
+                ),
+            )
+            for group in found
+        ),
+        notes=("success: golden missions and faults that struck; means: the successful of them",),
+    )  # fmt: skip
+
+
+def _success(group: Group) -> PaperCell:
+    won = group.succeeded[group.counted]
+    return share_cell(rate(int(won.sum()), len(won)))
+
+
+def _progress_table(ledger: Ledger) -> PaperTable:
+    """How much of each item of a reproduction is flown."""
+    plan = stored_plan(ledger)
+    assert plan is not None
+    over = {number for number, _ in ledger.fates()}
+    rows = []
+    for item in plan.items:
+        if item.preset:
+            keys = map(key_of, missions_of([item], plan.stack, plan.scale))
+            numbers = numbers_of(ledger, keys)
+            done = sum(number in over for number in numbers)
+            counts = (float(done), 100.0 * done / len(numbers))
+            cells = tuple(PaperCell(value=value, count=len(numbers)) for value in counts)
+            rows.append(PaperRow(labels=(item.name, item.title), cells=cells))
+    return PaperTable(
+        name="items",
+        title=f"Reproduction on {plan.stack} at scale {plan.scale:g}; n: missions of the item",
+        labels=("item", "what it shows"),
+        columns=(PaperColumn(title="flown", digits=0), PaperColumn(title="%", digits=0)),
+        rows=tuple(rows),
+        notes=("mavfi campaign report FOLDER --item ITEM prints its table",),
+    )
+
+
+def short(table: PaperTable) -> PaperTable:
+    """The table cut to one screen."""
+    if len(table.rows) <= ROWS:
+        return table
+    more = f"and {len(table.rows) - ROWS} more rows: mavfi campaign report"
+    return replace(table, rows=table.rows[:ROWS], notes=(more, *table.notes))
+
+
+def progress_lines(ledger: Ledger) -> list[str]:
+    """What is done, and the time left at the pace so far."""
+    planned, over = ledger.planned(), ledger.over()
+    errors = sum(ledger.errors_by_cell().values())
+    lines = [f"{ledger.meta('name') or ledger.folder.name}: {over} of {planned} missions"]
+    if errors:
+        lines.append(f"{errors} could not begin; run --retry-errors repeats them")
+    if over < planned:
+        lines.append(_time_left(ledger, planned - over))
+    return lines
+
+
+def _time_left(ledger: Ledger, missing: int) -> str:
+    walls = [wall for portion in ledger.columns(["wall_s"]) for wall in portion[0]]
+    if not walls:
+        return f"{missing} missing; time left: not known before a mission is over"
+    jobs, each_s = len(os.sched_getaffinity(0)), sum(walls) / len(walls)
+    return (
+        f"{missing} missing: about {duration(missing * each_s / jobs)} with {jobs} at a time "
+        f"({each_s:.1f} s each so far)"
+    )
