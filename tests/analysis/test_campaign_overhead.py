@@ -139,7 +139,7 @@ def test_a_campaign_without_detectors_says_so(book):
 
 def test_the_command_shows_it_where_it_is_asked_for(filled):
     folder = str(filled.ledger.folder)
-    plain = CliRunner().invoke(command, ["status", folder])
+    plain = CliRunner().invoke(command, ["status", folder, "--full"])
     asked = CliRunner().invoke(command, ["status", folder, "--overhead"])
     assert "host time" not in plain.output
     assert asked.output.startswith(plain.output)
