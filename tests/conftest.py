@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
 from missions import POSTS, SHORT
 
@@ -24,6 +25,7 @@ from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.vehicle import start_vehicle
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
+from sitl.camera.component import COMPONENT_ID, Camera
 
 for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
     sys.path.insert(0, str(Path(__file__).parent / _folder))
@@ -117,6 +119,8 @@ def free_port():
 class AutopilotOnUdp:
     """A scripted autopilot that calls a UDP port: as fast as it gets answers, at least double.
 
+    A depth camera in an empty world flies with it.
+
     Attributes:
         muted: kinds of messages that it no longer sends.
         extra: messages that it sends at every tick besides.
@@ -124,8 +128,9 @@ class AutopilotOnUdp:
         pause_s: wall time that every tick takes besides.
     """
 
-    def __init__(self, autopilot, port):
+    def __init__(self, autopilot, port, *, camera=True):
         self.autopilot = autopilot
+        self.camera = Camera(np.zeros((0, 6))) if camera else None
         self.muted = set()
         self.extra = []
         self.noise = None
@@ -137,7 +142,7 @@ class AutopilotOnUdp:
         self._thread.start()
 
     def _run(self):
-        decoder, encoder = Codec(255, 255), Codec(1, 1)
+        decoder, encoder, of_camera = Codec(255, 255), Codec(1, 1), Codec(1, COMPONENT_ID)
         while not self._over.is_set():
             inbox = []
             wait_s = TICK_WALL_S
@@ -151,9 +156,17 @@ class AutopilotOnUdp:
             self._over.wait(self.pause_s)
             messages = [*self.autopilot.advance(inbox), *self.extra]
             frames = [encoder.encode(m) for m in messages if m.get_type() not in self.muted]
+            if self.camera is not None:
+                frames += [of_camera.encode(m) for m in self._photograph(inbox)]
             for frame in [self.noise(), *frames] if self.noise else frames:
                 with contextlib.suppress(ConnectionError):
                     self._socket.send(frame)
+
+    def _photograph(self, inbox):
+        """What the camera sends at this tick, seen level and eastwards."""
+        answers = [answer for message in inbox for answer in self.camera.handle(message)]
+        pose = np.array(self.autopilot.position_enu_m), np.array([1.0, 0.0, 0.0, 0.0])
+        return answers + self.camera.poll(self.autopilot.stamp_s, *pose)
 
     def close(self):
         self._over.set()
@@ -166,8 +179,8 @@ def autopilot_on_udp(free_port):
     """Starts a scripted autopilot on UDP; it and the URL under which a mission hears it."""
     with contextlib.ExitStack() as stack:
 
-        def start(autopilot):
-            link = AutopilotOnUdp(autopilot, free_port)
+        def start(autopilot, **options):
+            link = AutopilotOnUdp(autopilot, free_port, **options)
             stack.callback(link.close)
             return link, f"udpin:127.0.0.1:{free_port}"
 

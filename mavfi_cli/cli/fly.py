@@ -105,8 +105,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_mission("--key-file", metavar="FILE", type=click.Path(dir_okay=False),
           help="File with the signing passphrase of --link.")  # fmt: skip
 @_mission("--loss-limit", "loss_limit_s", default=5.0, show_default=True,
-          help="Time without a new state on --link after which it counts as lost, on the vehicle's "
-               "clock and on the wall's, s.")  # fmt: skip
+          help="Time without a new state or depth frame on --link after which it counts as lost, "
+               "on the vehicle's clock and on the wall's, s.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
           help="Land and disarm at the goal  [only with --link].")  # fmt: skip
 @_fault("--inject", metavar="STAGE|STATE|GROUP",

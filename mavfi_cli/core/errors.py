@@ -108,6 +108,23 @@ class NoAutopilot(LinkError):
         super().__init__(f"no autopilot at {url}: no heartbeat within {waited_s:g} s")
 
 
+class UnfitAutopilot(LinkError):
+    """An autopilot that is not flown: of an unknown kind, or one of two on a link."""
+
+    def __init__(self, url: str, what: str) -> None:
+        super().__init__(f"{url}: {what}")
+
+
+class NoCamera(LinkError):
+    """No depth camera answered, so the vehicle would fly blind."""
+
+    def __init__(self, url: str, waited_s: float) -> None:
+        super().__init__(
+            f"{url}: no camera (MAVLink component 100) answered within {waited_s:g} s, so the "
+            "vehicle does not take off; --eyes starts one"
+        )
+
+
 class CommandRefused(LinkError):
     """The autopilot refused a command. Quotes the autopilot's status texts."""
 

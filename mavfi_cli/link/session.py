@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from mavfi_cli.core.errors import LinkError, NoAutopilot
+from mavfi_cli.core.errors import LinkError, NoAutopilot, NoCamera, UnfitAutopilot
 from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.codec import Message, dialect
@@ -100,8 +100,10 @@ class SessionSettings:
     component: int = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
     takeoff_height_m: float = 2.5  # above the ground at take-off
     request_streams: bool = True  # request message streams; lockstep sends them anyway
+    needs_camera: bool = False  # refuse the take-off until a camera has answered
     state_rate_hz: float = 50.0
     connect_timeout_s: float = 10.0
+    camera_timeout_s: float = 5.0
     ready_timeout_s: float = 60.0
     arm_timeout_s: float = 15.0
     takeoff_timeout_s: float = 30.0
@@ -219,15 +221,20 @@ class OffboardSession:
     def _acknowledged(self, message: Message) -> None:
         if self._is_of_vehicle(message):
             self._commands.acknowledge(message)
+            self._camera_heard = self._camera_heard or message.get_srcComponent() == _CAMERA
 
     def _heartbeat(self, message: Message) -> None:
-        """Ask the camera for its information at its first HEARTBEAT."""
+        """Ask the camera for its information at its first HEARTBEAT, unless that has been done."""
         if message.get_srcComponent() != _CAMERA or self._camera_heard:
             return
         if self._is_of_vehicle(message):
             self._camera_heard = True
-            information = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
-            self._commands.submit(dialect.MAV_CMD_REQUEST_MESSAGE, information, component=_CAMERA)
+            if not self._settings.needs_camera:
+                self._ask_camera()
+
+    def _ask_camera(self) -> None:
+        information = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
+        self._commands.submit(dialect.MAV_CMD_REQUEST_MESSAGE, information, component=_CAMERA)
 
     def _is_of_vehicle(self, message: Message) -> bool:
         """Return True if a message comes from a component of the autopilot's system."""
@@ -289,15 +296,35 @@ class OffboardSession:
         return 0.0 if since is None else self._now_s - since
 
     def _connecting(self) -> None:
+        self._require_fit()
         if self.telemetry.heard:
             if self._settings.request_streams:
                 self._requests.streams(self._settings.state_rate_hz)
+            if self._settings.needs_camera:
+                self._ask_camera()
             self._enter(Phase.WAITING_READY)
         elif self._elapsed_s() >= self._settings.connect_timeout_s:
             raise NoAutopilot(self._url, self._settings.connect_timeout_s)
 
+    def _require_fit(self) -> None:
+        """Refuse what cannot be flown, until the vehicle has taken off."""
+        if self.telemetry.unfit:
+            raise UnfitAutopilot(self._url, self.telemetry.unfit)
+
+    def _has_camera(self) -> bool:
+        """Return False while a needed camera has not answered, until the time is over."""
+        if self._camera_heard or not self._settings.needs_camera:
+            return True
+        timeout_s = self._settings.camera_timeout_s
+        if self._elapsed_s() >= timeout_s:
+            raise NoCamera(self._url, timeout_s)
+        return False
+
     def _waiting_ready(self) -> None:
         telemetry, requests = self.telemetry, self._requests
+        self._require_fit()
+        if not self._has_camera():
+            return
         if telemetry.armed and telemetry.in_air and telemetry.state is not None:
             self._was_up = True
             self._enter(Phase.TAKING_OFF)
@@ -324,6 +351,7 @@ class OffboardSession:
         return "not ready to arm"
 
     def _arming(self) -> None:
+        self._require_fit()
         if self.telemetry.armed:
             self._enter(Phase.TAKING_OFF)
         elif self._requests.insist("arming", dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0):

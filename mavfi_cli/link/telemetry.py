@@ -100,6 +100,15 @@ ARDUCOPTER = _AutopilotProfile(
 )
 
 
+_PROFILES = {
+    dialect.MAV_AUTOPILOT_PX4: PX4,
+    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUCOPTER,
+}
+_COPTERS = (
+    dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_COAXIAL, dialect.MAV_TYPE_HELICOPTER,
+    dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR, dialect.MAV_TYPE_TRICOPTER,
+    dialect.MAV_TYPE_DODECAROTOR, dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_GENERIC_MULTIROTOR,
+)  # fmt: skip
 _REORDERED_MS = 1000  # older by less: a late packet; older by more: a restarted clock
 
 
@@ -177,6 +186,7 @@ class Telemetry:
     Attributes:
         now_s: Time at which handled messages count as received. The owner sets it.
         system: System id of the autopilot; 0 before its first message.
+        unfit: Why an autopilot on the link cannot be flown; "" without a reason.
         state: Position, velocity and attitude in ENU; None before both are known.
         armed: Armed flag in HEARTBEAT.
         mode: Name of the flight mode; "" before the first HEARTBEAT.
@@ -192,6 +202,7 @@ class Telemetry:
     def __init__(self) -> None:
         self.now_s = 0.0
         self.system = 0
+        self.unfit = ""
         self.autopilot: _AutopilotProfile = PX4
         self.state: VehicleState | None = None
         self.armed = False
@@ -221,17 +232,25 @@ class Telemetry:
         handler = _HANDLERS.get(type(message))
         if handler is None or message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return
-        if not self.heard and isinstance(message, dialect.MAVLink_heartbeat_message):
+        if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._adopt(message)
         if self.heard and message.get_srcSystem() == self.system:
             handler(self, message)
 
     def _adopt(self, message: Message) -> None:
-        """Follow the sender of a HEARTBEAT. An unknown autopilot is treated as PX4."""
-        if message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
-            self.system = message.get_srcSystem()
-            ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
-            self.autopilot = ARDUCOPTER if ardupilot else PX4
+        """Follow the first autopilot that sends a HEARTBEAT and can be flown."""
+        system, profile = message.get_srcSystem(), _PROFILES.get(message.autopilot)
+        if message.autopilot == dialect.MAV_AUTOPILOT_INVALID or system == self.system:
+            return
+        if self.heard:
+            self.unfit = f"two autopilots are on this link, systems {self.system} and {system}"
+        elif profile is None or message.type not in _COPTERS:
+            self.unfit = (
+                f"system {system} is {_name('MAV_AUTOPILOT', message.autopilot)} with "
+                f"{_name('MAV_TYPE', message.type)}; PX4 and ArduPilot fly, with a multicopter"
+            )
+        else:
+            self.system, self.autopilot = system, profile
 
     def _heartbeat(self, message: Message) -> None:
         self.armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
@@ -299,6 +318,12 @@ class Telemetry:
         for text in self.texts.since(before):
             if self.collision_text is None and text.text.startswith("Collision"):
                 self.collision_text = text.text
+
+
+def _name(enum: str, number: int) -> str:
+    """Return the name of a MAVLink enumeration's value, or the enumeration and the number."""
+    entry = dialect.enums[enum].get(number)
+    return f"{enum} {number}" if entry is None else str(entry.name)
 
 
 _HANDLERS: dict[type, Callable[[Telemetry, Message], None]] = {

@@ -91,6 +91,7 @@ class Flight:
         self.images = ImageReceiver()
         self._frames: list[ImageFrame] = []
         self._camera_asked = False
+        self._seen_s = 0.0  # when the newest frame arrived, or frames were asked for
         self._clock = None if config.link is None else ForeignClock()
         self._unspoken_s = 0.0
         self._briefing: Briefing | None = None
@@ -104,11 +105,13 @@ class Flight:
         self.end_s = 0.0
         self.outcome: Outcome | None = None
         self.reason = ""
+        self._lands = False
 
     def _new_session(self, telemetry: Telemetry | None = None) -> OffboardSession:
         settings = SessionSettings(
             takeoff_height_m=self._config.takeoff_height_m,
             request_streams=self._config.link is not None,
+            needs_camera=self._config.link is not None,
         )
         url = self._config.link or "the simulated vehicle"
         return OffboardSession(settings, url=url, telemetry=telemetry)
@@ -210,8 +213,7 @@ class Flight:
             raise self._session.failure
         if self.outcome is None:
             return False
-        landing = self._config.land and self.outcome in _LAND_AFTER
-        if not landing or len(self._interrupts) > 1:
+        if not (self._config.land and self._lands) or len(self._interrupts) > 1:
             return True
         self._session.request_land()
         return self._session.phase in (Phase.DONE, Phase.FAILED)
@@ -221,11 +223,16 @@ class Flight:
         """Return the error of a failed landing, which does not change the mission's outcome."""
         return self._session.failure if self.outcome is not None else None
 
-    def end(self, outcome: Outcome, reason: str = "") -> None:
-        """Set the outcome of the mission. Later calls have no effect."""
+    def end(self, outcome: Outcome, reason: str = "", *, lands: bool = False) -> None:
+        """Set the outcome of the mission. Later calls have no effect.
+
+        Args:
+            lands: The vehicle still follows, also if the outcome is none after which it lands.
+        """
         if self.outcome is not None:
             return
         self.outcome, self.reason, self.end_s = outcome, reason, self.stamp_s
+        self._lands = lands or outcome in _LAND_AFTER
         text = outcome.value.replace("_", " ") + (f": {reason}" if reason else "")
         self.logger.note(self.stamp_s, "outcome", text, self._session.state)
 
@@ -268,7 +275,9 @@ class Flight:
         stamp_ms = None
         with self.wall.measure("link"):
             for message in self.link.messages(data, self.stamp_s):
-                self._frames += self.images.feed(message)
+                if frames := self.images.feed(message):
+                    self._frames += frames
+                    self._seen_s = self.stamp_s
                 if type(message) is _PACKET:
                     continue  # half of all messages, and nothing that the session looks at
                 self._session.handle(message)
@@ -323,6 +332,7 @@ class Flight:
             companion.executor.compute()
         if not self._camera_asked and self._nearly_up(state):
             self._camera_asked = True
+            self._seen_s = stamp_s
             self._session.start_camera(1.0 / self._config.camera_rate_hz)
         self.logger.tell(stamp_s, self._session, companion, self.injection)
         return True
@@ -385,6 +395,9 @@ class Flight:
             )
         elif session.failsafe_text is not None:
             self.end(Outcome.FAILSAFE, session.failsafe_text)
+        elif self._blind_s >= self._config.loss_limit_s:
+            limit_s = self._config.loss_limit_s
+            self.end(Outcome.LINK_LOST, f"the camera sent no frame for {limit_s:g} s", lands=True)
         elif companion is not None and companion.mode is PilotMode.ARRIVED:
             self.end(Outcome.SUCCESS)
         elif companion is not None and companion.mode is PilotMode.GAVE_UP:
@@ -393,6 +406,13 @@ class Flight:
             )
         elif self.stamp_s - self.takeover_s >= self._config.time_limit_s:
             self.end(Outcome.TIMEOUT, f"{self._config.time_limit_s:g} s")
+
+    @property
+    def _blind_s(self) -> float:
+        """Time by which the next frame of a foreign autopilot's camera is overdue, s."""
+        if not self._camera_asked or self._config.link is None:
+            return 0.0
+        return self.stamp_s - self._seen_s - 1.0 / self._config.camera_rate_hz
 
     # Record ---------------------------------------------------------------------------------------
 

@@ -9,8 +9,15 @@ import pytest
 from fake_autopilot import FakeArduCopter, FakePX4
 
 from mavfi_cli.autonomy import warm
-from mavfi_cli.core.errors import CommandRefused, ConfigError, Interrupted, NoAutopilot
-from mavfi_cli.link.codec import dialect
+from mavfi_cli.core.errors import (
+    CommandRefused,
+    ConfigError,
+    Interrupted,
+    NoAutopilot,
+    NoCamera,
+    UnfitAutopilot,
+)
+from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.mission import flight
 from mavfi_cli.mission.record.run_folder import load_run
@@ -77,12 +84,66 @@ def test_an_autopilot_that_refuses_to_arm_says_why(autopilot_on_udp, fly_short):
 
 
 @pytest.mark.parametrize("autopilot", [FakePX4, FakeArduCopter])
-def test_a_flight_without_a_camera_ends_by_the_clock(autopilot, autopilot_on_udp, fly_short):
+def test_the_time_limit_ends_a_flight(autopilot, autopilot_on_udp, fly_short):
     _, url = autopilot_on_udp(autopilot())
     run = load_run(fly_short(link=url, time_limit_s=1.0).path)
     assert run.result["outcome"] == "timeout"
-    assert run.result["images"]["received"] == 0
-    assert run.result["quality_of_flight"]["distance_m"] < 0.5
+    assert run.result["images"]["received"] > 0
+
+
+@pytest.mark.parametrize("autopilot", [FakePX4, FakeArduCopter])
+def test_nobody_takes_off_without_a_camera(autopilot, autopilot_on_udp, fly_short):
+    fake = autopilot()
+    _, url = autopilot_on_udp(fake, camera=False)
+    with pytest.raises(NoCamera, match=rf"{url}: no camera .* answered within 5 s"):
+        fly_short(link=url)
+    assert dialect.MAV_CMD_COMPONENT_ARM_DISARM not in [each.command for each in fake.commands]
+
+
+def test_a_camera_that_falls_silent_in_flight_ends_it_on_the_ground(
+    autopilot_on_udp, fly_short, at_event
+):
+    fake = FakePX4()
+    link, url = autopilot_on_udp(fake)
+
+    def go_blind():
+        link.camera = None
+
+    result = load_run(fly_short(at_event("offboard", go_blind), link=url, land=True).path).result
+    assert result["outcome"] == "link_lost"
+    assert result["reason"] == "the camera sent no frame for 5 s"
+    assert not fake.armed
+
+
+def test_a_second_autopilot_on_the_link_is_told_before_take_off(autopilot_on_udp, fly_short):
+    """As a router does that joins two vehicles' links."""
+    fake = FakePX4()
+    link, url = autopilot_on_udp(fake)
+    other = Codec(9, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3))
+    link.noise = lambda: other if fake.commands else b"\0"
+    with pytest.raises(UnfitAutopilot, match="two autopilots are on this link, systems"):
+        fly_short(link=url)
+    assert not fake.armed
+
+
+@pytest.mark.parametrize(
+    ("kind", "autopilot", "said"),
+    [
+        (1, 3, "MAV_AUTOPILOT_ARDUPILOTMEGA with MAV_TYPE_FIXED_WING"),
+        (2, 14, "MAV_AUTOPILOT_AUTOQUAD with MAV_TYPE_QUADROTOR"),
+        (2, 99, "MAV_AUTOPILOT 99 with MAV_TYPE_QUADROTOR"),
+    ],
+)
+def test_an_autopilot_of_an_unknown_type_is_not_flown(
+    autopilot_on_udp, fly_short, kind, autopilot, said
+):
+    link, url = autopilot_on_udp(FakePX4(), camera=False)
+    link.muted |= {*EVERYTHING}
+    link.noise = lambda: Codec(1, 1).encode(
+        dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 3, 3)
+    )
+    with pytest.raises(UnfitAutopilot, match=rf"{url}: system 1 is {said}; PX4 and ArduPilot fly"):
+        fly_short(link=url)
 
 
 def cut(link, *kinds):
