@@ -250,8 +250,8 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     platform = given.get("platform", base.platform)
     if link is not None and given.get("goal", base.goal) is None:
         raise click.UsageError("--link needs --goal X,Y,Z (ENU, m, from its local origin)")
-    if "firmware" in given and given.get("autopilot", base.autopilot) == OWN_AUTOPILOT:
-        raise click.UsageError("--firmware needs --autopilot px4 or ardupilot")
+    if given.get("autopilot", base.autopilot) == OWN_AUTOPILOT:
+        refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
     if measured_factor(platform) is not None and not given.get("realtime", base.realtime):
         raise click.UsageError(f"--platform {platform} needs --realtime")
     own = {field.name for field in fields(base)} - {"fault", "instruction", "detector"}

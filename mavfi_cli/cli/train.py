@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from mavfi_cli.cli.grouped import refuse_given
+
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
@@ -20,6 +22,10 @@ import click
               help="Flights per world.")  # fmt: skip
 @click.option("--first-seed", default=10_000, show_default=True,
               help="Seed of the first flight; each further flight adds 1.")  # fmt: skip
+@click.option("--autopilot", default="ours", show_default=True, metavar="ours|px4|ardupilot",
+              help="Autopilot that flies the missions.")  # fmt: skip
+@click.option("--firmware", metavar="PATH",
+              help="SITL binary of a real autopilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @click.option(
     "--kind",
     "kinds",
@@ -39,6 +45,8 @@ def train(
     worlds: tuple[str, ...],
     flights: int,
     first_seed: int,
+    autopilot: str,
+    firmware: str | None,
     kinds: tuple[str, ...],
     n_sigma: float | None,
     seed: int,
@@ -56,10 +64,12 @@ def train(
     from mavfi_cli.detect.fit import KINDS
     from mavfi_cli.report.detector_plots import draw_loss_curve
     from mavfi_cli.report.drawing import write_svg
-    from mavfi_cli.spec.mission import MissionConfig
+    from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
     from mavfi_cli.studies.train import WORLDS, TrainingPlan
     from mavfi_cli.studies.train import train as run
 
+    if autopilot == OWN_AUTOPILOT:
+        refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
     plan = TrainingPlan(
         worlds=worlds or WORLDS,
         flights=flights,
@@ -67,7 +77,7 @@ def train(
         seed=seed,
         n_sigma=n_sigma,
         kinds=kinds or KINDS,
-        base=MissionConfig(stack=stack),
+        base=MissionConfig(stack=stack, autopilot=autopilot, firmware=firmware),
     )
     with missions_view(quiet=quiet) as view:
         trained = run(plan, out, Options(jobs=jobs or 0), view)

@@ -208,7 +208,9 @@ def _row(name: str, path: Path | None) -> dict[str, Any]:
     span = f", seeds {seeds[0]} to {seeds[-1]}" if seeds else ""
     worlds = ", ".join(model.provenance.get("worlds", [])) or "unknown worlds"
     count = model.provenance.get("flights", len(flights))
-    return {**row, "told": f"{count} flights in {worlds}{span}; mavfi {model.mavfi}"}
+    autopilot = model.provenance.get("autopilot")
+    flown = f"{count} flights of {autopilot}" if autopilot else f"{count} flights"
+    return {**row, "told": f"{flown} in {worlds}{span}; mavfi {model.mavfi}"}
 
 
 def training_flights(provenance: Mapping[str, Any]) -> Sequence[str]:

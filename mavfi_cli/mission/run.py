@@ -35,7 +35,13 @@ from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.measures import record_of
 from mavfi_cli.mission.record.run_folder import RunFolder, new_run_folder, stem_of
 from mavfi_cli.mission.record.tables import Timetable, write_plans, write_timetable
-from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end, start_vehicle
+from mavfi_cli.mission.vehicle import (
+    StartVehicle,
+    Vehicle,
+    other_end,
+    start_vehicle,
+    with_firmware,
+)
 from mavfi_cli.spec.mission import MissionConfig, stack_of
 from mavfi_cli.spec.platform import load_platform
 
@@ -67,6 +73,7 @@ def fly_mission(
         MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
             or its record could not be written.
     """
+    config = with_firmware(config)
     platform, stack = load_platform(config.platform), stack_of(config)
     planner = planners.find(config.planner)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()

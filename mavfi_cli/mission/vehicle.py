@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, VehicleProcessError
@@ -144,17 +145,19 @@ def _firmware_arguments(config: MissionConfig) -> list[str]:
     option = "--hil" if config.autopilot == "px4" else "--json"
     seed = derive(config.seed, Stream.SENSOR, "firmware")
     return [
-        option, config.autopilot, "--firmware", str(firmware_of(config)),
+        option, config.autopilot, "--firmware", str(with_firmware(config).firmware),
         "--firmware-seed", str(seed),
     ]  # fmt: skip
 
 
-def firmware_of(config: MissionConfig) -> Path:
-    """Return the SITL binary of a mission's real autopilot.
+def with_firmware(config: MissionConfig) -> MissionConfig:
+    """Return the mission with the SITL binary of its real autopilot, so that a record names it.
 
     Raises:
         ConfigError: Neither the mission nor the environment names one.
     """
+    if config.autopilot == OWN_AUTOPILOT:
+        return config
     variable = FIRMWARE[config.autopilot]
     path = config.firmware or os.environ.get(variable)
     if not path:
@@ -163,7 +166,7 @@ def firmware_of(config: MissionConfig) -> Path:
             "environment",
             key="firmware",
         )
-    return Path(path)
+    return replace(config, firmware=path)
 
 
 Vehicle = VehicleInProcess | VehicleProcess

@@ -24,7 +24,8 @@ from mavfi_cli.detect.offline import columns_of, flight_of
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.record.tables import read_plans
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.mission.vehicle import with_firmware
+from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.stack import load_stack
 
 WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
@@ -118,18 +119,28 @@ def train(
     Raises:
         ModelError: too few flights, an unknown kind, or torch is missing; before anything is
             flown, unless too many flights fail.
-        ConfigError: n sigma is out of range, or the folder has the flights of another plan.
+        ConfigError: n sigma is out of range, the folder has the flights of another plan, or nothing
+            names the binary of a real autopilot.
         RecordError: a file cannot be written.
     """
     check(plan.kinds, len(plan.missions()), plan.n_sigma)
+    plan = replace(plan, base=with_firmware(plan.base))
     dataset, failed = _fly_training(plan, folder, options, spectator)
     fitted = {}
     for kind in plan.kinds:
         spectator.on_note(f"fitting {kind}")
-        fitted[kind] = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
+        model = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
+        fitted[kind] = _flown_by(plan.base.autopilot, model)
     models = {}
     for kind, model in fitted.items():  # all of them, or none
         path = folder / f"{kind}.json"
         model_file.save(path, model)
         models[kind] = (model, path)
     return _TrainedDetectors(dataset=dataset, models=models, failed=failed)
+
+
+def _flown_by(autopilot: str, model: Model) -> Model:
+    """Return the model with a real autopilot in its provenance."""
+    if autopilot == OWN_AUTOPILOT:
+        return model
+    return replace(model, provenance={**model.provenance, "autopilot": autopilot})

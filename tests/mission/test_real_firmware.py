@@ -7,22 +7,34 @@ import numpy as np
 import pytest
 from missions import SHORT
 
+from mavfi_cli.core.files import file_digest
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import FIRMWARE
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module", params=sorted(FIRMWARE))
-def run(request, tmp_path_factory):
+def fly(request, tmp_path_factory):
+    """Fly the short mission with a real autopilot and changes; its loaded run."""
     autopilot = request.param
     if not os.environ.get(FIRMWARE[autopilot]):
         pytest.skip(f"{FIRMWARE[autopilot]} names no SITL binary of {autopilot}")
-    config = replace(SHORT, autopilot=autopilot)
-    folder = fly_mission(config, tmp_path_factory.mktemp(autopilot), Watcher())
-    return load_run(folder.path)
+
+    def flown(**changes):
+        config = replace(SHORT, autopilot=autopilot, **changes)
+        return load_run(fly_mission(config, tmp_path_factory.mktemp(autopilot), Watcher()).path)
+
+    return flown
+
+
+@pytest.fixture(scope="module")
+def run(fly):
+    return fly()
 
 
 def test_it_reaches_the_goal_and_the_referee_saw_it(run):
@@ -46,3 +58,24 @@ def test_the_record_names_the_autopilot_and_repeats_its_settings(run):
     config = run.result["config"]
     assert config["autopilot"] in FIRMWARE
     assert config["world"] == SHORT.world
+    binary = os.environ[FIRMWARE[config["autopilot"]]]
+    assert config["firmware"] == binary
+    assert run.result["files"] == {binary: file_digest(binary)}
+
+
+@pytest.mark.parametrize("changes", [{"realtime": True}, {"vehicle": "spark"}], ids=str)
+def test_it_flies_by_the_wall_s_clock_and_another_vehicle(fly, changes):
+    result = fly(**changes).result
+    assert result["outcome"] == "success"
+    if "realtime" in changes:
+        assert result["host"]["flight_wall_s"] > result["quality_of_flight"]["flight_time_s"]
+
+
+def test_a_fault_is_withheld_by_a_detector_as_with_our_autopilot(fly):
+    fault = FaultConfig(
+        target="command_velocity", at="time=1", together=True, exact_bits=(62,), seed=2
+    )
+    result = fly(fault=fault, detector=DetectorConfig(name="gad")).result
+    assert result["outcome"] == "success"
+    assert result["detection"]["alarms"][0]["stage"] == "control"
+    assert result["fault"]["activation"]["activation"] == "withheld"

@@ -3,7 +3,7 @@
 import pytest
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
-from mavfi_cli.mission.vehicle import firmware_of
+from mavfi_cli.mission.vehicle import with_firmware
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -34,11 +34,13 @@ def test_what_a_real_autopilot_cannot_do_is_refused(other):
 
 def test_the_binary_is_the_missions_or_the_environments(monkeypatch):
     monkeypatch.setenv("PX4_SITL", "/env/px4")
-    assert str(firmware_of(MissionConfig(autopilot="px4"))) == "/env/px4"
-    assert str(firmware_of(MissionConfig(autopilot="px4", firmware="/own/px4"))) == "/own/px4"
+    assert with_firmware(MissionConfig(autopilot="px4")).firmware == "/env/px4"
+    named = MissionConfig(autopilot="px4", firmware="/own/px4")
+    assert with_firmware(named).firmware == "/own/px4"
+    assert with_firmware(MissionConfig()) == MissionConfig()
     monkeypatch.delenv("PX4_SITL")
     with pytest.raises(ConfigError, match="--firmware PATH, or PX4_SITL"):
-        firmware_of(MissionConfig(autopilot="px4"))
+        with_firmware(MissionConfig(autopilot="px4"))
 
 
 def test_the_binary_is_a_file_that_the_mission_depends_on():

@@ -79,10 +79,18 @@ def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
             "unknown detector 'gud'; did you mean 'gad'? Known: aad, gad, l2, range",
         ),
         (["--n-sigma", "-1"], "n sigma: must be a finite number above 0, got -1.0"),
+        (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
+        (
+            ["--autopilot", "px4"],
+            "firmware: px4 needs its SITL binary: --firmware PATH, or PX4_SITL in the environment",
+        ),
     ],
 )
-def test_what_cannot_be_fitted_to_is_said_before_anything_is_flown(mavfi, tmp_path, words, problem):
+def test_what_cannot_be_fitted_to_is_said_before_anything_is_flown(
+    mavfi, tmp_path, monkeypatch, words, problem
+):
+    monkeypatch.delenv("PX4_SITL", raising=False)
     done = mavfi("train", *words, "--out", tmp_path / "training", "--quiet")
-    code = 2 if problem.startswith("unknown") else 1
+    code = 2 if problem.startswith(("unknown", "--firmware")) else 1
     assert (done.returncode, done.stdout, done.stderr) == (code, "", f"error: {problem}\n")
     assert not (tmp_path / "training").exists()
