@@ -9,6 +9,8 @@ import click
 
 from mavfi_cli.cli.grouped import refuse_given
 
+_FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
+
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
@@ -26,6 +28,9 @@ from mavfi_cli.cli.grouped import refuse_given
               help="Autopilot that flies the missions.")  # fmt: skip
 @click.option("--firmware", metavar="PATH",
               help="SITL binary of a real autopilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
+@click.option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
+              help="Fit to the error-free flights in this folder of run folders, of any "
+                   "autopilot, instead of flying.")  # fmt: skip
 @click.option(
     "--kind",
     "kinds",
@@ -47,6 +52,7 @@ def train(
     first_seed: int,
     autopilot: str,
     firmware: str | None,
+    flown: Path | None,
     kinds: tuple[str, ...],
     n_sigma: float | None,
     seed: int,
@@ -70,6 +76,8 @@ def train(
 
     if autopilot == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
+    if flown is not None:
+        refuse_given(_FLYING, "means nothing with --flown")
     plan = TrainingPlan(
         worlds=worlds or WORLDS,
         flights=flights,
@@ -78,6 +86,7 @@ def train(
         n_sigma=n_sigma,
         kinds=kinds or KINDS,
         base=MissionConfig(stack=stack, autopilot=autopilot, firmware=firmware),
+        flown=flown,
     )
     with missions_view(quiet=quiet) as view:
         trained = run(plan, out, Options(jobs=jobs or 0), view)
@@ -88,10 +97,12 @@ def train(
         told = {kind: dict(model.provenance) for kind, (model, _) in trained.models.items()}
         click.echo(json.dumps(told, indent=2))
         return
+    failed = f"{trained.failed} flights failed and are left out"
+    left_out = failed if flown is None else f"left out: {trained.failed}"
     samples = sum(len(flight.deltas) for flight in trained.dataset.flights)
     click.echo(
         f"Data set    {len(trained.dataset)} flights of {stack}, {samples} samples"
-        + (f"; {trained.failed} flights failed and are left out" if trained.failed else "")
+        + (f"; {left_out}" if trained.failed else "")
     )
     for kind, (model, path) in trained.models.items():
         click.echo(f"{kind:<11} threshold {model.provenance['threshold']:.6g}  {path}")

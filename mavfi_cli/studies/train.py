@@ -15,14 +15,14 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.types import Outcome
+from mavfi_cli.core.types import Outcome, StackMark
 from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.fit import KINDS, check, fit
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import columns_of, flight_of
 from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.record.run_folder import RESULT, Run, load_run
 from mavfi_cli.mission.record.tables import read_plans
 from mavfi_cli.mission.vehicle import with_firmware
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
@@ -43,6 +43,7 @@ class TrainingPlan:
         first_seed: seed of the first flight; each further flight of any world adds 1.
         seed: seed of the split and of the initial weights.
         n_sigma: threshold of the Gaussian model; None takes the default.
+        flown: folder of run folders to fit to; None flies the missions.
     """
 
     worlds: tuple[str, ...] = WORLDS
@@ -52,6 +53,7 @@ class TrainingPlan:
     n_sigma: float | None = None
     kinds: tuple[str, ...] = KINDS
     base: MissionConfig = field(default_factory=MissionConfig)
+    flown: Path | None = None
 
     def missions(self) -> list[PlannedMission]:
         """The flights, world by world."""
@@ -83,38 +85,68 @@ class _TrainedDetectors:
 
 def _fly_training(
     plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
-) -> tuple[Dataset, int]:
+) -> tuple[list[FlightSamples], int]:
     """Fly the missing flights, and collect the samples of those that reached the goal.
 
     Returns:
-        The data set, also written to the folder, and the number of flights outside it.
+        The samples, and the number of other flights.
     """
-    missions, stack = plan.missions(), load_stack(plan.base.stack).mark
+    missions = plan.missions()
     ledger = run_campaign(
         missions, folder / FLIGHTS_FOLDER, replace(options, keep=Keep.ALL), spectator
     )
-    preprocess = PreprocessParams()
     flights: list[FlightSamples] = []
     with ledger:
         for entry in ledger.results():
-            config = missions[entry.number].config
+            world = missions[entry.number].config.world
             if entry.outcome == Outcome.SUCCESS.value and entry.path is not None:
-                run = load_run(folder / FLIGHTS_FOLDER / entry.path)
-                assert run.trace is not None
-                columns = columns_of(run.trace)
-                plans = read_plans(run.folder.plans)
-                flights.append(flight_of(columns, config.world, config.seed, preprocess, plans))
-    if not flights:
-        raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
-    dataset = Dataset(flights=tuple(flights), preprocess=preprocess, stack=stack)
-    dataset.save(folder / DATASET)
-    return dataset, len(missions) - len(flights)
+                flights.append(_samples(load_run(folder / FLIGHTS_FOLDER / entry.path), world))
+    return flights, len(missions) - len(flights)
+
+
+def _samples(run: Run, name: str) -> FlightSamples:
+    assert run.trace is not None
+    columns, plans = columns_of(run.trace), read_plans(run.folder.plans)
+    return flight_of(columns, name, run.record.config["seed"], PreprocessParams(), plans)
+
+
+def _collect_flown(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int]:
+    """Collect the samples of the error-free flights among the run folders of a folder.
+
+    Returns:
+        The samples, and the number of other flights. A flight has the name of its world, or that
+        of its run folder if the world and the seed have been flown before.
+    """
+    runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
+    usable = [run for run in runs if _is_error_free(run, stack)]
+    if not usable:
+        told = f"{len(runs)} runs, and no error-free flight of the stack {stack.name!r} among them"
+        raise ModelError(told, path=flown)
+    flights: dict[tuple[str, int], FlightSamples] = {}
+    for run in usable:
+        config = run.record.config
+        world = config["world"]
+        name = run.folder.path.name if (world, config["seed"]) in flights else world
+        flights[name, config["seed"]] = _samples(run, name)
+    return list(flights.values()), len(runs) - len(usable)
+
+
+def _is_error_free(run: Run, stack: StackMark) -> bool:
+    """Return True for a flight of the stack that reached the goal without fault and alarm."""
+    record = run.record
+    asked = (record.config["fault"], record.config["instruction"])
+    return (
+        record.outcome == Outcome.SUCCESS.value
+        and asked == (None, None)
+        and not (record.detection or {}).get("alarm_count")
+        and load_stack(record.config["stack"]).mark.digest == stack.digest
+    )
 
 
 def train(
     plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
 ) -> _TrainedDetectors:
-    """Fly, fit the detectors, and write the models with their provenance.
+    """Fly or collect flights, fit the detectors, and write the models with their provenance.
 
     Raises:
         ModelError: too few flights, an unknown kind, or torch is missing; before anything is
@@ -123,9 +155,19 @@ def train(
             names the binary of a real autopilot.
         RecordError: a file cannot be written.
     """
-    check(plan.kinds, len(plan.missions()), plan.n_sigma)
-    plan = replace(plan, base=with_firmware(plan.base))
-    dataset, failed = _fly_training(plan, folder, options, spectator)
+    stack = load_stack(plan.base.stack).mark
+    if plan.flown is None:
+        check(plan.kinds, len(plan.missions()), plan.n_sigma)
+        plan = replace(plan, base=with_firmware(plan.base))
+        flights, failed = _fly_training(plan, folder, options, spectator)
+    else:
+        flights, failed = _collect_flown(plan.flown, stack)
+        check(plan.kinds, len(flights), plan.n_sigma)
+    if not flights:
+        raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    dataset = Dataset(flights=tuple(flights), preprocess=PreprocessParams(), stack=stack)
+    dataset.save(folder / DATASET)
     fitted = {}
     for kind in plan.kinds:
         spectator.on_note(f"fitting {kind}")

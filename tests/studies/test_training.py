@@ -1,6 +1,7 @@
 """`mavfi train` on a small scale: ten of the shipped models' own flights, flown and fitted anew."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -94,3 +95,38 @@ def test_what_cannot_be_fitted_to_is_said_before_anything_is_flown(
     code = 2 if problem.startswith(("unknown", "--firmware")) else 1
     assert (done.returncode, done.stdout, done.stderr) == (code, "", f"error: {problem}\n")
     assert not (tmp_path / "training").exists()
+
+
+@pytest.fixture
+def flown(short_flight, tmp_path):
+    """A folder of ten copies of an error-free flight, and of three that are none of the stack."""
+    wrong = {"outcome": "timeout"}, {"fault": {"target": "planning"}}, {"stack": "mavbench"}
+    for number, changes in enumerate([{}] * 10 + list(wrong)):
+        copy = shutil.copytree(short_flight.path, tmp_path / "runs" / f"link-5-{number:03}")
+        result = json.loads((copy / "result.json").read_text())
+        section = result if "outcome" in changes else result["config"]
+        section.update(changes)
+        (copy / "result.json").write_text(json.dumps(result))
+    return tmp_path / "runs"
+
+
+def test_a_detector_is_fitted_to_the_error_free_flights_of_a_folder(mavfi, flown, tmp_path):
+    line = ("train", "--flown", flown, "--kind", "gad", "--out", tmp_path / "new", "--quiet")
+    done = mavfi(*line, "--stack", "hardened")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Data set    10 flights of hardened, ")
+    assert "; left out: 3\n" in done.stdout
+    told = model.read(tmp_path / "new" / "gad.json")
+    assert told.stack.name == "hardened"
+    assert {"farm/5", "link-5-009/5"} <= flights_of(told.provenance)
+
+
+def test_a_folder_without_flights_of_the_stack_is_told(mavfi, flown):
+    done = mavfi("train", "--flown", flown, "--stack", "mavbench-release", "--quiet")
+    problem = "13 runs, and no error-free flight of the stack 'mavbench-release' among them"
+    assert (done.returncode, done.stderr) == (1, f"error: {flown}: {problem}\n")
+
+
+def test_what_would_be_flown_means_nothing_with_flown(mavfi, flown):
+    done = mavfi("train", "--flown", flown, "--flights", "30")
+    assert (done.returncode, done.stderr) == (2, "error: --flights means nothing with --flown\n")
