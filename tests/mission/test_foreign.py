@@ -188,10 +188,10 @@ def test_a_simulator_slower_than_real_time_is_no_lost_link(
     autopilot_on_udp, fly_short, at_event, monkeypatch
 ):
     """A state every 0.3 s of the wall's clock, 0.1 s of the vehicle's."""
-    monkeypatch.setattr(fake_autopilot, "DT_S", 0.1)
     link, url = autopilot_on_udp(FakePX4())
 
     def slow():
+        monkeypatch.setattr(fake_autopilot, "DT_S", 0.1)
         link.pause_s = 0.3
 
     watcher = at_event("offboard", slow)
