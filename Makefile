@@ -1,11 +1,12 @@
 # Two commands do everything: `make fly` and `make test`. `make test-all` takes longer, and
-# `make docs` builds the documentation.
+# `make docs` and `make man` build the documentation and the manual page.
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 SOURCES := mavfi_cli sitl tests benchmarks examples
+SPHINX  := PATH="$(abspath $(BIN)):$$PATH" $(BIN)/sphinx-build -q -W --keep-going -E
 
-.PHONY: fly test test-all docs install install-dev lint clean
+.PHONY: fly test test-all docs man install install-dev lint clean
 
 fly: install
 	$(BIN)/mavfi fly --world dense --inject planning
@@ -18,8 +19,11 @@ test-all: install-dev lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 docs: install-dev
-	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/sphinx-build -q -W --keep-going -E -b html docs build/docs
+	$(SPHINX) -b html docs build/docs
 	@echo "Open build/docs/index.html"
+
+man: install-dev
+	$(SPHINX) -b man docs build/man
 
 lint: install-dev
 	$(BIN)/ruff check $(SOURCES)

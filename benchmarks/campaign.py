@@ -23,7 +23,7 @@ from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
-STACK = "hardened"  # of the figures in docs/campaign.md
+STACK = "hardened"  # of the figures in docs/results/speed.md
 STAGES = ("perception", "planning", "control")
 REQUIRED = {"golden and source level": 1000.0, "instruction level": 700.0}
 OUTSIDE_LIMIT = 0.05

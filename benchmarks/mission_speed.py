@@ -1,6 +1,6 @@
 """Speed of a golden mission: times real time, and where the host's time goes.
 
-Prints the tables of docs/results.md:
+Prints the tables of docs/results/speed.md:
 
     python benchmarks/mission_speed.py [--runs 7] [--world dense] [--seed 3] [--stack mavbench]
 

@@ -1,6 +1,6 @@
 """Success rates of golden missions: 100 seeds in each world, with Wilson intervals.
 
-Prints the table of docs/results.md:
+Prints the table of docs/results/speed.md:
 
     python benchmarks/success.py [--seeds 100] [--jobs 2] [--world dense ...] [--stack mavbench]
 """

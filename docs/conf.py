@@ -1,6 +1,10 @@
 """The documentation: `make docs` builds it with warnings as errors."""
 
 import importlib.metadata
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 project = "mavfi"
 author = "the mavfi authors"
@@ -12,6 +16,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_click",
     "sphinxcontrib.programoutput",
+    "keys",
 ]
 source_suffix = {".md": "markdown"}
 root_doc = "index"
@@ -29,3 +34,5 @@ html_title = f"mavfi {release}"
 html_copy_source = False
 html_show_sphinx = False
 html_show_copyright = False
+
+man_pages = [("reference/commands", "mavfi", "what a bit flip does to a flying robot", author, 1)]

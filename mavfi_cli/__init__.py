@@ -1,7 +1,7 @@
 """mavfi: what a bit flip does to a flying robot, and what it costs to survive it.
 
 `import mavfi_cli as mavfi` is the library. Its names are imported when they are first used, so that
-the import itself and `mavfi --help` stay fast. docs/library.md shows how to use them.
+the import itself and `mavfi --help` stay fast. docs/how-to/python.md shows how to use them.
 """
 
 import importlib

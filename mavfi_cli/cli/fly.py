@@ -70,8 +70,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 @click.command(cls=GroupedCommand)
 @_mission("--config", metavar="FILE", type=click.Path(path_type=Path, exists=True, dir_okay=False),
-          help="TOML file of the whole mission. Other options override it. docs/flight.md lists "
-               "its keys, including those without an option.")  # fmt: skip
+          help="TOML file of the whole mission. Other options override it. "
+               "docs/reference/settings.md lists its keys.")  # fmt: skip
 @_mission("--world", default="dense", show_default=True, metavar="NAME|FILE",
           help="World, or a TOML file of boxes; `mavfi world list` lists the worlds.")  # fmt: skip
 @_mission("--seed", default=3, show_default=True, help="Root seed of all random draws.")

@@ -14,7 +14,7 @@ The delta is the difference between the codes of a sample and of the last accept
 same state, saturated to 16 bits. It is 0 if there is no such sample. Yaw wraps: a change from above
 2 rad to below -2 rad, or back, counts as no change.
 
-docs/detect.md compares this code with other combinations of sign and exponent.
+docs/results/detectors.md compares this code with other combinations of sign and exponent.
 """
 
 from __future__ import annotations

@@ -45,9 +45,16 @@ class MissionConfig:
         planner: Name of the planner, stored in its canonical form.
         seed: Root seed of the mission, from which world, planner, latency and sensor streams
             derive.
+        platform: Compute platform, or path of a TOML file; it gives the kernels their latencies.
         stack: Stack of the companion, as for `load_stack`.
+        vehicle: Simulated vehicle, or path of a TOML file.
         start, goal: None selects the world's own.
+        takeoff_height_m: Height at which the companion takes over.
+        v_max_mps, a_max_mps2: Limits of planned trajectories.
         goal_tolerance_m: None selects the stack's own.
+        time_limit_s: Simulated time from take-off after which the mission ends as `timeout`.
+        map_resolution_m, map_range_m: Edge of a voxel; length of the longest ray in the map.
+        camera_columns, camera_rows, camera_rate_hz: Depth image, and how often it comes.
         world_seed: Seed of a generated world, or of start and goal in a scene; None for `seed`.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
         autopilot: Which autopilot flies the simulated vehicle: ours, or real firmware.

@@ -42,7 +42,7 @@ _LIMITS = {  # minimum and maximum of each number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stack:
-    """Structure, checks and gains of the companion. docs/stacks.md explains every key.
+    """Structure, checks and gains of the companion. docs/reference/stacks.md lists the keys.
 
     Attributes:
         stretches_clock: A waypoint lasts until its distance is flown. If the speed limit clips a

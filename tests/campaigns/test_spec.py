@@ -260,8 +260,8 @@ def test_what_is_wrong_with_one_of_many_settings_names_it():
 
 
 def test_the_specification_of_the_documents_can_be_flown():
-    text = Path(__file__).parents[2].joinpath("docs", "campaign.md").read_text()
-    example = text.partition("## The specification\n\n```toml\n")[2].partition("```")[0]
+    text = Path(__file__).parents[2].joinpath("docs", "reference", "campaigns.md").read_text()
+    example = text.partition("<!-- file: mine.toml -->\n```toml\n")[2].partition("```")[0]
     spec = spec_of(example)
     # two worlds x (golden, two stages x two numbers of bits: 100 each; native: 20)
     assert len(flyable(spec)) == 2 * (5 * 100 + 20)

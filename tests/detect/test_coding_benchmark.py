@@ -1,4 +1,4 @@
-"""The comparison of codings that docs/detect.md quotes, on runs in which nothing happens."""
+"""The comparison of codings in docs/results/detectors.md, on runs in which nothing happens."""
 
 import sys
 from pathlib import Path

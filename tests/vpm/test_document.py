@@ -1,24 +1,25 @@
-"""docs/vpm.md: its files load, its numbers are what the commands print."""
+"""The pages about redundancy: their files load, their numbers are what the commands print."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-from mavfi_cli.spec.platform import load_platform, platform_names
+from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report
 from mavfi_cli.vpm.vehicle import load_vehicle
 
-TEXT = (Path(__file__).parents[2] / "docs" / "vpm.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
 
 
-def files():
-    return re.findall(r"^```toml\n(.*?)^```$", TEXT, re.DOTALL | re.M)
+def file_of(page, name):
+    return re.findall(rf"<!-- file: {name} -->\n```toml\n(.*?)^```$", page.read_text(), re.S | re.M)
 
 
 def test_the_example_files_load_and_are_used(tmp_path):
-    vehicle, platform = files()
+    (vehicle,) = file_of(DOCS / "how-to" / "redundancy.md", "my_vehicle.toml")
+    (platform,) = file_of(DOCS / "how-to" / "platform.md", "half-tx2.toml")
     (tmp_path / "vehicle.toml").write_text(vehicle)
     (tmp_path / "platform.toml").write_text(platform)
     half = load_platform(str(tmp_path / "platform.toml"))
@@ -29,18 +30,10 @@ def test_the_example_files_load_and_are_used(tmp_path):
     assert one["schemes"][0]["compute_kg"] == pytest.approx(0.1 + 0.0054 * 20.0)
 
 
-def test_the_table_of_platforms():
-    rows = re.findall(r"^\| `([\w.-]+)` \| .* \| (\d+) ms \| (\d+) ms \|$", TEXT, re.M)
-    assert sorted(name for name, _, _ in rows) == platform_names()
-    for name, octomap_ms, planner_ms in rows:
-        kernels = load_platform(name).kernels
-        assert 1000.0 * kernels["octomap"].latency_s == pytest.approx(float(octomap_ms), abs=0.51)
-        assert 1000.0 * kernels["planner"].latency_s == pytest.approx(float(planner_ms), abs=0.51)
-
-
 def test_the_table_of_calibrations():
+    text = (DOCS / "explanation" / "performance-model.md").read_text()
     rows = re.findall(r"^\| `(\w+)` \| [\w ]+ \| ([\d.]+) (s|N) \| x ([\d.]+) \| x ([\d.]+) \|$",
-                      TEXT, re.M)  # fmt: skip
+                      text, re.M)  # fmt: skip
     assert [row[0] for row in rows] == ["airsim", "spark"]
     for name, value, unit, tmr, dmr in rows:
         (one,) = report([load_vehicle(name)], Choices(), SCHEMES)["vehicles"]

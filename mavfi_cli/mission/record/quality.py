@@ -13,7 +13,7 @@ Truth = dict[str, np.ndarray]
 QUALITY = (
     "flight_time_s", "distance_m", "mean_speed_mps", "max_speed_mps", "min_clearance_m",
     "goal_distance_m",  # at the end of the mission
-    "energy_regression_j",  # MAVBench's regression, see docs/flight.md
+    "energy_regression_j",  # MAVBench's regression, see docs/reference/records.md
     "energy_propeller_j",  # from JSBSim's propeller shaft power, all rotors
 )  # fmt: skip
 
