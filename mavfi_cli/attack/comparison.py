@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from mavfi_cli.attack.target import Difference
+from mavfi_cli.attack.difference import Difference
 from mavfi_cli.core.errors import ConfigError
 
 STDOUT = "stdout"

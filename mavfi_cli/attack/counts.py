@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
 import subprocess
+import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from mavfi_cli.core.errors import TargetError
@@ -15,6 +17,7 @@ from mavfi_cli.fi.tracer.spawn import Program
 
 SLOWER = 200.0  # callgrind takes 10 to 60 times as long as the program
 START_S = 60.0
+_TOLD_EVERY_S = 1.0
 
 
 def callgrind() -> str | None:
@@ -23,13 +26,20 @@ def callgrind() -> str | None:
 
 
 def run_counted(
-    command: Program, *, stdout: Path, stderr: Path, counts: Path, wall_s: float
+    command: Program,
+    *,
+    stdout: Path,
+    stderr: Path,
+    counts: Path,
+    wall_s: float,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> int:
     """Run a program under callgrind and return its exit code.
 
     Args:
         counts: file to which callgrind writes.
         wall_s: duration of the program without it.
+        tell: called every second with how long it has been running, in words.
 
     Raises:
         TargetError: it does not end in time, or a signal kills it.
@@ -46,9 +56,7 @@ def run_counted(
             stdin=given, stdout=out, stderr=err, start_new_session=True,
         )  # fmt: skip
     try:
-        code = process.wait(limit_s)
-    except subprocess.TimeoutExpired:
-        raise TargetError(name, f"has not ended under callgrind after {limit_s:.0f} s") from None
+        code = _await_end(process, name, limit_s, tell)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -56,6 +64,18 @@ def run_counted(
     if code < 0:
         raise TargetError(name, f"is killed by signal {-code} under callgrind")
     return code
+
+
+def _await_end(
+    process: subprocess.Popen[bytes], name: str, limit_s: float, tell: Callable[[str], None]
+) -> int:
+    """Wait for the exit code; tell how long it takes."""
+    begun_s = time.monotonic()
+    while (elapsed_s := time.monotonic() - begun_s) < limit_s:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return process.wait(min(_TOLD_EVERY_S, limit_s - elapsed_s))
+        tell(f"counted by callgrind, {elapsed_s:.0f} s of at most {limit_s:.0f} s")
+    raise TargetError(name, f"has not ended under callgrind after {limit_s:.0f} s")
 
 
 def read_counts(path: Path, objects: Iterable[str]) -> dict[str, Counter[int]]:

@@ -20,14 +20,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.attack.target import AttackPlace, TargetProfile, Watch, code_of
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.counted import CountedRun
+from mavfi_cli.fi.tracer.arch import Detour
+from mavfi_cli.fi.tracer.counted import CountedRun, detour_at
 from mavfi_cli.fi.tracer.fault import CountedStop
 from mavfi_cli.fi.tracer.image import Image, Location, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Segment, Stratum, record_window
@@ -37,18 +38,21 @@ STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
 _NOTHING = "executes nothing that may be hit"
 _CHECKED = 4  # instructions whose counts are checked, besides the most executed
+_DETOUR_CODE = 32  # bytes of code in which a detour fits, if one does
 Guard = Callable[[Tracee], AbstractContextManager[object]]
 _FIRST = np.array([1])
 
 
 def steps_told(stage: Callable[[str], None]) -> Watch:
-    """Make a watch that tells `stage` the number of instructions stepped so far."""
+    """Make a watch that tells `stage` how many instructions were stepped so far, or other news."""
     total = 0
 
-    def watch(steps: int) -> None:
+    def watch(news: int | str) -> None:
         nonlocal total
-        total += steps
-        stage(f"profile, {total} instructions stepped")
+        if isinstance(news, int):
+            total += news
+            news = f"{total} instructions stepped"
+        stage(f"profile, {news}")
 
     return watch
 
@@ -83,7 +87,7 @@ def profile_run(
     ends = (*markers, *([end] if end else []))
     strata = [_Stepper(place, None, ends, limit, watch, guard).step(_FIRST, 1)]
     for marker in markers:
-        stepper = _Stepper(place, marker, ends, limit, watch, guard)
+        stepper = _Stepper(place, marker, ends, limit, watch, guard).with_detour()
         pilot, others = np.split(rng.permutation(stepper.count()) + 1, [max(1, windows // 2)])
         if not len(pilot):
             continue
@@ -252,12 +256,27 @@ class _Stepper:
     limit: int
     watch: Watch | None = None
     guard: Guard = nullcontext
+    detour: Detour | None = None  # at the marker
+
+    def with_detour(self) -> _Stepper:
+        """The same with the detour that fits at the marker."""
+        assert self.marker is not None
+        with started(self.place) as tracee:
+            address = self.place.image(tracee).address(self.marker)
+            code = tracee.memory.read(address, _DETOUR_CODE)
+        detour = detour_at(address, lambda at: code[at - address :][:16], self._executions)
+        return replace(self, detour=detour)
 
     def count(self) -> int:
         """Count the windows of a run."""
         assert self.marker is not None
         with started(self.place) as tracee:
-            return tracee.count_to_end(self.place.image(tracee).address(self.marker))
+            address = self.place.image(tracee).address(self.marker)
+        return self._executions(address)
+
+    def _executions(self, address: int) -> int:
+        with started(self.place) as tracee:
+            return tracee.count_to_end(address)
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
         """Step the windows of these numbers, from 1, out of `count`."""
@@ -280,8 +299,8 @@ class _Stepper:
                     return
                 start: tuple[CountedStop, ...] = ()
                 if self.marker is not None:
-                    start = (CountedStop(self.marker, number),)
-                    if not tracee.run_to(address, number - passed):
+                    start = (CountedStop(self.marker, number, self.detour),)
+                    if not tracee.run_to(address, number - passed, self.detour):
                         raise TargetError(self.place.name, "does not repeat its function calls")
                 trace = record_window(
                     tracee,

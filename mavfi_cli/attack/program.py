@@ -273,7 +273,7 @@ class Workplace:
             short = min(limit, _SHORT)
             return profile_run(self, rng, limit=short, watch=watch, guard=self._guard)
         except WindowTooLong:
-            return self._counted(rng)
+            return self._counted(rng, watch)
 
     @contextlib.contextmanager
     def _guard(self, tracee: Tracee) -> Iterator[None]:
@@ -286,13 +286,13 @@ class Workplace:
         if tracee.ended is not None:
             self._require_golden("stepped", tracee.ended)
 
-    def _counted(self, rng: np.random.Generator) -> TargetProfile:
+    def _counted(self, rng: np.random.Generator, watch: Watch | None) -> TargetProfile:
         """Count the executions of a whole run by callgrind, and check some of them."""
         begun = time.perf_counter()
         self._renew_folder()
         code = run_counted(
             self._command, stdout=self._stdout, stderr=self._stderr, counts=self._counts,
-            wall_s=self._known_golden().wall_s,
+            wall_s=self._known_golden().wall_s, tell=watch or (lambda _: None),
         )  # fmt: skip
         self._require_golden("run under callgrind", Ended(exit_code=code, signal=None))
         profile = profile_counted(self, lambda paths: read_counts(self._counts, paths), begun)

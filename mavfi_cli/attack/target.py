@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from mavfi_cli.attack.difference import Difference
 from mavfi_cli.attack.outcome import RunOutcome, Window
 from mavfi_cli.fi.tracer.counted import CountedRun
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
@@ -23,7 +23,8 @@ from mavfi_cli.fi.tracer.sampling import Strategy, Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 from mavfi_cli.stats.clusters import Total, estimated_total
 
-Watch = Callable[[int], None]  # called with the instructions stepped since the last call
+# Called with the instructions stepped since the last call, or with what goes on, in words.
+Watch = Callable[[int | str], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -266,40 +267,6 @@ class AttackTarget(Protocol):
 
     def open(self) -> JudgedPlace:
         """Make a place for runs in this process."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Difference:
-    """The difference between an output and the golden one.
-
-    Attributes:
-        relative: the value to compare with a tolerance; inf if the outputs cannot be compared
-            number by number (another shape, another kind of answer, not a number).
-        absolute: the same in `unit`, or inf.
-        unit: unit of `absolute`.
-        text: the difference in words.
-        noticeable: whether it is beyond what the taker of the output tolerates.
-        parts: what the difference consists of, by name.
-    """
-
-    relative: float
-    absolute: float
-    unit: str = ""
-    text: str = ""
-    noticeable: bool = True
-    parts: Mapping[str, float] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Entries of a record; a size that is not a number is null."""
-        finite = math.isfinite(self.relative)
-        return {
-            "relative": self.relative if finite else None,
-            "absolute": self.absolute if finite else None,
-            "unit": self.unit,
-            "text": self.text,
-            "noticeable": self.noticeable,
-            "parts": dict(self.parts),
-        }
 
 
 def judged(

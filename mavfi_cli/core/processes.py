@@ -13,13 +13,16 @@ from typing import Any
 _LENGTH = 8
 
 
-def fork(work: Callable[[], int]) -> int:
+def fork(work: Callable[[], int], call: Callable[[], int] = os.fork) -> int:
     """Do work in a fork of this process, which exits with the returned code, or 1 on an error.
+
+    Args:
+        call: Forks the process.
 
     Returns:
         Process id of the fork.
     """
-    child = os.fork()
+    child = call()
     if child:
         return child
     code = 1

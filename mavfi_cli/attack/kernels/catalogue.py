@@ -9,10 +9,11 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mavfi_cli.attack.difference import Difference
 from mavfi_cli.attack.kernels.inputs import KernelInputs
 from mavfi_cli.attack.kernels.outputs import (
     A_TICK_S,
@@ -25,15 +26,17 @@ from mavfi_cli.attack.kernels.outputs import (
     numbers,
     paths,
 )
-from mavfi_cli.attack.kernels.scope import KernelScope, compiled_region, kernel_scope
-from mavfi_cli.attack.target import Difference
 from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, tracking
 from mavfi_cli.autonomy.grid import segment_free
 from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
 from mavfi_cli.autonomy.trajectory import waypoint_index
 from mavfi_cli.core.errors import TargetError, UnknownName
 
+if TYPE_CHECKING:
+    from mavfi_cli.attack.kernels.scope import KernelScope
+
 Call = Callable[[], Output]
+_FILLED_MB_PER_S = 512  # by a loop that allocates, at least
 _POSES = 5  # from which the collision check looks ahead
 
 
@@ -51,6 +54,7 @@ class Kernel:
         too_long: true if the kernel is too long to be stepped whole; windows are sampled.
         inner: compiled functions at which windows begin, beside those of its scope.
         code: for a plug-in kernel, function that returns entry and scope; called after it has run.
+        memory_mb: memory that a run may take beyond that of the loaded kernel.
     """
 
     name: str
@@ -62,9 +66,20 @@ class Kernel:
     too_long: bool = False
     inner: tuple[Any, ...] = ()
     code: Callable[[], KernelScope] | None = None
+    memory_mb: int = 128
+
+    @property
+    def hang_s(self) -> float:
+        """CPU time beyond its golden one after which a run hangs.
+
+        A runaway fills its memory three times as fast, so it ends as a crash, never as a hang.
+        """
+        return self.memory_mb / _FILLED_MB_PER_S
 
     def scope(self) -> KernelScope:
         """The machine code that can be hit, in a process in which the kernel has run."""
+        from mavfi_cli.attack.kernels.scope import compiled_region, kernel_scope
+
         found = kernel_scope(self.name) if self.code is None else self.code()
         more = tuple(compiled_region(function)[1] for function in self.inner)
         return replace(found, inner=(*found.inner, *more))

@@ -11,13 +11,14 @@ import copy
 import hashlib
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
+from mavfi_cli.attack.difference import Difference
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.outputs import unpack
 from mavfi_cli.attack.kernels.scope import KernelScope
@@ -26,7 +27,6 @@ from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import (
-    Difference,
     Golden,
     RunLimits,
     RunVerdict,
@@ -69,7 +69,6 @@ class KernelTarget:
     inputs_sha256: str = ""
     flight: str = ""
     tolerance: float = 0.0
-    limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
     layout: _Layout | None = None
 
@@ -89,6 +88,7 @@ class KernelTarget:
             "inputs_sha256": self.inputs_sha256,
             "flight": self.flight,
             "tolerance": self.tolerance,
+            "memory_mb": catalogue.find(self.kernel).memory_mb,
             "sources": own_digest(),
         }
 
@@ -123,8 +123,8 @@ class KernelPlace:
             RecordError: the inputs cannot be read.
             TargetError: the kernel cannot be loaded.
         """
-        self.name, self.limits = target.name, target.limits
-        self._kernel, inputs = catalogue.find(target.kernel), _read(target.inputs)
+        self.name, self._kernel = target.name, catalogue.find(target.kernel)
+        self.limits, inputs = RunLimits(cpu_grace_s=self._kernel.hang_s), _read(target.inputs)
         with contextlib.ExitStack() as undo:
             self._output = os.memfd_create("mavfi-kernel-output")
             undo.callback(os.close, self._output)

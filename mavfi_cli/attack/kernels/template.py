@@ -13,6 +13,7 @@ fork to the next.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import resource
@@ -37,7 +38,7 @@ TIMES = struct.Struct("<dd")
 PID_BYTES = 4
 RUN, GO, ASK_SCOPE = b"r", b"g", b"s"
 OUTPUT = 1
-_EXTRA_MEMORY = 2 << 30  # a corrupted size must not exhaust the machine's memory
+_libc = ctypes.CDLL(None)
 _LARGEST_FILE = 1 << 28
 
 
@@ -49,7 +50,7 @@ def main() -> None:
     calls = [kernel.prepare(each) for each in inputs_of_bytes(inputs)]
     for call in calls * (2 if kernel.repeatable else 0):
         pack(call())
-    _limit()
+    _limit(kernel.memory_mb)
     send(connection, (len(calls), newest_cache_ns()))
     sys.dont_write_bytecode = True  # the second run must not find what the first has compiled
     gc.collect()
@@ -72,15 +73,19 @@ def _give_up(why: str) -> None:
 
 
 def _in_child(work: Callable[[], int]) -> int:
-    """Do work in a fork of this process; return its wait status when it has ended."""
-    return os.waitpid(fork(work), 0)[1]
+    """Do work in a fork of this process; return its wait status when it has ended.
+
+    Python's own fork would draw new random numbers, so every fork would have another memory.
+    """
+    return os.waitpid(fork(work, _libc.fork), 0)[1]
 
 
-def _limit() -> None:
+def _limit(extra_mb: int) -> None:
+    """A corrupted size must not exhaust the machine's memory."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + _EXTRA_MEMORY
+    limit = pages * resource.getpagesize() + (extra_mb << 20)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))

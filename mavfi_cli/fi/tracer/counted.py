@@ -20,6 +20,9 @@ from mavfi_cli.fi.tracer.arch import TRAITS, Detour, Flow, flow
 from mavfi_cli.fi.tracer.fault import CountedStop
 from mavfi_cli.fi.tracer.image import Location
 
+Locate = Callable[[int], Location]
+CodeAt = Callable[[int], bytes]  # 16 bytes of code
+
 _BY_BREAKPOINT = 100_000  # most executions that are counted by a breakpoint: about a second
 
 
@@ -40,12 +43,8 @@ class CountedRun:
     detours: tuple[Detour | None, ...]
 
     @classmethod
-    def of(cls, executions: Mapping[int, int], code_at: Callable[[int], bytes]) -> CountedRun:
-        """Make the population from the number of executions of each address.
-
-        Args:
-            code_at: 16 bytes of code at an address.
-        """
+    def of(cls, executions: Mapping[int, int], code_at: CodeAt) -> CountedRun:
+        """Make the population from the number of executions of each address."""
         addresses = sorted(executions)
         flows = [flow(code_at(address), address) for address in addresses]
         counts = _without_repeats(addresses, [executions[each] for each in addresses], flows)
@@ -89,15 +88,13 @@ class CountedRun:
         return int(self.addresses[self._at(position)[0]])
 
     def trigger(
-        self, position: int, locate: Callable[[int], Location]
+        self, position: int, locate: Locate, _: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
         """The trigger of one executed instruction, and k, the number of its execution."""
         index, k = self._at(position)
         return self.stages(index, k, locate), k
 
-    def stages(
-        self, index: int, k: int, locate: Callable[[int], Location]
-    ) -> tuple[CountedStop, ...]:
+    def stages(self, index: int, k: int, locate: Locate) -> tuple[CountedStop, ...]:
         """The stages to execution k of an instruction."""
         place = int(self.places[index])
         here, there = (locate(int(self.addresses[at])) for at in (index, place))
@@ -107,6 +104,24 @@ class CountedRun:
         before = k if place < index else k - 1  # executions of the place until then
         first = (CountedStop(there, before, detour),) if before else ()
         return (*first, CountedStop(here, 1))
+
+
+def detour_at(address: int, code_at: CodeAt, executions: Callable[[int], int]) -> Detour | None:
+    """The detour at one instruction; None if none fits there.
+
+    Args:
+        executions: function from an address to the number of its executions.
+    """
+    size, expected = 0, None
+    while (how := flow(code_at(address + size), address + size)) is not None and how.movable:
+        size += how.size
+        if size >= TRAITS.jump_bytes:
+            return Detour(size)
+        if expected is None:
+            expected = executions(address)
+        if not how.straight or executions(address + size) != expected:
+            return None
+    return None
 
 
 def _without_repeats(

@@ -12,6 +12,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,14 @@ from mavfi_cli.core.errors import (
     named_member,
 )
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch import TRAITS, Instruction, decode, record_steps, return_address
+from mavfi_cli.fi.tracer.arch import (
+    TRAITS,
+    Detour,
+    Instruction,
+    decode,
+    record_steps,
+    return_address,
+)
 from mavfi_cli.fi.tracer.arch.interface import StepEnd
 from mavfi_cli.fi.tracer.compat import (
     PINFI_MODEL,
@@ -33,7 +41,7 @@ from mavfi_cli.fi.tracer.compat import (
     draw_pinfi_with_bugs,
     draw_rosfi,
 )
-from mavfi_cli.fi.tracer.counted import CountedRun
+from mavfi_cli.fi.tracer.counted import CodeAt, CountedRun, Locate, detour_at
 from mavfi_cli.fi.tracer.fault import (
     CountedStop,
     FaultModel,
@@ -43,11 +51,12 @@ from mavfi_cli.fi.tracer.fault import (
 )
 from mavfi_cli.fi.tracer.image import Location, Scope
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+from mavfi_cli.fi.tracer.tracee import DETOUR_COST, Ended, Tracee
 
 _CHUNK = 16384
 _STAGE_COST = 12  # one more stop costs about as much as 12 counted hits
 _HORIZON = 1 << 20
+_NEAR = 16  # instructions before the target at which a detour is looked for
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,10 +107,10 @@ class Stratum:
         return int(segment.trace[index])
 
     def trigger(
-        self, position: int, locate: Callable[[int], Location]
+        self, position: int, locate: Locate, code_at: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
         """The trigger of one executed instruction, and k, the number of its execution."""
-        return plan_trigger(*self._at(position), locate)
+        return plan_trigger(*self._at(position), locate, code_at)
 
     def _at(self, position: int) -> tuple[Segment, int]:
         """The segment and index of one executed instruction, counted over all segments."""
@@ -223,32 +232,74 @@ class _Blanket:
             self._tracee.memory.write(start, data)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Way:
+    """Stages to an executed instruction of a segment, and what they cost in counted hits."""
+
+    cost: int
+    stages: tuple[CountedStop, ...]
+
+
+_cost = attrgetter("cost")
+
+
 def plan_trigger(
-    segment: Segment, index: int, locate: Callable[[int], Location]
+    segment: Segment, index: int, locate: Locate, code_at: CodeAt
 ) -> tuple[tuple[CountedStop, ...], int]:
     """Plan the cheapest exact trigger of one executed instruction of a segment.
 
     Each counted hit costs the same. So a rarely executed instruction shortly before the target is
-    reached first, and the target's executions are counted from there.
+    reached first, and the target's executions are counted from there, or a detour counts.
 
     Returns:
         The trigger, and k, the number of the execution of its instruction in the segment.
     """
-    trace = segment.trace[: index + 1]
-    target = trace[index]
-    is_target = trace == target
-    k = int(np.count_nonzero(is_target))
-    if k <= _STAGE_COST:
-        return (*segment.start, CountedStop(locate(int(target)), k)), k
+    target, k = locate(int(segment.trace[index])), int(segment.ranks[index])
+    best = _Way(cost=k, stages=(CountedStop(target, k),))
+    if best.cost > _STAGE_COST:
+        best = min([best, *_anchored(segment, index, locate)], key=_cost)
+    if best.cost > DETOUR_COST:
+        best = min([best, *_detoured(segment, index, locate, code_at)], key=_cost)
+    return (*segment.start, *best.stages), k
+
+
+def _anchored(segment: Segment, index: int, locate: Locate) -> Iterator[_Way]:
+    """Count to the instruction before the target from which it costs least."""
+    target, k = segment.trace[index], int(segment.ranks[index])
     first = max(0, index - _HORIZON)
+    before = segment.trace[first:index] == target
     ranks = segment.ranks[first:index]
-    after = k - (np.cumsum(is_target)[first:index] - is_target[first:index])
-    cost = np.where(is_target[first:index], np.iinfo(np.int64).max, ranks + after)
-    best = int(np.argmin(cost)) if len(cost) else -1
-    if best < 0 or int(cost[best]) + _STAGE_COST >= k:
-        return (*segment.start, CountedStop(locate(int(target)), k)), k
-    anchor = CountedStop(locate(int(trace[first + best])), int(ranks[best]))
-    return (*segment.start, anchor, CountedStop(locate(int(target)), int(after[best]))), k
+    after = 1 + np.cumsum(before[::-1])[::-1]
+    cost = np.where(before, np.iinfo(np.int64).max, ranks + after)
+    if len(cost) and int(cost.min()) + _STAGE_COST < k:
+        yield _through(segment, first + int(np.argmin(cost)), index, locate)
+
+
+def _detoured(segment: Segment, index: int, locate: Locate, code_at: CodeAt) -> Iterator[_Way]:
+    """Count by a detour, at the target or at the nearest instruction before it where one fits."""
+
+    def executions(address: int) -> int:
+        return int(np.count_nonzero(segment.trace == address))
+
+    for place in range(index, max(-1, index - _NEAR), -1):
+        detour = detour_at(int(segment.trace[place]), code_at, executions)
+        if detour is not None:
+            yield _through(segment, place, index, locate, detour)
+            return
+
+
+def _through(
+    segment: Segment, place: int, index: int, locate: Locate, detour: Detour | None = None
+) -> _Way:
+    """Count to one executed instruction, and from there to the target."""
+    rank, target = int(segment.ranks[place]), segment.trace[index]
+    stages = [CountedStop(locate(int(segment.trace[place])), rank, detour)]
+    cost = rank if detour is None else min(rank, DETOUR_COST)
+    if place < index:
+        after = int(np.count_nonzero(segment.trace[place : index + 1] == target))
+        stages.append(CountedStop(locate(int(target)), after))
+        cost += after + _STAGE_COST
+    return _Way(cost=cost, stages=tuple(stages))
 
 
 Draw = Callable[
@@ -337,8 +388,8 @@ def draw_fault(
     plan: Strategy,
     rng: np.random.Generator,
     *,
-    code_at: Callable[[int], bytes],
-    locate: Callable[[int], Location],
+    code_at: CodeAt,
+    locate: Locate,
 ) -> InstructionFault:
     """Draw a fault, uniformly over the executed instructions with an operand the model allows.
 
@@ -363,7 +414,7 @@ def draw_fault(
         corruption = plan.draw_at(instruction, rng, following)
         if corruption is None:
             continue
-        trigger, k = stratum.trigger(position, locate)
+        trigger, k = stratum.trigger(position, locate, code_at)
         return InstructionFault(
             trigger=trigger,
             execution=k,

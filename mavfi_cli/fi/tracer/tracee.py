@@ -40,7 +40,7 @@ from mavfi_cli.fi.tracer.linux import ProcessTimer
 
 TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL = 1, 2, 4, 6, 0x80
 
-_DETOUR_FROM = 100  # to make a detour takes as long as some 100 counted hits
+DETOUR_COST = 20  # to make a detour takes as long as some 15 counted hits
 _DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # of a detour's pages from the code, bytes
 _PAGES_BYTES = 8192
 _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP_FIXED_NOREPLACE
@@ -208,7 +208,7 @@ class Tracee:
         Returns:
             False if the process ended first.
         """
-        if count >= _DETOUR_FROM and detour is not None:
+        if count >= DETOUR_COST and detour is not None:
             detoured = self._run_to_detoured(address, count, detour)
             if detoured is not None:
                 return detoured

@@ -83,7 +83,7 @@ def test_all_executed_instructions_are_drawn_alike(counted):
     image, run = counted("flows")
     seen = Counter()
     for position in range(run.executed):
-        stages, k = run.trigger(position, image.locate)
+        stages, k = run.trigger(position, image.locate, lambda _: b"")
         seen[run.address(position)] += 1
         assert k == seen[run.address(position)]
         assert stages[-1].location == image.locate(run.address(position))

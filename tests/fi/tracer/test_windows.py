@@ -97,20 +97,23 @@ def test_a_window_that_is_too_long_is_refused(start):
         profile_of(start, "counting", "1000", limit=100)
 
 
-def test_every_trigger_stops_before_its_execution(start):
-    trace, image, _ = profile_of(start, "counting", "60")
+@pytest.mark.parametrize(("name", "arguments"), [("counting", ("60",)), ("flows", ())])
+def test_every_trigger_stops_before_its_execution(start, name, arguments):
+    trace, image, _ = profile_of(start, name, *arguments)
     segment = Segment(start=(), trace=trace)
-    indices = np.random.default_rng(5).integers(len(trace), size=12)
+    code = start(name, *arguments).memory
+    indices = np.random.default_rng(5).integers(len(trace), size=24)
+    detours = 0
     for index in map(int, indices):
-        trigger, k = plan_trigger(segment, index, image.locate)
+        trigger, k = plan_trigger(segment, index, image.locate, lambda at: code.read(at, 16))
         assert k == int((trace[: index + 1] == trace[index]).sum())
-        tracee = start("counting", "60")
+        tracee = start(name, *arguments)
         for stage in trigger:
-            assert tracee.run_to(image.address(stage.location), stage.count)
-        rest = record_window(
-            tracee, scope_of(image, ["counting"]), limit=100_000, program="counting"
-        )
+            assert tracee.run_to(image.address(stage.location), stage.count, stage.detour)
+        detours += any(stage.detour is not None for stage in trigger)
+        rest = record_window(tracee, scope_of(image, [name]), limit=100_000, program=name)
         assert np.array_equal(rest, trace[index:])
+    assert detours > 4
 
 
 def test_a_two_level_trigger_counts_less():
@@ -118,7 +121,7 @@ def test_a_two_level_trigger_counts_less():
     trace = np.array(([1] + [2, 3] * 1000) * 20, np.int64)
     segment = Segment(start=(), trace=trace)
     index = 2001 * 15 + 9
-    trigger, k = plan_trigger(segment, index, lambda address: address)
+    trigger, k = plan_trigger(segment, index, lambda address: address, lambda _: b"")
     assert k == 15 * 1000 + int(np.sum(trace[2001 * 15 : index + 1] == trace[index]))
     assert [(stage.location, stage.count) for stage in trigger] == [(1, 16), (int(trace[index]), 5)]
 

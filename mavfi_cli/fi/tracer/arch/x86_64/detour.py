@@ -139,5 +139,4 @@ def _moved(found: Any, at: int, return_slot: int) -> bytes | None:
 def prepare_system_call(registers: Registers, number: int, *arguments: int) -> None:
     """Set the registers for a system call instruction at the instruction pointer."""
     names = ("rax", *_SYSTEM_CALL_ARGUMENTS[: len(arguments)])
-    for name, value in zip(names, (number, *arguments), strict=True):
-        registers.write(name, value)
+    registers.write_together(dict(zip(names, (number, *arguments), strict=True)))

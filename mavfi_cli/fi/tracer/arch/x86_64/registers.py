@@ -11,6 +11,7 @@ import ctypes
 import functools
 import mmap
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mavfi_cli.fi.tracer import linux
@@ -211,9 +212,7 @@ class Registers:
             OSError: the kernel refuses the value.
         """
         if name in _SLOT:
-            words = list(self.general())
-            words[_SLOT[name]] = value
-            self.write_general(words)
+            self.write_together({name: value})
             return
         area = bytearray(self.extended())
         data = value.to_bytes(width_of(name) // 8, "little")
@@ -226,6 +225,17 @@ class Registers:
         area[XSTATE_BV : XSTATE_BV + 8] = present.to_bytes(8, "little")
         self.forget()
         linux.set_registers(self.tid, NT_X86_XSTATE, bytes(area))
+
+    def write_together(self, values: Mapping[str, int]) -> None:
+        """Write several general registers, by name, at once.
+
+        Raises:
+            OSError: the kernel refuses a value.
+        """
+        words = list(self.general())
+        for name, value in values.items():
+            words[_SLOT[name]] = value
+        self.write_general(words)
 
     def write_general(self, words: list[int]) -> None:
         """Write `user_regs_struct` as 27 integers."""
