@@ -1,11 +1,13 @@
 """Programs that are counted by callgrind instead of being stepped."""
 
+import re
 import shutil
 from collections import Counter
 
 import numpy as np
 import pytest
 
+from mavfi_cli.attack import counts
 from mavfi_cli.attack import profile as profiles
 from mavfi_cli.attack import program as programs
 from mavfi_cli.attack.campaign import Plan, run_campaign
@@ -64,15 +66,28 @@ def test_a_long_program_is_attacked_whole(native_program):
     assert "counted by callgrind; 0 % more are not reached" in program_table(summary)
 
 
+def test_it_tells_how_long_callgrind_counts_and_may_count(place, monkeypatch):
+    monkeypatch.setattr(counts, "_TOLD_EVERY_S", 0.01)
+    told = []
+    watch = profiles.steps_told(told.append)
+    place("counting", "300000").profile(np.random.default_rng(1), watch=watch)
+    counting = [text for text in told if "callgrind" in text]
+    assert len(counting) > 5
+    form = re.compile(r"profile, counted by callgrind, \d+ s of at most (\d+) s")
+    limits = {form.fullmatch(text)[1] for text in counting}
+    assert len(limits) == 1
+    assert told.index(counting[0]) > 0  # stepped first
+
+
 def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):
     where = place("counting", "60000")
-    counts = programs.read_counts
+    true_counts = programs.read_counts
     monkeypatch.setattr(
         programs,
         "read_counts",
         lambda *given: {
             path: {at: n - (n > 50_000) for at, n in found.items()}
-            for path, found in counts(*given).items()
+            for path, found in true_counts(*given).items()
         },
     )
     with pytest.raises(TargetError, match="more often than the 59999 times that callgrind counts"):

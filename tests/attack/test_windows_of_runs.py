@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.attack.comparison import OutputComparison
-from mavfi_cli.attack.profile import function_of, profile_calls, profile_run
+from mavfi_cli.attack.profile import function_of, profile_calls, profile_run, started
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.core.errors import TargetError, UnknownName
 from mavfi_cli.fi.tracer.fault import FaultModel, Site
@@ -168,6 +168,22 @@ def test_short_windows_are_stepped_until_it_is_enough(place):
     assert sum(stratum.windows_in_run for stratum in profile.strata) == 1 + 400
 
 
+def test_windows_are_reached_by_the_detour_that_fits_at_their_marker(place):
+    where = place("counting", "400")
+    marker = functions(where, "body")
+    _, *strata = profile_run(where, np.random.default_rng(2), markers=marker, windows=3).strata
+    starts = [segment.start[0] for stratum in strata for segment in stratum.segments]
+    detours = {start.detour for start in starts}
+    assert detours == {starts[0].detour} != {None}
+    address = {}
+    for how in (starts[0].detour, None):
+        with started(where) as tracee:
+            at = where.image(tracee).address(marker[0])
+            assert tracee.run_to(at, 321, how)
+            address[how] = tracee.registers.read("rdi")
+    assert set(address.values()) == {320}
+
+
 def test_faults_are_drawn_evenly_over_all_windows(recursive):
     """Chi-square of the drawn instructions against what the whole run executes."""
     from scipy.stats import chisquare
@@ -201,7 +217,7 @@ def test_a_trigger_of_a_window_stops_before_its_execution(recursive):
         executions = np.flatnonzero(whole[begin:] == image.address(fault.target))
         tracee = recursive.start()
         for stage in fault.trigger:
-            assert tracee.run_to(image.address(stage.location), stage.count)
+            assert tracee.run_to(image.address(stage.location), stage.count, stage.detour)
         scope = recursive.scope(image)
         rest = record_window(tracee, scope, limit=100_000, program="recursive")
         assert np.array_equal(rest, whole[begin + executions[fault.execution - 1] :])

@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.catalogue import Call
@@ -59,14 +60,16 @@ def main() -> None:
     while request := connection.recv(1):
         if request == ASK_SCOPE:
             status = _in_child(lambda: _tell_scope(connection, kernel, calls[0]))
-            if status:
-                _give_up(f"fails without a fault (wait status {status})")
+            if os.WIFSIGNALED(status):
+                _give_up(f"fails without a fault: signal {os.WTERMSIG(status)}")
+            elif status:
+                os._exit(1)
         elif request == RUN:  # not the GO of a child that was killed before reading it
             call = calls[connection.recv(1)[0]]
             _in_child(partial(_run, connection, call))
 
 
-def _give_up(why: str) -> None:
+def _give_up(why: str) -> NoReturn:
     """End without the libraries' own last messages, which would hide ours."""
     os.write(2, f"{why}\n".encode())
     os._exit(1)
@@ -93,9 +96,16 @@ def _limit(extra_mb: int) -> None:
 
 def _tell_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
     """Find the kernel's code in a child, because that changes the memory much."""
-    call()
-    send(connection, kernel.scope())
+    try:
+        call()
+        send(connection, kernel.scope())
+    except Exception as error:  # the user's kernel may raise anything
+        _give_up(f"fails without a fault: {_in_words(error)}")
     return 0
+
+
+def _in_words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _run(connection: socket.socket, call: Call) -> int:
@@ -110,7 +120,7 @@ def _run(connection: socket.socket, call: Call) -> int:
         data = pack(output)
     except Exception as error:  # any error of the corrupted kernel is a result
         times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
-        data, code = f"{type(error).__name__}: {error}".encode(), RAISED
+        data, code = _in_words(error).encode(), RAISED
     os.pwrite(OUTPUT, times + data, 0)
     return code
 

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,21 @@ from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, explicit_corruption
 
+TAKING = """
+import numpy as np
+from mavfi_cli.attack.kernels.catalogue import Kernel
+from mavfi_cli.attack.kernels.scope import compiled_scope
+from mavfi_cli.autonomy.octree import decode_leaves
+
+def prepare(_inputs):
+    decode_leaves(np.zeros(0, np.uint8), np.empty((0, 4), np.int64))
+    return lambda: {{"size": np.array([np.empty(300 << 20, np.uint8).size])}}
+
+KERNEL = Kernel(
+    name="taking", title="Taking", prepare=prepare, memory_mb={memory_mb},
+    code=lambda: compiled_scope("taking", decode_leaves),
+)
+"""
 KNOWN = Path(__file__).parent / "known_kernel.py"
 # In each, r10 is set once: corrupted after that, it is never read, dereferenced, waited for or
 # returned.
@@ -130,6 +146,20 @@ def test_a_kernel_of_ones_own_is_attacked_by_the_name_of_its_file(known_target, 
     assert outcomes == [entry["outcome"] for entry in together.records]
     assert {entry["kernel"] for entry in alone.records} == {"known"}
     assert {entry["object"] for entry in alone.records} == {"libvictim.so"}
+
+
+@pytest.mark.parametrize(("memory_mb", "enough"), [(128, False), (512, True)])
+def test_a_run_may_take_what_its_kernel_allows(tmp_path, kernel_inputs, memory_mb, enough):
+    kernel = tmp_path / "taking.py"
+    kernel.write_text(TAKING.format(memory_mb=memory_mb))
+    target = KernelTarget(kernel=str(kernel), inputs=kernel_inputs)
+    if not enough:
+        with pytest.raises(TargetError, match=r"fails without a fault: .*MemoryError"):
+            target.open()
+        return
+    with closing(target.open()) as place:
+        assert place.limits.cpu_grace_s == 1.0
+        assert place.fault_free().exit_code == 0
 
 
 def test_the_bytecode_that_an_attacked_process_finds_is_always_there(known_target, monkeypatch):
