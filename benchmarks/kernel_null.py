@@ -8,15 +8,17 @@ in the opposite order:
     free      nobody traces it
     ended     traced, nothing armed: its counted window was over before the call
     armed     traced, a counter armed that counts nothing in this call: its window is yet to begin
-    counted   traced, every entry into the kernel counted: in the window
+    counted   traced, every entry into the kernel counted by a breakpoint: in the window
+    detoured  traced, every entry counted by a detour, if one fits there
     stopped   stopped at its first entry for a null injection, then nobody traces it
     after     stopped at its first entry for a null injection, then traced to the end
 
 Outside of the window a null injection costs `armed` over `free` before it and `after` over
-`stopped` after it; `ended` over `free` is what tracing alone costs. Each is the median over all
-rounds of the ratio of CPU times of the call within a round, with a 95 % bootstrap interval.
-Target: less than 1 %. What the window itself costs is told beside: the stop (`stopped` less `free`)
-and one counted execution (`counted` less `armed`, over the entries).
+`stopped` after it; `ended` over `free` is what tracing alone costs, `detoured` over `free` what it
+costs to count all entries to a late one. Each is the median over all rounds of the ratio of CPU
+times of the call within a round, with a 95 % bootstrap interval. Target: less than 1 %. What the
+window itself costs is told beside: the stop (`stopped` less `free`) and one execution that a
+breakpoint counts (`counted` less `armed`, over the entries).
 """
 
 from __future__ import annotations
@@ -33,13 +35,15 @@ import numpy as np
 from mavfi_cli.attack.campaign import one_processor
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
+from mavfi_cli.attack.profile import detour_of
+from mavfi_cli.fi.tracer.arch import Detour
 from mavfi_cli.fi.tracer.inject import instruction_at
 from mavfi_cli.fi.tracer.tracee import PerfBreakpoint, Tracee
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 from mavfi_cli.spec.mission import MissionConfig
 
-WAYS = ("free", "ended", "armed", "counted", "stopped", "after")
-PAIRS = (("ended", "free"), ("armed", "free"), ("after", "stopped"))
+WAYS = ("free", "ended", "armed", "counted", "detoured", "stopped", "after")
+PAIRS = (("ended", "free"), ("armed", "free"), ("detoured", "free"), ("after", "stopped"))
 NEVER = 1 << 40  # more executions than any call has
 NOWHERE = 0x1000  # nothing is mapped there
 
@@ -60,7 +64,7 @@ def finish_alone(tracee: Tracee) -> None:
         os.close(process)
 
 
-def run(place: KernelPlace, way: str) -> float:
+def run(place: KernelPlace, way: str, detour: Detour | None) -> float:
     """CPU time of one call, s."""
     tracee = place.start()
     entry = place.layout.image.address(place.layout.scope.entry)
@@ -68,6 +72,8 @@ def run(place: KernelPlace, way: str) -> float:
         counter = PerfBreakpoint(tracee.tid, NOWHERE if way == "armed" else entry, NEVER)
         finish(tracee)
         counter.close()
+    elif way == "detoured":
+        assert not tracee.run_to(entry, NEVER, detour)
     elif way in ("stopped", "after"):
         assert tracee.run_to(entry), "the kernel is never entered"
         assert instruction_at(tracee, entry) is not None
@@ -94,10 +100,11 @@ def measure(name: str, inputs: Path, rounds: int) -> None:
     with one_processor(), closing(target.open()) as place:
         tracee = place.start()
         entries = tracee.count_to_end(place.layout.image.address(place.layout.scope.entry))
+        detour = detour_of(place, place.layout.scope.entry)
         spent: dict[str, list[float]] = {way: [] for way in WAYS}
         for number in range(rounds):
             for way in WAYS if number % 2 else reversed(WAYS):
-                spent[way].append(run(place, way))
+                spent[way].append(run(place, way, detour))
     cpu_s = {way: np.array(values) for way, values in spent.items()}
     cells = [ratio(cpu_s[over], cpu_s[under]) for over, under in PAIRS]
     stop_us = 1e6 * np.median(cpu_s["stopped"] - cpu_s["free"])
@@ -116,10 +123,11 @@ def main() -> None:
     parser.add_argument("--kernel", action="append", default=[])
     options = parser.parse_args()
     print(
-        "| kernel | call, ms | tracing alone | before the window | after it | the stop, us "
+        "| kernel | call, ms | tracing alone | before the window | counted by a detour "
+        "| after it | the stop, us "
         "| a counted execution, us (entries) |"
     )
-    print("|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
         inputs = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))["inputs"]
         for kernel in catalogue.select(options.kernel):

@@ -40,11 +40,16 @@ def fly(
         ConfigError: A setting has the wrong type or is out of range.
         MavfiError: The mission could not begin, or its record could not be written.
     """
+    mission = _mission(config, settings)
+    if mission.instruction is not None:  # the attacked node loads as long as this process
+        from mavfi_cli.attack.served import start_early
+        from mavfi_cli.mission.instruction import PROGRAM
+
+        start_early(PROGRAM)
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.run import fly_mission
 
-    mission = _mission(config, settings)
     folder = fly_mission(mission, Path(out), watcher or Watcher(), recorder=recorder)
     return load_run(folder.path)
 

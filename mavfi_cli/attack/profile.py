@@ -20,7 +20,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ def profile_run(
     ends = (*markers, *([end] if end else []))
     strata = [_Stepper(place, None, ends, limit, watch, guard).step(_FIRST, 1)]
     for marker in markers:
-        stepper = _Stepper(place, marker, ends, limit, watch, guard).with_detour()
+        stepper = _Stepper(place, marker, ends, limit, watch, guard, detour_of(place, marker))
         pilot, others = np.split(rng.permutation(stepper.count()) + 1, [max(1, windows // 2)])
         if not len(pilot):
             continue
@@ -222,6 +222,19 @@ def function_of(place: AttackPlace, name: str) -> Location:
         return image.function(name, place.scope(image).objects)
 
 
+def detour_of(place: AttackPlace, marker: Location) -> Detour | None:
+    """The detour that counts an instruction of a run; None if none fits there."""
+    with started(place) as tracee:
+        address = place.image(tracee).address(marker)
+        code = tracee.memory.read(address, _DETOUR_CODE)
+
+    def executions(address: int) -> int:
+        with started(place) as tracee:
+            return tracee.count_to_end(address)
+
+    return detour_at(address, lambda at: code[at - address :][:16], executions)
+
+
 @contextmanager
 def started(place: AttackPlace) -> Iterator[Tracee]:
     """A run of a place, which is killed afterwards."""
@@ -258,25 +271,11 @@ class _Stepper:
     guard: Guard = nullcontext
     detour: Detour | None = None  # at the marker
 
-    def with_detour(self) -> _Stepper:
-        """The same with the detour that fits at the marker."""
-        assert self.marker is not None
-        with started(self.place) as tracee:
-            address = self.place.image(tracee).address(self.marker)
-            code = tracee.memory.read(address, _DETOUR_CODE)
-        detour = detour_at(address, lambda at: code[at - address :][:16], self._executions)
-        return replace(self, detour=detour)
-
     def count(self) -> int:
         """Count the windows of a run."""
         assert self.marker is not None
         with started(self.place) as tracee:
-            address = self.place.image(tracee).address(self.marker)
-        return self._executions(address)
-
-    def _executions(self, address: int) -> int:
-        with started(self.place) as tracee:
-            return tracee.count_to_end(address)
+            return tracee.count_to_end(self.place.image(tracee).address(self.marker))
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
         """Step the windows of these numbers, from 1, out of `count`."""

@@ -113,6 +113,20 @@ class ServedProcess:
             self._errors = -1
 
 
+_early: dict[str, ServedProcess] = {}
+
+
+def start_early(module: str) -> None:
+    """Start a program that the next `served_process` of the module gets, because it loads long."""
+    if module not in _early:
+        _early[module] = ServedProcess(module)
+
+
+def served_process(module: str) -> ServedProcess:
+    """The program that was started early, or a new one."""
+    return _early.pop(module, None) or ServedProcess(module)
+
+
 def channel() -> socket.socket:
     """The program's end of the socket; call it in the program."""
     return socket.socket(fileno=CHANNEL)

@@ -20,7 +20,8 @@ from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.sampling import Rule
 from mavfi_cli.mission.briefing import of_config
-from mavfi_cli.mission.instruction.server import PROGRAM, Setup
+from mavfi_cli.mission.instruction import PROGRAM
+from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of

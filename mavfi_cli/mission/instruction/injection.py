@@ -20,7 +20,7 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import LiveAttack, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
-from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.attack.served import ServedProcess, served_process
 from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
@@ -33,8 +33,9 @@ from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.thread import TracerThread
+from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
-from mavfi_cli.mission.instruction.server import PROGRAM, Setup
+from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -344,4 +345,4 @@ def injection_of(
         planned = _planned_of(repeat)
     else:
         planned = _plan_fault(config, config.instruction, out, versions, fly_golden)
-    return _InstructionInjection(planned, ServedProcess(PROGRAM), for_debugger)
+    return _InstructionInjection(planned, served_process(PROGRAM), for_debugger)

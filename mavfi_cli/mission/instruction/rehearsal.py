@@ -15,7 +15,7 @@ import numpy as np
 
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.profile import profile_call, profile_calls, profile_run
-from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.attack.served import served_process
 from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import TargetError
@@ -25,7 +25,8 @@ from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
 from mavfi_cli.fi.tracer.tracee import Tracee
-from mavfi_cli.mission.instruction.server import PROGRAM, Setup
+from mavfi_cli.mission.instruction import PROGRAM
+from mavfi_cli.mission.instruction.server import Setup
 
 Order = tuple[Any, float]  # input, start stamp
 WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
@@ -46,7 +47,7 @@ class Rehearsal:
     def __init__(self, setup: Setup, orders: Sequence[Order], entry: int = 1) -> None:
         self._setup, self._entry = setup, entry
         self._last = orders[-1]
-        self._spawned = ServedProcess(PROGRAM)
+        self._spawned = served_process(PROGRAM)
         with contextlib.ExitStack() as undo:
             undo.callback(self.close)
             self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
@@ -153,7 +154,7 @@ def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
     Raises:
         TracingForbidden: the operating system neither counts nor lets us trace.
     """
-    spawned, counts = ServedProcess(PROGRAM), []
+    spawned, counts = served_process(PROGRAM), []
     with contextlib.ExitStack() as leaving:
         leaving.callback(spawned.kill)
         scope = spawned.begin(setup, f"node {setup.node}")

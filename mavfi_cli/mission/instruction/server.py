@@ -18,8 +18,6 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.spec.mission import MissionConfig, stack_of
 from mavfi_cli.spec.platform import load_platform
 
-PROGRAM = "mavfi_cli.mission.instruction.server"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
