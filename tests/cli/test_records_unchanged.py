@@ -95,8 +95,9 @@ COMMANDS = {
     ),
     "plan": ("6aa389c6388b46f8", ["campaign", "plan", "fig7", "--json"]),
     # Its inputs_sha256 is of a pickle that names our modules: renewed when those moved to attack/.
-    # Renewed when operands became the bits that are read or written.
-    "kernels": ("87c993740d610bfb", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
+    # Renewed when operands became the bits that are read or written, and when the settings got the
+    # memory of a run.
+    "kernels": ("6b2633bbddbfaa1f", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
     "compare": (
         "eac34e35e3c1cd54",
         [
