@@ -1,5 +1,6 @@
 """The documents: commands run, examples work, links lead somewhere."""
 
+import json
 import os
 import re
 import shlex
@@ -11,8 +12,12 @@ from pathlib import Path
 import click
 import pytest
 from fake_autopilot import FakePX4
+from pyarrow.parquet import read_schema
 
 from mavfi_cli import cli
+from mavfi_cli.analysis.flights import CONFIG
+from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.mission.record.measures import measures_of
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -66,6 +71,23 @@ def test_every_relative_link_leads_to_a_file(document):
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_placeholder_is_left(document):
     assert "@@" not in document.read_text()
+
+
+def told_columns(page):
+    """What a page of the reference names in code."""
+    return set(re.findall(r"`(\w+)`", (ROOT / "docs" / "reference" / page).read_text()))
+
+
+def test_the_reference_names_everything_in_a_run_folder(short_flight):
+    told = told_columns("records.md") | set(BY_NAME)
+    tables = short_flight.path.glob("*.parquet")
+    columns = {name for each in tables for name in read_schema(each).names}
+    result = json.loads((short_flight.path / "result.json").read_text())
+    assert (columns | set(result)) - told == set()
+
+
+def test_the_reference_names_every_column_of_an_export():
+    assert {*measures_of({}), *CONFIG} - told_columns("campaigns.md") == set()
 
 
 @pytest.mark.slow
