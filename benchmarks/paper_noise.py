@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import argparse
 
-import numpy as np
-from scipy.stats import fisher_exact
+from mavfi_cli.stats.effects import fisher, recovered_share
 
 GOLDEN, FAULTY = 100, 300  # missions a world
 TABLE_IV = {  # world: successes golden, with faults, with the Gaussian, with the autoencoder, %
@@ -23,35 +22,11 @@ TABLE_IV = {  # world: successes golden, with faults, with the Gaussian, with th
 TABLE_III = {0: 100, 1: 92, 3: 91, 5: 89}  # bits: successes of 100
 
 
-def p_of(first: tuple[int, int], second: tuple[int, int]) -> float:
-    """Fisher's exact test, two-sided, of two (successes, missions)."""
-    table = [[wins, n - wins] for wins, n in (first, second)]
-    return float(fisher_exact(table).pvalue)
-
-
 def counts(world: str) -> tuple[int, int, int, int]:
     """Successes of golden, faulty, Gaussian and autoencoder missions."""
     golden, faulty, gaussian, autoencoder = TABLE_IV[world]
     wins = [round(FAULTY * rate / 100.0) for rate in (faulty, gaussian, autoencoder)]
     return round(GOLDEN * golden / 100.0), wins[0], wins[1], wins[2]
-
-
-def recovered(
-    golden: int, faulty: int, protected: int, draws: int, rng: np.random.Generator
-) -> tuple[float, float, float]:
-    """Share of the lost success that protection recovers: estimate, low and high end, 95 %.
-
-    The three rates are drawn from their posterior distributions under Jeffreys' prior,
-    Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as well. The interval
-    is that of the percentiles of the ratio, also where the faults lose nothing in a draw.
-    """
-    draw = [
-        rng.beta(wins + 0.5, n - wins + 0.5, draws)
-        for wins, n in ((golden, GOLDEN), (faulty, FAULTY), (protected, FAULTY))
-    ]
-    low, high = np.percentile((draw[2] - draw[1]) / (draw[0] - draw[1]), [2.5, 97.5])
-    base = faulty / FAULTY
-    return (protected / FAULTY - base) / (golden / GOLDEN - base), float(low), float(high)
 
 
 def table_iv(draws: int, seed: int) -> None:
@@ -60,23 +35,23 @@ def table_iv(draws: int, seed: int) -> None:
         f"{'Table IV':<9} {'golden':<8} {'faults':<10} {'p':<7} {'recovered by GAD':<21} "
         f"{'by AAD':<21} GAD against AAD, p"
     )
-    rng = np.random.default_rng(seed)
     for world in TABLE_IV:
         golden, faulty, gaussian, autoencoder = counts(world)
-        cells = [
-            "{:4.0f} % ({:.0f} to {:.0f})".format(
-                *(100.0 * each for each in recovered(golden, faulty, wins, draws, rng))
+        cells = []
+        for wins in (gaussian, autoencoder):
+            told = recovered_share(
+                (golden, GOLDEN), (faulty, FAULTY), (wins, FAULTY), draws=draws, seed=seed
             )
-            for wins in (gaussian, autoencoder)
-        ]
+            ends = (100.0 * each for each in (told.value, told.low, told.high))
+            cells.append("{:4.0f} % ({:.0f} to {:.0f})".format(*ends))
         print(
             f"{world:<9} {golden:>3}/{GOLDEN}  {faulty:>4}/{FAULTY}   "
-            f"{p_of((golden, GOLDEN), (faulty, FAULTY)):<7.2g} {cells[0]:<21} {cells[1]:<21} "
-            f"{p_of((gaussian, FAULTY), (autoencoder, FAULTY)):.2f}"
+            f"{fisher((golden, GOLDEN), (faulty, FAULTY)):<7.2g} {cells[0]:<21} {cells[1]:<21} "
+            f"{fisher((gaussian, FAULTY), (autoencoder, FAULTY)):.2f}"
         )
     golden, faulty = (sum(counts(world)[kind] for world in TABLE_IV) for kind in (0, 1))
     missions = len(TABLE_IV) * GOLDEN, len(TABLE_IV) * FAULTY
-    p = p_of((golden, missions[0]), (faulty, missions[1]))
+    p = fisher((golden, missions[0]), (faulty, missions[1]))
     print(f"{'pooled':<9} {golden}/{missions[0]}  {faulty}/{missions[1]}  {p:.2g}")
 
 
@@ -90,7 +65,7 @@ def table_iii() -> None:
         ("Table IV's golden in Sparse", (sparse, GOLDEN)),
         ("5 bits", five),
     ):
-        print(f"  {name + ',':<28} {other[0]:>3}/{other[1]}  p = {p_of(one, other):.2g}")
+        print(f"  {name + ',':<28} {other[0]:>3}/{other[1]}  p = {fisher(one, other):.2g}")
 
 
 def main() -> None:

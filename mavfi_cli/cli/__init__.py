@@ -22,6 +22,7 @@ _COMMANDS = {
     "detect": ("mavfi_cli.cli.detect", "List the detectors and evaluate them."),
     "campaign": ("mavfi_cli.cli.campaign", "Plan, run and summarise thousands of missions."),
     "reproduce": ("mavfi_cli.cli.reproduce", "Fly every experiment of the paper."),
+    "report": ("mavfi_cli.cli.report", "Write one page: the paper's claims beside flown missions."),
     "compare": ("mavfi_cli.cli.compare", "Fly the same missions on several platforms."),
     "vpm": ("mavfi_cli.cli.vpm", "Model the cost of DMR and TMR in speed, time and energy."),
     "platforms": ("mavfi_cli.cli.platforms", "List the compute platforms and their latencies."),

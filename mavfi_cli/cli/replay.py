@@ -13,6 +13,9 @@ _TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of 
 
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path))
+@click.option("--mission", "number", type=click.IntRange(min=0), metavar="NUMBER",
+              help="RUN is a campaign's folder or exported .parquet: repeat its mission of this "
+                   "number.")  # fmt: skip
 @click.option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
               show_default=True, help="Parent of the new run folder.")  # fmt: skip
@@ -20,12 +23,20 @@ _TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of 
               help="Instruction level: stop the node at the injected instruction and wait for a "
                    "debugger. The activation is then neither followed nor compared.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
-def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) -> None:
+def replay(
+    run: Path, number: int | None, without_fault: bool, out: Path, gdb: bool, as_json: bool
+) -> None:
     """Repeat RUN, a run folder, and compare the records byte for byte.
 
     Exits with code 1 if the repetition differs. With --without-fault the difference shows the
-    effect of the fault. An interrupted replay leaves no files.
+    effect of the fault. An interrupted replay leaves no files. With --mission, the measures of the
+    repetition are compared with those that the campaign recorded.
     """
+    if number is not None:
+        if gdb:
+            raise click.UsageError("--gdb needs a run folder, which --mission does not")
+        _replay_mission(run, number, out, without_fault=without_fault, as_json=as_json)
+        return
     from mavfi_cli.core.errors import Interrupted
     from mavfi_cli.core.files import file_digest
     from mavfi_cli.core.versions import installed_versions, version_differences
@@ -83,6 +94,43 @@ def replay(run: Path, without_fault: bool, out: Path, gdb: bool, as_json: bool) 
             click.echo("\n".join(difference_lines(recorded, again)))
         click.echo(f"Run folder  {again.folder.path}")
     if not identical and not without_fault:
+        raise click.exceptions.Exit(1)
+
+
+def _replay_mission(
+    campaign: Path, number: int, out: Path, *, without_fault: bool, as_json: bool
+) -> None:
+    from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.report.summary import outcome_line
+    from mavfi_cli.studies.again import mission_of
+
+    mission = mission_of(campaign, number)
+    config = mission.golden if without_fault else mission.config
+    click.echo(f"flying mission {number}: {config.world}, seed {config.seed}", err=True)
+    again = load_run(fly_mission(config, out, Watcher()).path)
+    differing = mission.differing(again.result)
+    if as_json:
+        comparison = {
+            "campaign": str(campaign),
+            "mission": number,
+            "again": str(again.folder.path),
+            "identical": not differing,
+            "outcomes": [mission.row["outcome"], again.record.outcome],
+            "differing_measures": differing,
+        }
+        click.echo(json.dumps(comparison, indent=2))
+    else:
+        click.echo(outcome_line(again.result))
+        told = (
+            "identical in every measure"
+            if not differing
+            else "DIFFERENT in " + ", ".join(differing)
+        )
+        click.echo(told)
+        click.echo(f"Run folder  {again.folder.path}")
+    if differing and not without_fault:
         raise click.exceptions.Exit(1)
 
 

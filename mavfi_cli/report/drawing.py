@@ -75,10 +75,16 @@ def write_svg(figure: Figure, path: Path) -> None:
         ConfigError: Its name does not end in .svg.
         RecordError: The file could not be written.
     """
+    require_svg(path)
+    text = svg(figure)
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure as SVG. Equal figures give equal texts."""
     import matplotlib as mpl
 
-    require_svg(path)
     with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
-    write_atomically(path, lambda file: file.write(buffer.getvalue()))
+    return buffer.getvalue().decode()

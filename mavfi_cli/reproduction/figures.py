@@ -51,10 +51,24 @@ def draw(table: PaperTable, ledger: Ledger, item: Item | None, columns: str) -> 
     Args:
         columns: width, `one` or `two`.
     """
-    drawn = _DRAWN.get(item.name) if item is not None else None
-    if item is None or drawn is None:
-        return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)
-    return drawn(flown(item_flights(item, ledger)), columns)
+    if item is None or item.name not in _DRAWN:
+        return draw_table(table, columns)
+    return draw_flights(item.name, table, item_flights(item, ledger), columns)
+
+
+def draw_table(table: PaperTable, columns: str) -> Figure:
+    """Draw a table whose item has no figure of its flights."""
+    return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)
+
+
+def draw_flights(name: str, table: PaperTable, flights: pa.Table, columns: str) -> Figure:
+    """Draw the figure of an item from its flights, or the dots of its table.
+
+    Args:
+        flights: as `analysis.flights.flights`. `fig13` needs their kept run folders.
+    """
+    drawn = _DRAWN.get(name)
+    return draw_table(table, columns) if drawn is None else drawn(flown(flights), columns)
 
 
 def _increase(bare: pa.Table, struck: pa.Table) -> FloatArray:

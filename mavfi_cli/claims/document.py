@@ -1,0 +1,344 @@
+"""The whole report as plain values; `mavfi_cli.report.page` makes the page of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from mavfi_cli.campaigns.specification_file import to_toml
+from mavfi_cli.claims.arms import arms
+from mavfi_cli.claims.beyond import (
+    BIT_CLASSES,
+    Fate,
+    StateCell,
+    hourly_failures,
+    kernel_flows,
+    state_map,
+)
+from mavfi_cli.claims.catalogue import CLAIMS, Claim
+from mavfi_cli.claims.effects import Finding, Protected, count, lost_share, struck, worst_flights
+from mavfi_cli.claims.findings import Kernels, instruction_faults
+from mavfi_cli.claims.flights import FlownMission, GoldenFlights, where
+from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
+from mavfi_cli.core.versions import __version__
+from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT
+from mavfi_cli.stats.effects import ClaimVerdict, judge
+from mavfi_cli.stats.shares import wilson
+
+_DETECTORS = (None, "gad", "aad")
+_LONGEST = 5  # flights of a campaign that are listed although they succeed
+_ISOLATED = "isolated kernels"
+
+
+def document(
+    evidence: Evidence, items: Iterable[Any], upsets_per_hour: float = 1.0
+) -> dict[str, Any]:
+    """All parts of the report.
+
+    Args:
+        items: the paper's tables and figures, as `claims.items.shown_items`.
+        upsets_per_hour: bit flips that reach the injection sites in an hour of flight.
+    """
+    flights = {
+        stack: [each for each in evidence.missions(stack) if each.as_paper] for stack in STACKS
+    }
+    kernels = _kernels(evidence)
+    claims = [_judged(claim, flights, kernels) for claim in CLAIMS]
+    maps = {stack: state_map(flights[stack]) for stack in STACKS}
+    return {
+        "version": __version__,
+        "stacks": STACKS,
+        "summary": _summary(evidence, flights, kernels, claims),
+        "problems": evidence.problems,
+        "claims": claims,
+        "verdicts": {where: _counted(claims, where) for where in (*STACKS, _ISOLATED)},
+        "worst": [row for stack in STACKS for row in _worst(stack, flights[stack])],
+        "spreads": [row for stack in STACKS for row in _spreads(stack, flights[stack])],
+        "flows": {stack: kernel_flows(flights[stack], _silent(kernels)) for stack in STACKS},
+        "fates": [*Fate],
+        "maps": [part for stack in STACKS for part in _matrices(stack, maps[stack])],
+        "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
+        "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
+        "items": _items(items),
+        "left_out": LEFT_OUT,
+        "detectors": ("", "gad", "aad"),
+        "upsets_per_hour": upsets_per_hour,
+        "hourly": {stack: hourly_failures(flights[stack], upsets_per_hour) for stack in STACKS},
+        "arms": [
+            {"campaign": each.name, "arms": found}
+            for each in evidence.campaigns
+            if (found := arms(each.flights))
+        ],
+        "sources": [*map(_source, evidence.campaigns)],
+        "kernel_sources": [
+            {"path": each.path, "summary": each.summary} for each in evidence.kernels
+        ],
+        "missions": [_worth_a_look(each) for each in evidence.campaigns if each.flights],
+    }
+
+
+def _items(shown: Iterable[Any]) -> list[dict[str, Any]]:
+    """The paper's tables and figures, each on all stacks."""
+    found: dict[str, dict[str, Any]] = {}
+    for each in shown:
+        told = found.setdefault(each.item.name, {"item": each.item, "shown": [], "missing": []})
+        if each.table is None:
+            told["missing"].append(each.stack)
+        else:
+            told["shown"].append(each)
+    return [*found.values()]
+
+
+def _kernels(evidence: Evidence) -> Kernels:
+    return {
+        each["kernel"]: each for source in evidence.kernels for each in source.summary["kernels"]
+    }
+
+
+def _silent(kernels: Kernels) -> dict[str, tuple[int, int]]:
+    outcomes = {name: each["outcomes"]["sdc"] for name, each in kernels.items()}
+    return {name: (each["count"], each["of"]) for name, each in outcomes.items()}
+
+
+# Claims -------------------------------------------------------------------------------------------
+
+
+def _judged(
+    claim: Claim, flights: Mapping[str, Sequence[FlownMission]], kernels: Kernels
+) -> dict[str, Any]:
+    if claim.isolated:
+        found = {_ISOLATED: claim.find(kernels)}
+    else:
+        found = {stack: claim.find(those) for stack, those in flights.items()}
+    told = {name: getattr(claim, name) for name in claim.__slots__ if name != "find"}
+    return {**told, "cells": {name: _cell(claim, each) for name, each in found.items()}}
+
+
+def _cell(claim: Claim, found: Finding) -> dict[str, Any]:
+    return {
+        "verdict": judge(found.effect, claim.low, claim.high),
+        "effect": found.effect,
+        "told": found.told,
+    }
+
+
+def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdict, int]:
+    found = Counter(each["cells"][where]["verdict"] for each in claims if where in each["cells"])
+    return {verdict: found[verdict] for verdict in ClaimVerdict}
+
+
+# Five sentences -----------------------------------------------------------------------------------
+
+
+def _summary(
+    evidence: Evidence,
+    flights: Mapping[str, Sequence[FlownMission]],
+    kernels: Kernels,
+    claims: Sequence[Mapping[str, Any]],
+) -> list[str]:
+    missions = len(evidence.missions())
+    runs = sum(each["runs"] for each in kernels.values())
+    attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
+    return [
+        f"This page judges {len(claims)} claims of the paper by {missions:,} missions{attacked}.",
+        _verdict_sentence(claims),
+        _cost_sentence(flights),
+        _saved_sentence(flights),
+        _crash_sentence(flights),
+    ]
+
+
+def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
+    parts = []
+    for name in (*STACKS, _ISOLATED):
+        found = _counted(claims, name)
+        known = sum(found.values()) - found[ClaimVerdict.NOT_FLOWN]
+        if known:
+            parts.append(
+                f"on {name}, {found[ClaimVerdict.REPRODUCED]} of {known} are reproduced, "
+                f"{found[ClaimVerdict.NOT_REPRODUCED]} are not, "
+                f"and {found[ClaimVerdict.OPEN]} cannot be "
+                "told apart from chance"
+            )
+    if not parts:
+        return "None of the claims has been flown yet."
+    text = "; ".join(parts) + "."
+    return text[0].upper() + text[1:]
+
+
+def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
+    parts = []
+    for stack, those in flights.items():
+        faulty = instruction_faults(those) or struck(where(those, level="source"))
+        kind = "an instruction" if instruction_faults(those) else "a state"
+        golden = GoldenFlights(those)
+        faulty = golden.paired(faulty)
+        if faulty:
+            own = {each.pair: each for each in faulty}
+            parts.append(
+                f"on {stack}, a bit flip in {kind} loses {_rate(lost_share(faulty))} of the "
+                f"missions that {len(own):,} golden flights complete"
+            )
+    if not parts:
+        return "No flight with a fault has a golden flight beside it, so the cost is not known."
+    return _sentence(parts)
+
+
+def _saved_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
+    parts = []
+    for stack, those in flights.items():
+        for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
+            pairs = Protected.of(those, detector).pairs
+            lost = [each for own, each in pairs if own.lost]
+            if lost:
+                saved = wilson(sum(not each.lost for each in lost), len(lost))
+                parts.append(f"on {stack}, {name} saves {_rate(saved)} of the lost missions")
+            elif pairs:
+                parts.append(
+                    f"on {stack}, no fault that {name} saw loses a mission without it, "
+                    "so there is nothing to save"
+                )
+    if not parts:
+        return "No fault was flown both without and with a detector."
+    return _sentence(parts)
+
+
+def _crash_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
+    lost = [each for those in flights.values() for each in instruction_faults(those) if each.lost]
+    if not lost:
+        return "No fault in an instruction has lost a mission."
+    ended = wilson(sum(bool(each.node_ended) for each in lost), len(lost))
+    return (
+        f"Of the {len(lost):,} missions that a fault in an instruction loses, {_rate(ended)} "
+        "follow a node that crashed or hung; the others follow silent corruption."
+    )
+
+
+def _sentence(parts: Sequence[str]) -> str:
+    text = "; ".join(parts) + "."
+    return text[0].upper() + text[1:]
+
+
+def _rate(share: Any) -> str:
+    ends = f"{100 * share.low:.0f} to {100 * share.high:.0f}"
+    return f"{100 * share.share:.0f} % ({count(share)}; 95 % interval {ends} %)"
+
+
+# Worst cases and spreads --------------------------------------------------------------------------
+
+
+def _worst(stack: str, flights: Sequence[FlownMission]) -> list[dict[str, Any]]:
+    rows = []
+    golden = GoldenFlights(flights)
+    faulty = [each for each in flights if each.struck and not each.process_killed]
+    kinds = sorted({(str(each.level), each.world, str(each.platform)) for each in faulty})
+    for level, world, platform in kinds:
+        for detector in _DETECTORS:
+            those = where(faulty, level=level, world=world, platform=platform, detector=detector)
+            if golden.ratios(those):
+                rows.append(
+                    {"stack": stack, "level": level, "world": world, "platform": platform,
+                     "detector": detector, "longest": worst_flights(golden, those)}
+                )  # fmt: skip
+    return rows
+
+
+def _spreads(stack: str, flights: Sequence[FlownMission]) -> list[dict[str, Any]]:
+    """Every flight with a fault in a state over its own golden one, by world and detector."""
+    golden = GoldenFlights(flights)
+    found: dict[tuple[str, str | None], list[FlownMission]] = {}
+    for each in where(flights, level="source", platform="x86"):
+        if each.struck and not each.process_killed:
+            found.setdefault((each.world, each.detector), []).append(each)
+    return [
+        {"stack": stack, "world": world, "detector": detector, "ratios": golden.ratios(those)}
+        for (world, detector), those in sorted(found.items(), key=str)
+        if golden.ratios(those)
+    ]
+
+
+# Where a bit hurts --------------------------------------------------------------------------------
+
+
+def _matrices(stack: str, cells: Sequence[StateCell]) -> list[dict[str, Any]]:
+    """A matrix a phase and a kind of state: states as rows, classes of bits as columns."""
+    found = []
+    for phase in sorted({each.phase for each in cells}):
+        here = [each for each in cells if each.phase == phase]
+        for columns in BIT_CLASSES:
+            those = [each for each in here if each.bits in columns]
+            used = [bits for bits in columns if any(each.bits == bits for each in those)]
+            by_place = {(each.state, each.bits): each for each in those}
+            if those:
+                rows = [
+                    {"state": state, "cells": [by_place.get((state, bits)) for bits in used]}
+                    for state in dict.fromkeys(each.state for each in those)
+                ]
+                found.append({"stack": stack, "phase": phase, "columns": used, "rows": rows})
+    return found
+
+
+def _map_rows(stack: str, cells: Sequence[StateCell]) -> list[dict[str, Any]]:
+    return [
+        {"stack": stack, "state": each.state, "bits": each.bits, "phase": each.phase,
+         "faults": each.harmed.total, "harmful": each.harmed.count, "lost": each.lost.count}
+        for each in cells
+    ]  # fmt: skip
+
+
+# Where it comes from ------------------------------------------------------------------------------
+
+
+def _source(source: CampaignSource) -> dict[str, Any]:
+    spec = source.spec
+    seeds = sorted({each.seed for each in source.flights})
+    return {
+        "name": source.name,
+        "path": source.path,
+        "about": spec.about if spec else "",
+        "toml": to_toml(spec) if spec else "",
+        "planned": source.planned,
+        "flown": len(source.flights),
+        "errors": source.errors,
+        "stacks": sorted({each.stack for each in source.flights}),
+        "seeds": (seeds[0], seeds[-1]) if seeds else None,
+        "root": spec.seed if spec else None,
+        "versions": source.versions,
+        "host": {name: source.host.get(name) for name in ("machine", "cores", "started")},
+        "digest": source.digest,
+    }
+
+
+def _worth_a_look(source: CampaignSource) -> dict[str, Any]:
+    """The lost missions of a campaign, and the longest of the others."""
+    golden = GoldenFlights(source.flights)
+    lost = [each for each in source.flights if each.lost]
+    longer = sorted(
+        (each for each in source.flights if not each.golden and golden.ratio(each)),
+        key=lambda each: -(golden.ratio(each) or 0.0),
+    )[:_LONGEST]
+    return {
+        "name": source.name,
+        "lost": [_listed(each, golden) for each in lost],
+        "longest": [_listed(each, golden) for each in longer],
+    }
+
+
+def _listed(flight: FlownMission, golden: GoldenFlights) -> dict[str, Any]:
+    """One line of the list; the command repeats the flight."""
+    struck_state = f"{flight.fault_target}, {flight.fault_field or 'any'}"
+    what = "golden" if flight.golden else struck_state
+    place = flight.path or f"{flight.source} --mission {flight.number}"
+    return {
+        "number": flight.number,
+        "what": " + ".join(filter(None, (what, flight.detector))),
+        "world": flight.world,
+        "seed": flight.seed,
+        "stack": flight.stack,
+        "outcome": flight.outcome,
+        "reason": flight.reason,
+        "flight_time_s": flight.flight_time_s,
+        "ratio": golden.ratio(flight),
+        "command": f"mavfi replay {place}",
+    }

@@ -1,0 +1,236 @@
+"""Finds campaigns, exported campaigns and attacked kernels in files and folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from mavfi_cli.analysis.failures import KERNELS
+from mavfi_cli.analysis.flights import flights
+from mavfi_cli.campaigns.begin import stored_spec
+from mavfi_cli.campaigns.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.specification import Spec
+from mavfi_cli.campaigns.specification_file import load_spec, presets
+from mavfi_cli.campaigns.world_search import SEARCH
+from mavfi_cli.claims.flights import FlownMission, flights_of
+from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.files import file_digest, read_parquet
+from mavfi_cli.core.versions import installed_versions, version_differences
+from mavfi_cli.mission.record.measures import record_of
+
+STACKS = ("mavbench", "hardened")  # the paper's, and ours
+_NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
+_EXPORT, _SPEC = ".parquet", ".toml"
+_OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignSource:
+    """A campaign, from its folder or from an export.
+
+    Attributes:
+        path: the campaign's folder, or the exported file.
+        spec: None if a program made the list, or if no specification lies beside an export.
+        planned: missions on its list; None of an export, which does not say.
+        flights: the missions that flew.
+        errors: missions that could not begin.
+        versions, host: of the first record; empty of an export.
+        digest: SHA-256 of an exported file; empty of a folder.
+        table: of `analysis.flights.flights`; of an export, its columns.
+    """
+
+    path: Path
+    name: str
+    spec: Spec | None
+    planned: int | None
+    flights: Sequence[FlownMission]
+    table: pa.Table
+    errors: int = 0
+    versions: Mapping[str, str] = field(default_factory=dict)
+    host: Mapping[str, Any] = field(default_factory=dict)
+    digest: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelSource:
+    """Attacked kernels: the summary that `mavfi kernels --out` writes."""
+
+    path: Path
+    summary: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """All that was found.
+
+    Attributes:
+        problems: what could not be read, is incomplete, or does not fit, a sentence each.
+    """
+
+    campaigns: Sequence[CampaignSource]
+    kernels: Sequence[KernelSource]
+    problems: Sequence[str]
+
+    def missions(self, stack: str | None = None) -> list[FlownMission]:
+        """The flights of a stack, each mission once; None means all stacks."""
+        once: dict[str, FlownMission] = {}
+        for campaign in self.campaigns:
+            for each in campaign.flights:
+                if stack in (None, each.stack):
+                    once.setdefault(each.changes, each)
+        return list(once.values())
+
+
+def gather(places: Sequence[Path]) -> Evidence:
+    """Read what the places hold.
+
+    Args:
+        places: folders of campaigns, of `mavfi kernels`, folders of such folders, exports.
+
+    Raises:
+        RecordError: a place does not exist, or nothing in them can be read.
+    """
+    campaigns: list[CampaignSource] = []
+    kernels: list[KernelSource] = []
+    problems: list[str] = []
+    for place in places:
+        before = len(campaigns) + len(kernels) + len(problems)
+        for path in _found(place):
+            try:
+                each = _read(path)
+            except (MavfiError, OSError) as error:
+                problems.append(f"Not read: {error}.")
+                continue
+            if isinstance(each, KernelSource):
+                kernels.append(each)
+            else:
+                campaigns.append(each)
+        if len(campaigns) + len(kernels) + len(problems) == before:
+            problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
+    if not any(each.flights for each in campaigns) and not kernels:
+        raise RecordError("; ".join(each.rstrip(".") for each in problems) or _nothing(campaigns))
+    problems += _incomplete(campaigns)
+    return Evidence(campaigns=campaigns, kernels=kernels, problems=[*problems, *_mixed(campaigns)])
+
+
+def _found(place: Path) -> Iterator[Path]:
+    """Ledgers, summaries of kernels and exports at a place, in the order of their names."""
+    if not place.exists():
+        raise RecordError(f"{place}: does not exist")
+    if place.is_file():
+        yield place
+        return
+    yield from sorted(
+        path
+        for path in place.rglob("*")
+        if (path.name in (KERNELS, LEDGER) or path.suffix == _EXPORT)
+        and path.name not in _OTHERS
+        and not _inside_campaign(path.relative_to(place))
+    )
+
+
+def _inside_campaign(path: Path) -> bool:
+    """Whether it belongs to a campaign's own folders: kept runs, the search for a world."""
+    return bool({"runs", SEARCH, "profiles"} & set(path.parts[:-1]))
+
+
+def _read(path: Path) -> CampaignSource | KernelSource:
+    if path.name == LEDGER:
+        return _from_ledger(path.parent)
+    if path.suffix == _EXPORT:
+        return _from_export(path)
+    return _from_kernels(path)
+
+
+def _from_ledger(folder: Path) -> CampaignSource:
+    with Ledger(folder) as ledger:
+        table = flights(ledger)
+        first = table["number"][:1].to_pylist()
+        record = record_of(next(ledger.results(first)).result) if first else record_of({})
+        versions = json.loads(ledger.meta("versions") or "{}")
+        return CampaignSource(
+            path=folder,
+            name=ledger.meta("name") or folder.name,
+            spec=stored_spec(ledger),
+            planned=ledger.planned(),
+            flights=flights_of(table, folder),
+            errors=sum(ledger.errors_by_cell().values()),
+            versions=versions or record.versions,
+            host=record.host,
+            table=table,
+        )
+
+
+def _from_export(path: Path) -> CampaignSource:
+    table = read_parquet(path, "export of a campaign")
+    lacking = [name for name in _NEEDED if name not in table.column_names]
+    if lacking:
+        raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
+    spec = _spec_beside(path)
+    return CampaignSource(
+        path=path,
+        name=path.stem,
+        spec=spec,
+        planned=None,
+        flights=flights_of(table, path),
+        errors=table["state"].to_pylist().count("error"),
+        digest=file_digest(path),
+        table=table,
+    )
+
+
+def _spec_beside(path: Path) -> Spec | None:
+    """The specification of an export: NAME.toml, also for NAME-part1.parquet, or the preset."""
+    for stem in (path.stem, path.stem.rpartition("-part")[0]):
+        if stem and (beside := path.with_name(stem + _SPEC)).is_file():
+            return load_spec(str(beside))
+        if stem in presets():
+            return load_spec(stem)
+    return None
+
+
+def _from_kernels(path: Path) -> KernelSource:
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        for each in told["kernels"]:
+            each["kernel"], each["outcomes"]["sdc"]["of"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordError(f"{path}: no summary of `mavfi kernels` ({error!r})") from None
+    return KernelSource(path=path, summary=told)
+
+
+# What is missing ----------------------------------------------------------------------------------
+
+
+def _nothing(campaigns: Sequence[CampaignSource]) -> str:
+    return "; ".join(f"{each.path}: no mission has flown yet" for each in campaigns)
+
+
+def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
+    for each in campaigns:
+        over = len(each.flights) + each.errors
+        if each.planned is not None and over < each.planned:
+            yield (
+                f"{each.path}: {over:,} of {each.planned:,} missions have flown. "
+                f"`mavfi campaign run {each.path}` flies the rest."
+            )
+        if each.errors:
+            yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."
+
+
+def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
+    told = [each for each in campaigns if each.versions]
+    for each in told[1:]:
+        if found := version_differences(told[0].versions, each.versions):
+            yield f"{each.path} and {told[0].path} were flown by other builds: {', '.join(found)}."
+    here = installed_versions()
+    if told and (found := version_differences(told[0].versions, here)):
+        yield (
+            f"{told[0].path} was flown by another build than this one, so its missions may not "
+            f"repeat here: {', '.join(found)}."
+        )

@@ -1,0 +1,1 @@
+"""The report as one HTML file: `render` fills page.html, with page.css and the charts inside."""

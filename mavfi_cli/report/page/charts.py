@@ -1,0 +1,165 @@
+"""Charts of the page: SVG by matplotlib, small enough for a phone, each with its data as CSV.
+
+The SVG stands in the page itself, so it takes font and colours from the page: light, dark, print.
+No library of interactive charts: plotly alone is 5 MB in each page, and a page without script has
+nothing that can fail.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, svg
+from mavfi_cli.report.paper_figures import (
+    PALETTE,
+    SMALLEST,
+    Strip,
+    StripPanel,
+    draw_strips,
+    print_axes,
+    print_figure,
+)
+from mavfi_cli.report.tables.columns import csv_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LOST = "#b2182b"
+_TITLES = {None: "no detector", "gad": "Gaussian", "aad": "autoencoder"}
+_THEME = {INK: "var(--ink)", NOTE: "var(--note)", GRID: "var(--rule)", "#ffffff": "none",
+          PALETTE[0]: "var(--deep)"}  # fmt: skip
+_OWN_ID = re.compile(r' id="[a-z]+[a-z0-9]*_[0-9_]+"')  # figure_1, text_3: not unique in a page
+_FONT = re.compile(r"font: (?:[a-z0-9]+ )*?([0-9.]+px)[^;\"]*")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chart:
+    """A picture in the page.
+
+    Attributes:
+        name: of its CSV file, without suffix.
+        title: what it shows, in words, also for those who cannot see it.
+        markup: SVG.
+        data: a `data:` link to the CSV.
+    """
+
+    name: str
+    title: str
+    markup: str
+    data: str
+
+
+def chart(name: str, title: str, figure: Figure, rows: Iterable[Mapping[str, Any]]) -> Chart:
+    """A figure and its numbers as a part of the page."""
+    return Chart(name=name, title=title, markup=inline(figure), data=csv_link(rows))
+
+
+def csv_link(rows: Iterable[Mapping[str, Any]]) -> str:
+    """A link that holds rows as CSV."""
+    return data_link(csv_text(rows))
+
+
+def data_link(text: str) -> str:
+    """A link that holds CSV text."""
+    code = base64.b64encode(text.encode()).decode()
+    return f"data:text/csv;charset=utf-8;base64,{code}"
+
+
+def inline(figure: Figure) -> str:
+    """A figure as an SVG element in the page's font and colours."""
+    text = svg(figure)
+    markup = _OWN_ID.sub("", text[text.index("<svg") :])
+    markup = _FONT.sub(r"font-size: \1", markup)
+    for colour, variable in _THEME.items():
+        markup = markup.replace(colour, variable)
+    return markup.strip()
+
+
+def spread_chart(stack: str, rows: Sequence[Mapping[str, Any]]) -> Chart:
+    """Every flight with a fault in a state over its own golden flight, a panel a world."""
+    worlds = dict.fromkeys(each["world"] for each in rows)
+    panels = [
+        StripPanel(
+            title=world,
+            strips=[
+                Strip(label=title, values=_increases(rows, world, name), style=style)
+                for style, (name, title) in enumerate(_TITLES.items(), start=1)
+            ],
+        )
+        for world in worlds
+    ]
+    figure = draw_strips(panels, "flight time over the golden flight of the same mission, %")
+    data = [
+        {"world": each["world"], "detector": each["detector"] or "", "over_golden": f"{ratio:.4f}"}
+        for each in rows for ratio in each["ratios"]
+    ]  # fmt: skip
+    return chart(f"states-{stack}", f"Faults in states, {stack}", figure, data)
+
+
+def _increases(rows: Sequence[Mapping[str, Any]], world: str, detector: str | None) -> FloatArray:
+    mine = [x["ratios"] for x in rows if (x["world"], x["detector"]) == (world, detector)]
+    return 100.0 * (np.array([ratio for each in mine for ratio in each]) - 1.0)
+
+
+# Arms, kernels ------------------------------------------------------------------------------------
+
+
+def arm_chart(campaign: str, arms: Sequence[Any]) -> Chart:
+    """Lost missions of each arm with their intervals."""
+    figure = print_figure("one", 0.6 + 0.17 * len(arms))
+    axes = figure.add_subplot()
+    print_axes(axes)
+    for place, arm in enumerate(arms):
+        telling = arm.p_value is not None and arm.p_value < 0.05
+        colour = _LOST if arm.p_value is None else DETECTORS["gad"] if telling else NONE
+        axes.hlines(place, 100 * arm.lost.low, 100 * arm.lost.high, color=colour, linewidth=1.4)
+        axes.plot(100 * arm.lost.share, place, "o", color=colour, markersize=4)
+    axes.set_yticks(range(len(arms)), [each.name for each in arms], fontsize=SMALLEST)
+    axes.set_ylim(len(arms) - 0.4, -0.6)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("missions lost, % (95 % interval)", fontsize=SMALLEST)
+    rows = [
+        {"arm": each.name, "lost": each.lost.count, "of": each.lost.total, "low": each.lost.low,
+         "high": each.lost.high, "p": "" if each.p_value is None else each.p_value}
+        for each in arms
+    ]  # fmt: skip
+    return chart(f"arms-{campaign}", f"Lost missions of each arm of {campaign}", figure, rows)
+
+
+_FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "#6a4fb3",
+          "crashed": "#e4572e", "hung": "#f2b134"}  # fmt: skip
+
+
+def flow_chart(stack: str, flows: Sequence[Any]) -> Chart:
+    """What struck kernels did, a bar a kernel."""
+    figure = print_figure("one", 0.9 + 0.26 * len(flows))
+    axes = figure.add_subplot()
+    print_axes(axes)
+    for place, flow in enumerate(flows):
+        total, left = sum(each.total for each in flow.fates.values()), 0.0
+        for fate, share in flow.fates.items():
+            part = 100.0 * share.total / total
+            label = fate.value if not place else None
+            axes.barh(place, part, left=left, height=0.66, color=_FATES[fate.value], label=label)
+            left += part
+    names = [each.kernel.replace("_", " ") for each in flows]
+    axes.set_yticks(range(len(flows)), names, fontsize=SMALLEST)
+    axes.set_ylim(len(flows) - 0.5, -0.5)
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel("share of struck kernels, %", fontsize=SMALLEST)
+    figure.legend(
+        loc="outside upper center", ncols=3, frameon=False, fontsize=SMALLEST, handlelength=1.0,
+        columnspacing=1.0, labelcolor=INK,
+    )  # fmt: skip
+    rows = [
+        {"kernel": each.kernel, "fate": fate.value, "missions": share.total, "lost": share.count}
+        for each in flows for fate, share in each.fates.items()
+    ]  # fmt: skip
+    return chart(f"kernels-{stack}", f"What struck kernels did, {stack}", figure, rows)

@@ -1,0 +1,147 @@
+"""Fills the template: numbers become words, and charts their places."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.report.page.charts import (
+    Chart,
+    arm_chart,
+    csv_link,
+    data_link,
+    flow_chart,
+    inline,
+    spread_chart,
+)
+from mavfi_cli.report.tables.paper_table import as_csv, cells_of
+
+_FOLDER = Path(__file__).parent
+_NONE = "\N{EN DASH}"
+_DETECTORS = {None: "none", "": "none", "gad": "Gaussian", "aad": "autoencoder"}
+
+
+def render(told: Mapping[str, Any]) -> str:
+    """The page as one HTML text; equal values give equal pages.
+
+    Args:
+        told: `mavfi_cli.claims.document.document`.
+
+    Raises:
+        MavfiError: the template library is not installed. Says how to install it.
+    """
+    try:
+        import jinja2
+    except ImportError:
+        raise MavfiError(
+            "the report needs jinja2 and scipy; install them with: pip install 'mavfi[report]'"
+        ) from None
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True,
+        lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=_unbroken,
+    )  # fmt: skip
+    environment.filters |= {
+        "percent": percent, "ends": ends, "effect": effect, "of": count_of, "p": p_value,
+        "times": times, "detector": detector, "hourly": hourly, "shade": shade, "csv": csv_link,
+        "cells": cells_of, "table_csv": lambda table: data_link(as_csv(table)),
+    }  # fmt: skip
+    style = (_FOLDER / "page.css").read_text(encoding="utf-8")
+    return environment.get_template("page.html").render(**told, style=style, charts=_charts(told))
+
+
+def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
+    stacks = told["stacks"]
+    spreads = {s: [each for each in told["spreads"] if each["stack"] == s] for s in stacks}
+    return {
+        "items": {
+            (each.item.name, each.stack): _item_chart(each)
+            for item in told["items"]
+            for each in item["shown"]
+            if each.figure is not None
+        },
+        "states": [spread_chart(s, rows) for s, rows in spreads.items() if rows],
+        "arms": [arm_chart(each["campaign"], each["arms"]) for each in told["arms"]],
+        "flows": [flow_chart(s, told["flows"][s]) for s in stacks if told["flows"][s]],
+    }
+
+
+def _item_chart(shown: Any) -> Chart:
+    item = shown.item
+    rows = shown.flights or None
+    link = csv_link(rows) if rows else data_link(as_csv(shown.table))
+    name = f"{item.name}-{shown.stack}".replace(" ", "-")
+    return Chart(
+        name=f"{name}-flights" if rows else name, title=f"{item.paper}, {shown.stack}",
+        markup=inline(shown.figure), data=link,
+    )  # fmt: skip
+
+
+def _unbroken(value: Any) -> Any:
+    """A number stays in one line with its sign of per cent."""
+    plain_text = isinstance(value, str) and not hasattr(value, "__html__")
+    return value.replace(" %", "\N{NARROW NO-BREAK SPACE}%") if plain_text else value
+
+
+# Numbers as words ---------------------------------------------------------------------------------
+
+
+def percent(value: float | None, digits: int = 0) -> str:
+    """A share of one as per cent."""
+    if value is None or not math.isfinite(value):
+        return _NONE
+    return f"{100 * value:z.{digits}f} %"
+
+
+def ends(share: Any, scale: float = 100.0, digits: int = 0) -> str:
+    """The ends of an interval."""
+    return f"{scale * share.low:z.{digits}f} to {scale * share.high:z.{digits}f}"
+
+
+def effect(found: Any, unit: str) -> str:
+    """An effect with its interval, in per cent or in points of a success rate."""
+    if found is None:
+        return _NONE
+    if unit == "number":
+        return f"{found.value:.2f} ({ends(found, 1.0, 2)})"
+    largest = max(abs(found.low), abs(found.high))
+    digits = 0 if largest >= 0.1 else 1 if largest >= 0.01 else 4
+    value = f"{100 * found.value:{'+' if unit == 'points' else ''}z.{digits}f}"
+    return f"{value} {'points' if unit == 'points' else '%'} ({ends(found, digits=digits)})"
+
+
+def count_of(share: Any) -> str:
+    """Such as `3 of 98`."""
+    return f"{share.count:,} of {share.total:,}"
+
+
+def p_value(chance: float | None) -> str:
+    """A p-value."""
+    if chance is None:
+        return _NONE
+    return "< 0.001" if chance < 0.001 else f"{chance:.2g}"
+
+
+def times(excess: float | None) -> str:
+    """A relative increase with its sign."""
+    if excess is None or not math.isfinite(excess):
+        return _NONE
+    return f"{100 * excess:+z.1f} %"
+
+
+def detector(name: str | None) -> str:
+    """A detector as the page calls it."""
+    return _DETECTORS.get(name, str(name))
+
+
+def hourly(rates: tuple[float, float, float]) -> str:
+    """A rate with its interval, two digits each."""
+    point, low, high = (f"{each:.2g}" for each in rates)
+    return f"{point} ({low} to {high})"
+
+
+def shade(share: float | None) -> str:
+    """The strength of a cell's colour, from 0 to 100."""
+    return "0" if share is None or not math.isfinite(share) else f"{100 * math.sqrt(share):.0f}"

@@ -1,0 +1,169 @@
+"""Effects with intervals, and what an interval says about a claim.
+
+An effect is one number of a comparison: a difference of two rates, or the share of a loss that
+protection recovers. A claim gives the range in which the effect lies. `judge` compares the two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import Enum
+
+import numpy as np
+
+from mavfi_cli.stats.bootstrap import Interval
+from mavfi_cli.stats.paired import McNemar
+from mavfi_cli.stats.shares import Share, z_of
+
+DRAWS = 100_000  # of the three rates in `recovered_share`
+Count = tuple[int, int]  # successes, missions
+
+
+class ClaimVerdict(Enum):
+    """What the data say about a claim."""
+
+    REPRODUCED = "reproduced"
+    NOT_REPRODUCED = "not reproduced"
+    OPEN = "not distinguishable"  # at this number of missions
+    NOT_FLOWN = "not flown"
+
+
+def judge(effect: Interval | None, low: float = -math.inf, high: float = math.inf) -> ClaimVerdict:
+    """Compare the interval of an effect with the range that a claim gives.
+
+    The claim is reproduced if the whole interval is in the range, and not reproduced if no part of
+    it is. If the interval has a part on either side, the missions do not tell. The ends of a
+    direction are open: an interval that ends at 0 is not above 0.
+
+    Args:
+        effect: with its 95 % interval; None, or an interval without ends, if there are no data.
+        low, high: ends of the claimed range. Only finite ends are open.
+    """
+    if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
+        return ClaimVerdict.NOT_FLOWN
+    if low < effect.low and effect.high < high:
+        return ClaimVerdict.REPRODUCED
+    if effect.high <= low or effect.low >= high:
+        return ClaimVerdict.NOT_REPRODUCED
+    return ClaimVerdict.OPEN
+
+
+def fisher(first: Count, second: Count) -> float:
+    """Two-sided p-value of Fisher's exact test of two independent rates."""
+    from scipy.stats import fisher_exact
+
+    table = [[wins, missions - wins] for wins, missions in (first, second)]
+    return float(fisher_exact(table).pvalue)
+
+
+def correlation(pairs: Sequence[tuple[float, float]]) -> Interval:
+    """Pearson's correlation with Fisher's interval; NaN if one of the two does not vary.
+
+    Args:
+        pairs: at least four.
+    """
+    from scipy.stats import pearsonr
+
+    first, second = (np.array(each) for each in zip(*pairs, strict=True))
+    if np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
+        return Interval(value=math.nan, low=math.nan, high=math.nan, count=len(pairs))
+    found = pearsonr(first, second)
+    ends = found.confidence_interval()
+    return Interval(
+        value=float(found.statistic), low=float(ends.low), high=float(ends.high), count=len(pairs)
+    )
+
+
+def as_interval(share: Share) -> Interval:
+    """A rate as an effect."""
+    return Interval(value=share.share, low=share.low, high=share.high, count=share.total)
+
+
+def rate_difference(first: Share, second: Share) -> Interval:
+    """First minus second of two independent rates, with the hybrid score interval.
+
+    R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the two
+    Wilson intervals, added in squares. NaN if one has no observations.
+    """
+    count = min(first.total, second.total)
+    if not count:
+        return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
+    value = first.share - second.share
+    below = math.hypot(first.share - first.low, second.high - second.share)
+    above = math.hypot(first.high - first.share, second.share - second.low)
+    return Interval(
+        value=value, low=max(-1.0, value - below), high=min(1.0, value + above), count=count
+    )
+
+
+def paired_difference(test: McNemar, confidence: float = 0.95) -> Interval:
+    """Success of the second treatment minus that of the first, of the same missions.
+
+    D. G. Bonett and R. M. Price, J. Educational and Behavioral Statistics 37, 2012: one pair is
+    added to each kind of pair that differs, so 0 of n differences still has a width.
+    """
+    if not test.pairs:
+        return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
+    gained, lost = ((each + 1) / (test.pairs + 2) for each in (test.only_second, test.only_first))
+    centre = gained - lost
+    half = z_of(confidence) * math.sqrt((gained + lost - centre**2) / (test.pairs + 2))
+    return Interval(
+        value=test.difference,
+        low=max(-1.0, centre - half),
+        high=min(1.0, centre + half),
+        count=test.pairs,
+    )
+
+
+def recovered_share(
+    golden: Count, faulty: Count, protected: Count, *, draws: int = DRAWS, seed: int = 1
+) -> Interval:
+    """Share of the lost success that protection recovers, of three independent rates.
+
+    A ratio of two differences. The three rates are drawn from their posterior distributions under
+    Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as well.
+    The interval is that of the percentiles of the ratio. Draws in which the faults cost nothing
+    belong to it.
+
+    Args:
+        golden, faulty, protected: successes and missions of each.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = [
+        rng.beta(wins + 0.5, missions - wins + 0.5, draws)
+        for wins, missions in (golden, faulty, protected)
+    ]
+    low, high = np.percentile((drawn[2] - drawn[1]) / (drawn[0] - drawn[1]), [2.5, 97.5])
+    rates = [wins / missions for wins, missions in (golden, faulty, protected)]
+    loss = rates[0] - rates[1]
+    value = (rates[2] - rates[1]) / loss if loss else math.nan
+    return Interval(value=value, low=float(low), high=float(high), count=faulty[1])
+
+
+def longest_reaches(beyond: Share, flights: int) -> Interval:
+    """Probability that the longest of so many flights is at least as long as a given one.
+
+    1 - (1 - p)^n, where p is the share of flights that are as long. The ends are those of p.
+
+    Args:
+        beyond: share of our flights that are as long.
+        flights: number of flights of which the longest is taken.
+    """
+    value, low, high = (
+        -math.expm1(flights * math.log1p(-each)) if each < 1.0 else 1.0
+        for each in (beyond.share, beyond.low, beyond.high)
+    )
+    return Interval(value=value, low=low, high=high, count=beyond.total)
+
+
+def excess_over_mean(golden: Sequence[float], others: Sequence[float]) -> tuple[float, float]:
+    """The longest of the golden and of the other flights over the mean golden one, minus 1.
+
+    Unpaired: the reading that the paper's words allow. The first number is what the flights differ
+    by without any fault. NaN if either has no flight.
+    """
+    if not golden or not others:
+        return math.nan, math.nan
+    reference = math.fsum(golden) / len(golden)
+    return max(golden) / reference - 1.0, max(others) / reference - 1.0

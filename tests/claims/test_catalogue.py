@@ -1,0 +1,121 @@
+"""The claims: each has its words, numbers and range, and decides what it says."""
+
+import re
+
+import pytest
+from flown import flights, row
+
+from mavfi_cli.claims.catalogue import CLAIMS
+from mavfi_cli.reproduction.items import BY_NAME
+from mavfi_cli.stats.effects import ClaimVerdict, judge
+
+BY_CLAIM = {claim.name: claim for claim in CLAIMS}
+
+
+def verdict(name, those):
+    claim = BY_CLAIM[name]
+    return judge(claim.find(those).effect, claim.low, claim.high)
+
+
+def test_names_are_unique_and_of_the_papers_items():
+    assert len(BY_CLAIM) == len(CLAIMS) > 35
+    assert {claim.item for claim in CLAIMS} < BY_NAME.keys()
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
+def test_a_claim_is_a_sentence_with_a_range_inside_which_something_lies(claim):
+    assert re.fullmatch(r"[A-Z].*\.", claim.words) or claim.words.startswith("future_")
+    assert claim.effect
+    assert claim.paper_tells
+    assert claim.low < claim.high
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
+def test_nothing_flown_is_no_verdict(claim):
+    found = claim.find({} if claim.isolated else [])
+    assert judge(found.effect, claim.low, claim.high) is ClaimVerdict.NOT_FLOWN
+
+
+def test_the_papers_numbers_stand_in_their_claims():
+    assert BY_CLAIM["table4-dense"].paper == "85 % to 75.3 %: 9.7 points"
+    assert "p = 0.0012" in BY_CLAIM["table4-factory"].paper_tells
+    assert "p = 0.052" in BY_CLAIM["table4-dense"].paper_tells
+    assert BY_CLAIM["table3-1"].paper_tells.endswith("Fisher's p = 0.0068")
+    assert BY_CLAIM["table3-5"].paper_tells.endswith("Fisher's p = 0.63")
+    assert BY_CLAIM["fig12-farm"].words.endswith("takes 74.2 % longer.")
+    assert BY_CLAIM["table4-gad"].low > 0.4
+
+
+def stage(name, seed, **how):
+    return row(name, instruction=True, seed=seed, config={"world": "dense"}, **how)
+
+
+def dense(lost):
+    """A golden flight and a fault in planning for 100 seeds; so many faults lose the mission."""
+    rows = []
+    for seed in range(1, 101):
+        rows.append(row(seed=seed, config={"world": "dense"}))
+        rows.append(stage("planning", seed, outcome="timeout" if seed <= lost else "success"))
+    return flights(rows)
+
+
+@pytest.mark.parametrize(
+    ("lost", "told"),
+    [
+        (10, ClaimVerdict.REPRODUCED),
+        (0, ClaimVerdict.OPEN),
+        (12, ClaimVerdict.OPEN),  # 6 to 19 points, the paper's interval ends at 17
+        (60, ClaimVerdict.NOT_REPRODUCED),
+    ],
+)
+def test_success_in_dense(lost, told):
+    assert verdict("table4-dense", dense(lost)) is told
+    assert verdict("table4-farm", dense(lost)) is ClaimVerdict.NOT_FLOWN
+
+
+def kernels(**shares):
+    """Outcomes of 5,000 runs of each kernel: silent, benign."""
+    return {
+        name: {
+            "title": name,
+            "outcomes": {
+                "sdc": {"count": silent, "of": 5000},
+                "benign": {"count": benign, "of": 5000},
+            },
+        }
+        for name, (silent, benign) in shares.items()
+    }
+
+
+def test_isolated_kernels():
+    told = kernels(octomap=(2000, 500), rrtstar=(20, 2000), rrt=(100, 2000), control=(900, 1300))
+    assert verdict("fig6-octomap", told) is ClaimVerdict.REPRODUCED
+    assert verdict("fig6-rrtstar", told) is ClaimVerdict.REPRODUCED
+    assert verdict("fig6-benign", told) is ClaimVerdict.OPEN  # 26 % of 5,000
+    other = kernels(octomap=(200, 500), point_cloud=(900, 3000))
+    assert verdict("fig6-octomap", other) is ClaimVerdict.NOT_REPRODUCED
+
+
+def test_states_and_fields():
+    rows = []
+    for seed in range(1, 41):
+        rows.append(row(seed=seed))
+        for field, time_s in (("sign", 30.0), ("exponent", 20.0), ("mantissa", 20.0)):
+            fault = {"field": field, "together": True}
+            rows.append(row("waypoint_position", seed=seed, fault=fault, time_s=time_s))
+    assert verdict("fig9-fields", flights(rows)) is ClaimVerdict.REPRODUCED
+    assert verdict("fig8-position", flights(rows)) is ClaimVerdict.NOT_FLOWN  # any field, not these
+
+
+def test_the_cost_of_detectors():
+    rows = []
+    for seed in range(1, 31):
+        for name, share in (("gad", 0.02), ("aad", 0.0001)):
+            costs = {"check_share": share} | {
+                f"recovery_share_{each}": 0.0 for each in ("perception", "planning", "control")
+            }
+            rows.append(stage("planning", seed, detector=name, **costs))
+    those = flights(rows)
+    assert verdict("table5-gad", those) is ClaimVerdict.REPRODUCED  # 2 %, at most 2.2 %
+    assert verdict("table5-aad", those) is ClaimVerdict.NOT_REPRODUCED  # 0.01 %, at most 0.0062 %
+    assert verdict("table5-gad-over-aad", those) is ClaimVerdict.REPRODUCED

@@ -1,0 +1,116 @@
+"""Lost, harmful and recovered missions, counted by hand."""
+
+import pytest
+from flown import flights, row
+
+from mavfi_cli.claims.effects import (
+    Protected,
+    compared,
+    harm_share,
+    struck,
+    success_lost,
+    worst_as_long,
+    worst_flights,
+)
+from mavfi_cli.claims.flights import GoldenFlights, where
+
+PLANNING = {"target": "planning", "fault": {"field": "exponent"}}
+
+
+def pairs(*outcomes):
+    """A golden flight of 20 s for each seed, and a faulty one that lasts or ends like this."""
+    rows = []
+    for seed, end in enumerate(outcomes, start=1):
+        rows.append(row(seed=seed))
+        how = {"outcome": end, "time_s": 60.0} if isinstance(end, str) else {"time_s": end}
+        rows.append(row(**PLANNING, seed=seed, **how))
+    return rows
+
+
+def test_a_fault_is_harmful_if_lost_or_more_than_5_percent_longer():
+    those = flights(pairs(20.0, 21.0, 21.1, "timeout"))
+    share = harm_share(GoldenFlights(those), struck(those))
+    assert (share.count, share.total) == (2, 4)
+
+
+def test_a_fault_without_a_successful_golden_flight_is_not_counted():
+    rows = pairs("timeout", 40.0)
+    rows[0] = {**rows[0], "outcome": "collision"}
+    share = harm_share(GoldenFlights(flights(rows)), struck(flights(rows)))
+    assert (share.count, share.total) == (1, 1)
+
+
+def test_success_lost_is_paired_and_counts_faults_that_nothing_read():
+    rows = pairs("collision", *[20.0] * 8)
+    rows[3] = {**rows[3], "injected": "not_activated"}
+    rows.append(row(**PLANNING, seed=50, injected="not_injected"))
+    found = success_lost(GoldenFlights(flights(rows)), struck(flights(rows)))
+    assert found.effect.value == pytest.approx(1 / 9)
+    assert found.effect.count == 9
+    assert found.told == "1 of 9 lost; golden 0 of 9"
+
+
+def test_the_longest_flight_is_paired_and_unpaired():
+    rows = pairs(30.0, 20.0)
+    rows[2] = {**rows[2], "flight_time_s": 10.0}  # the second golden flight is short
+    rows[3] = {**rows[3], "flight_time_s": 18.0}
+    those = flights(rows)
+    worst = worst_flights(GoldenFlights(those), struck(those))
+    assert worst.paired == pytest.approx(0.8)  # 18 over its own 10
+    assert worst.unpaired == pytest.approx(1.0)  # 30 over the mean of 20 and 10
+    assert worst.golden == pytest.approx(20 / 15 - 1)
+    assert (worst.longer.count, worst.longer.total) == (2, 2)
+
+
+def test_a_longest_flight_is_as_probable_as_flights_are_as_long():
+    those = flights(pairs(30.0, 20.0, 20.0, 20.0))
+    found = worst_as_long(GoldenFlights(those), struck(those), 1.5, 10)
+    assert found.effect.value == pytest.approx(1.0 - 0.75**10)
+    assert found.told == "1 of 4 as long; longest +50.0 %"
+
+
+def watched(rows, detector, *times):
+    """The same faults with a detector."""
+    found = []
+    for seed, end in enumerate(times, start=1):
+        how = {"outcome": end} if isinstance(end, str) else {"time_s": end}
+        found.append(row(**PLANNING, seed=seed, detector=detector, **how))
+    return rows + found
+
+
+def test_a_detector_saves_lost_missions_and_brings_long_ones_back():
+    rows = pairs("timeout", "collision", 40.0, 20.0)
+    rows = watched(rows, "gad", 20.0, "collision", 20.5, 20.0)
+    rows = watched(rows, "aad", 20.0, 20.0, 40.0, "crash")
+    those = flights(rows)
+    gad, aad = (Protected.of(those, name) for name in ("gad", "aad"))
+    assert gad.recovered().told == "1 of 2 lost missions saved"
+    assert aad.recovered().effect.value == 1.0
+    assert gad.shortened().told == "1 of 1 longer flights brought back"
+    assert (gad.undone().count, gad.undone().total) == (2, 3)
+    assert (aad.undone().count, aad.undone().total) == (2, 3)
+    test = compared(gad, aad)
+    assert (test.only_first, test.only_second, test.pairs) == (1, 1, 4)
+
+
+def test_nothing_to_recover_says_so():
+    found = Protected.of(flights(watched(pairs(20.0), "gad", 20.0)), "gad").recovered()
+    assert found.effect is None
+    assert found.told == "0 of 1 lost without"
+
+
+def test_what_is_not_of_the_paper_is_marked():
+    held = {"persistence": "stuck-at", "duration_s": 5.0}
+    rows = [
+        row("planning"),
+        row("planning", fault=held),
+        row("planning", config={"v_max_mps": 0.6}),
+        row("planning", config={"time_limit_s": 99.0}),
+    ]
+    assert [each.as_paper for each in flights(rows)] == [True, False, False, True]
+
+
+def test_flights_are_chosen_by_their_columns():
+    those = flights([row(seed=1), row("planning", seed=2), row("control", seed=3)])
+    assert [each.seed for each in where(those, fault_target=("planning", "control"))] == [2, 3]
+    assert [each.seed for each in where(those, seed=1, level=None)] == [1]

@@ -1,0 +1,17 @@
+"""What the page tells of some committed campaigns."""
+
+from pathlib import Path
+
+from mavfi_cli.claims.document import document
+from mavfi_cli.claims.items import shown_items
+from mavfi_cli.claims.sources import gather
+
+RESULTS = Path(__file__).parents[3] / "docs" / "results"
+_CAMPAIGNS = ("instruction", "effects-part2", "protected-part2", "hardening-part1", "sight-part1")
+
+
+def everything():
+    """The whole document, made anew."""
+    exports = [RESULTS / f"{name}.parquet" for name in _CAMPAIGNS]
+    evidence = gather([*exports, RESULTS / "kernels.json"])
+    return document(evidence, shown_items(evidence))
