@@ -1,18 +1,25 @@
 """The documents: commands run, examples work, links lead somewhere."""
 
+import json
 import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import click
 import pytest
 from fake_autopilot import FakePX4
+from pyarrow.parquet import read_schema
 
 from mavfi_cli import cli
+from mavfi_cli.analysis.flights import CONFIG
+from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.mission.record.measures import measures_of
+from mavfi_cli.spec.mission import MissionConfig
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -68,18 +75,44 @@ def test_no_placeholder_is_left(document):
     assert "@@" not in document.read_text()
 
 
-@pytest.mark.slow
-def test_the_pages_build_without_a_warning(tmp_path):
-    """A warning is a dead link, a page that no other lists, or a name that no longer exists."""
-    line = ["-q", "-W", "--keep-going", "-b", "html", "-d", tmp_path / "cache", ROOT / "docs"]
+def told_columns(page):
+    """What a page of the reference names in code."""
+    return set(re.findall(r"`(\w+)`", (ROOT / "docs" / "reference" / page).read_text()))
+
+
+def test_the_reference_names_everything_in_a_run_folder(short_flight):
+    told = told_columns("records.md") | set(BY_NAME)
+    tables = short_flight.path.glob("*.parquet")
+    columns = {name for each in tables for name in read_schema(each).names}
+    result = json.loads((short_flight.path / "result.json").read_text())
+    assert (columns | set(result)) - told == set()
+
+
+def test_the_reference_names_every_column_of_an_export():
+    assert {*measures_of({}), *CONFIG} - told_columns("campaigns.md") == set()
+
+
+def build(builder, folder):
+    """Build the documents with warnings as errors."""
+    line = ["-q", "-W", "--keep-going", "-b", builder, "-d", folder / "cache", ROOT / "docs"]
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     done = subprocess.run(
-        [sys.executable, "-m", "sphinx", *line, tmp_path / "pages"],
+        [sys.executable, "-m", "sphinx", *line, folder / builder],
         capture_output=True, text=True, check=False, env={**os.environ, "PATH": path},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    told = (tmp_path / "pages" / "reference" / "commands.html").read_text()
+
+
+@pytest.mark.slow
+def test_the_pages_build_without_a_warning(tmp_path):
+    """A warning is a dead link, a page that no other lists, or a name that no longer exists."""
+    build("html", tmp_path)
+    told = (tmp_path / "html" / "reference" / "commands.html").read_text()
     assert "--fault-seed" in told
     assert "--allow-unsigned" in told  # of `mavfi sitl`, whose help is its own
     commands = cli.cli.list_commands(click.Context(cli.cli))
     assert [name for name in commands if f'id="mavfi-{name}"' not in told] == []
+    settings = (tmp_path / "html" / "reference" / "settings.html").read_text()
+    assert [each.name for each in fields(MissionConfig) if each.name not in settings] == []
+    build("man", tmp_path)
+    assert "--fault-seed" in (tmp_path / "man" / "mavfi.1").read_text().replace("\\", "")
