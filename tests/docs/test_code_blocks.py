@@ -140,3 +140,10 @@ def test_the_blocks_of_a_page_run(run, tmp_path):
     session = Session(tmp_path)
     for block in run:
         session.run(block)
+
+
+@pytest.mark.parametrize("text", ["$ echo one\ntwo\n", "$ false\n", "$ true\nerror: none\n"])
+def test_a_page_that_is_wrong_is_found(text, tmp_path):
+    block = Block(place="here", language="console", text=text, notes={})
+    with pytest.raises(AssertionError, match="here"):
+        Session(tmp_path).run(block)
