@@ -1,14 +1,16 @@
 """The .tlog of a flight: every frame of both directions in the format of ground stations.
 
-A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame. The
-time is EPOCH_UNIX_S plus the simulated stamp, so the same flight gives the same bytes.
+A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame. In
+simulation the time is EPOCH_UNIX_S plus the stamp, so the same flight gives the same bytes. For a
+foreign autopilot it is this computer's UTC, as in the logs of ground stations: what a simulated
+autopilot tells in SYSTEM_TIME may be any date.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
@@ -17,7 +19,7 @@ from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
 _FLUSH_BYTES = 1 << 16
-_FLUSH_INTERVAL_S = 1.0  # simulated time
+_FLUSH_INTERVAL_S = 1.0  # of the stamps
 
 
 class TlogWriter:
@@ -25,13 +27,15 @@ class TlogWriter:
 
     Args:
         path: File to create or overwrite.
+        epoch_unix_s: Unix time of stamp 0.
 
     Raises:
         RecordError: The file cannot be written, here or in any method.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, epoch_unix_s: int = EPOCH_UNIX_S) -> None:
         self._path = path
+        self._epoch_us = epoch_unix_s * 1_000_000
         self._pending = bytearray()
         self._whole = 0  # length of the whole records in the file, bytes
         self._flushed_s = 0.0
@@ -43,7 +47,7 @@ class TlogWriter:
 
     def write(self, stamp_s: float, *frames: bytes) -> None:
         """Record frames, sent or received, at a stamp."""
-        time_us = EPOCH_UNIX_S * 1_000_000 + round(stamp_s * 1e6)
+        time_us = self._epoch_us + round(stamp_s * 1e6)
         self._pending += time_us.to_bytes(8, "big").join([b"", *frames])
         overdue = abs(stamp_s - self._flushed_s) >= _FLUSH_INTERVAL_S
         if overdue or len(self._pending) >= _FLUSH_BYTES:
@@ -97,12 +101,20 @@ class RecordedLink:
         transport: Open transport. Its opener closes it.
         system, component: MAVLink ids of this end.
         signing: Signs sent frames and refuses received ones without a good signature.
+        clock: Unix time, s, to record in place of the stamps.
     """
 
     def __init__(
-        self, transport: Transport, system: int, component: int, *, signing: Signing | None = None
+        self,
+        transport: Transport,
+        system: int,
+        component: int,
+        *,
+        signing: Signing | None = None,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self._transport = transport
+        self._clock = clock
         self._codec = Codec(system, component, signing=signing)
         self._tlog: TlogWriter | None = None
         self._early: list[tuple[float, list[bytes]]] = []
@@ -114,7 +126,8 @@ class RecordedLink:
         Raises:
             RecordError: The file cannot be written, now or at any later message.
         """
-        with contextlib.closing(TlogWriter(path)) as self._tlog:
+        epoch_unix_s = EPOCH_UNIX_S if self._clock is None else 0
+        with contextlib.closing(TlogWriter(path, epoch_unix_s)) as self._tlog:
             for stamp_s, frames in self._early:
                 self._tlog.write(stamp_s, *frames)
             self._early.clear()
@@ -149,6 +162,8 @@ class RecordedLink:
             self._transport.send(b"".join(frames))
 
     def _record(self, stamp_s: float, frames: list[bytes]) -> None:
+        if self._clock is not None:
+            stamp_s = self._clock()
         if self._tlog is None:
             self._early.append((stamp_s, frames))
         else:

@@ -86,7 +86,13 @@ class Flight:
         self._platform = platform
         self._planner = planner
         self._interrupts = interrupts
-        self.link = RecordedLink(transport, SYSTEM_ID, COMPONENT_ID, signing=_signing(config))
+        self.link = RecordedLink(
+            transport,
+            SYSTEM_ID,
+            COMPONENT_ID,
+            signing=_signing(config),
+            clock=None if config.link is None else time.time,
+        )
         self._session = self._new_session()
         self.images = ImageReceiver()
         self._frames: list[ImageFrame] = []

@@ -55,3 +55,17 @@ def test_both_directions_are_recorded_and_what_came_early_comes_first(ends, tmp_
     with ends[0].recording(tmp_path / "flight.tlog"):
         exchange(ends, 1)
     assert told(tmp_path / "flight.tlog") == records(0) + records(1)
+
+
+def test_a_clock_is_recorded_in_place_of_the_stamps(tmp_path):
+    ours, theirs = socket.socketpair()
+    transport = open_transport(f"fd:{ours.detach()}")
+    clock = iter([1.7e9, 1.7e9 + 0.25, 1.7e9 + 0.5, 1.7e9 + 7.125]).__next__
+    link = RecordedLink(transport, 1, OWN, clock=clock)
+    with theirs:
+        exchange((link, theirs, Codec(1, VEHICLE)), 0)
+        with link.recording(tmp_path / "flight.tlog"):
+            exchange((link, theirs, Codec(1, VEHICLE)), 1)
+    transport.close()
+    stamps = [EPOCH_UNIX_S + stamp_s for stamp_s, *_ in told(tmp_path / "flight.tlog")]
+    assert stamps == [1.7e9, 1.7e9 + 0.25, 1.7e9 + 0.5, 1.7e9 + 7.125]

@@ -1,10 +1,16 @@
 """Missions with an autopilot at the far end of a UDP socket."""
 
+import json
 import signal
 import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import fake_autopilot
 import numpy as np
+import pymavlink
 import pytest
 from fake_autopilot import FakeArduCopter, FakePX4
 
@@ -22,10 +28,23 @@ from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.mission import flight
 from mavfi_cli.mission.record.run_folder import load_run
 
+MAVLOGDUMP = Path(pymavlink.__file__).parent / "tools" / "mavlogdump.py"
+
+
+def dumped_stamps(tlog):
+    """Unix time of every record, as mavlogdump reads them."""
+    line = [sys.executable, MAVLOGDUMP, "--format", "json", "--types", "HEARTBEAT", str(tlog)]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    found = [json.loads(text) for text in done.stdout.splitlines() if text.startswith("{")]
+    return [each["meta"]["timestamp"] for each in found]
+
 
 def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_event):
     watcher = at_event("", None)
+    begun = time.time()
     run = load_run(fly_short(watcher, link=sitl_on_udp, start=None, land=True).path)
+    dates = dumped_stamps(run.folder.tlog)
+    assert begun <= dates[0] < dates[-1] <= time.time()
     assert run.result["outcome"] == "success"
     assert run.result["referee"] is None
     assert run.result["world"] is None
