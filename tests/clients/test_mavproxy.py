@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from pages import block
 
 _MODULES = "param,arm,mode,cmdlong,misc"
 
@@ -136,3 +137,42 @@ def test_mavproxy_hears_why_offboard_cannot_arm(sitl, connect, free_tcp_port):
     proxy.expect(r"Arming denied: Resolve system health failures first")
     _, log = server.stop()
     assert not log["armed"].any()
+
+
+@pytest.mark.slow
+def test_the_lines_of_the_page_do_what_it_says(sitl, connect, free_tcp_port):
+    """Each is typed when the one before has taken effect."""
+    port = free_tcp_port()
+    link = ("--link", f"tcpin:127.0.0.1:{port}", "--camera-heartbeat", "0")
+    server = sitl("--world", "farm", "--speed", "5", *link)
+    proxy = connect(port)
+    proxy.expect(r"Received \d+ parameters")
+    answers = [
+        r"MPC_XY_CRUISE\s+5\.0\s+MPC_XY_VEL_MAX\s+12\.0", r"", r"Loaded module wp",
+        r"Available modes: .*POSCTL.*OFFBOARD", r"POSCTL> ", r"ATTITUDE \{time_boot_ms : \d+",
+        r"LOITER> ", r"ARMED", r"TAKEOFF> (?s:.*)LOITER> ", r"Disarmed by landing",
+    ]  # fmt: skip
+    for line, answer in zip(block("mavproxy", "text").splitlines(), answers, strict=True):
+        proxy.command(line)
+        proxy.expect(answer)
+    _, log = server.stop()
+    assert log["position_enu_m"][:, 2].max() == pytest.approx(3.6, abs=0.3)
+
+
+@pytest.mark.slow
+def test_mavproxy_loads_its_modules_and_fetches_parameters_again(sitl, connect, free_tcp_port):
+    port = free_tcp_port()
+    server = sitl("--world", "farm", "--speed", "5", "--link", f"tcpin:127.0.0.1:{port}")
+    proxy = connect(port)
+    proxy.expect(r"Received \d+ parameters")
+    for module in ("graph", "link", "terrain"):
+        proxy.command(f"module load {module}")
+        proxy.expect(rf"(Loaded module|module already loaded:?) {module}|{module}")
+    proxy.command("module list")
+    proxy.expect(r"graph: ")
+    proxy.command("param set MPC_XY_VEL_MAX 4")
+    assert any(shown(proxy, "MPC_XY_VEL_MAX") == 4.0 for _ in range(50))
+    proxy.command("param fetch")
+    proxy.expect(r"Received \d+ parameters")
+    assert shown(proxy, "MPC_XY_VEL_MAX") == 4.0
+    server.stop()

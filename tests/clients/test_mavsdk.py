@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from pages import block
 
 SCRIPT = Path(__file__).with_name("mavsdk_flight.py")
 
@@ -43,3 +44,22 @@ def test_mavsdk_arms_takes_off_flies_offboard_and_lands(sitl, free_udp_port, fre
     assert log["armed"].any()
     assert not log["armed"][-1]
     assert log["on_ground"][-1]
+
+
+@pytest.mark.slow
+def test_the_script_of_the_page_flies_and_lands(sitl, free_udp_port, free_tcp_port, tmp_path):
+    """As it is printed, but for the port on which MAVSDK's own server listens."""
+    port = free_udp_port()
+    server = sitl("--world", "farm", "--speed", "5", "--link", f"udpout:127.0.0.1:{port}")
+    script = block("mavsdk", "python")
+    assert script.count("System()") == 1
+    path = tmp_path / "fly.py"
+    path.write_text(script.replace("System()", f"System(port={free_tcp_port()})"))
+    done = subprocess.run(
+        [sys.executable, str(path), f"udpin://127.0.0.1:{port}"],
+        capture_output=True, text=True, timeout=180, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, block("mavsdk", "text")), done.stderr
+    report, log = server.stop()
+    assert report["collision"] is None
+    assert not log["armed"][-1]
