@@ -19,6 +19,7 @@ FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}
 """Real autopilots, and the environment variables that name their SITL binaries."""
 
 OWN_AUTOPILOT = "ours"
+_REPEATING = (OWN_AUTOPILOT, "ardupilot")  # autopilots whose flights repeat exactly
 _LOSS_LIMIT_S = 5.0
 Vector3 = tuple[float, float, float]
 LIMITS = {  # minimum and maximum of each number
@@ -170,10 +171,12 @@ class MissionConfig:
             return
         if self.link is not None:
             raise ConfigError("flies our vehicle, without --link", key="autopilot")
-        if self.instruction is not None:
+        repeats = self.autopilot in _REPEATING and not self.realtime
+        if self.instruction is not None and not repeats:
+            paced = " with --realtime" if self.realtime else ""
             raise ConfigError(
-                f"flights of {self.autopilot} do not repeat exactly, and --level instruction "
-                "needs that",
+                f"flights of {self.autopilot}{paced} do not repeat exactly, and --level "
+                "instruction needs that",
                 key="autopilot",
             )
 

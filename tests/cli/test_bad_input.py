@@ -232,3 +232,35 @@ def test_an_option_that_would_do_nothing_is_refused(command_line, arguments, sai
     code, out, err = command_line("fly", *arguments)
     assert (code, out) == (2, "")
     assert said in err
+
+
+@pytest.fixture
+def no_firmware(tmp_path, monkeypatch):
+    """Paths that are no firmware, by what they are."""
+    monkeypatch.delenv("PX4_SITL", raising=False)
+    files = {kind: tmp_path / kind for kind in ("folder", "text", "program")}
+    files["folder"].mkdir()
+    files["text"].write_text("no program")
+    files["program"].symlink_to("/bin/true")
+    return files | {"nothing": tmp_path / "nothing"}
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "kind", "said"),
+    [
+        ("px4", "nothing", "no firmware at {path}"),
+        ("px4", "folder", "no firmware at {path}"),
+        ("px4", "text", "no permission to execute {path}"),
+        ("px4", "program", "{path} is no PX4: it has no startup files in"),
+        ("ardupilot", "program", "true ended with code 0"),
+    ],
+)
+def test_a_path_that_is_no_firmware(refused, no_firmware, autopilot, kind, said):
+    path = no_firmware[kind]
+    line = refused(*SHORT_LINE[1:], "--quiet", "--autopilot", autopilot, "--firmware", path)
+    assert said.format(path=path) in line
+
+
+def test_a_real_autopilot_without_a_binary(refused, no_firmware):
+    line = refused(*SHORT_LINE[1:], "--quiet", "--autopilot", "px4")
+    assert line.startswith("firmware: px4 needs its SITL binary: --firmware PATH, or PX4_SITL")

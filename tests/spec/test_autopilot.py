@@ -7,6 +7,8 @@ from mavfi_cli.mission.vehicle import with_firmware
 from mavfi_cli.spec.instruction import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
+PLANNER = InstructionConfig(target="planner")
+
 
 def test_a_flight_of_our_own_has_the_record_that_it_had():
     assert not {"autopilot", "firmware"} & set(MissionConfig().to_dict())
@@ -24,12 +26,20 @@ def test_an_unknown_autopilot_is_refused():
 
 @pytest.mark.parametrize(
     "other",
-    [{"link": "udpin:127.0.0.1:14540"}, {"instruction": InstructionConfig(target="planner")}],
-    ids=["link", "instruction"],
+    [
+        {"autopilot": "px4", "link": "udpin:127.0.0.1:14540"},
+        {"autopilot": "px4", "instruction": PLANNER},
+        {"autopilot": "ardupilot", "instruction": PLANNER, "realtime": True},
+    ],
+    ids=["link", "instruction", "wall clock"],
 )
 def test_what_a_real_autopilot_cannot_do_is_refused(other):
     with pytest.raises(ConfigError, match="autopilot"):
-        MissionConfig(autopilot="px4", **other)
+        MissionConfig(**other)
+
+
+def test_an_autopilot_whose_flights_repeat_takes_instruction_level_faults():
+    assert MissionConfig(autopilot="ardupilot", instruction=PLANNER).instruction is PLANNER
 
 
 def test_the_binary_is_the_missions_or_the_environments(monkeypatch):

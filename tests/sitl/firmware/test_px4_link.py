@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import time
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import VehicleProcessError
-from mavfi_cli.link.codec import Codec, Message
+from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport
 from sitl.firmware.px4 import ANSWER_LIMIT_S, Px4Link
 from sitl.firmware.sensors import FIELD_NED_GAUSS, Sensors
@@ -44,6 +45,14 @@ def test_motor_outputs_are_those_of_the_armed_frames(wire: Wire, resting: Truth)
     assert outputs[11_816_000] == pytest.approx([0.297, 0.3, 0.3, 0.295], abs=0.005)
     assert outputs[15_000_000] == pytest.approx([0.619, 0.62, 0.62, 0.619], abs=0.002)
     assert link.unanswered == 0
+
+
+def test_motor_outputs_that_are_no_numbers_turn_nothing(wire: Wire, resting: Truth) -> None:
+    link, theirs = _link(wire)
+    outputs = [math.nan, math.inf, -math.inf, 0.5, *[math.nan] * 12]
+    frame = dialect.MAVLink_hil_actuator_controls_message(4000, outputs, 0x80, 0)
+    theirs.sendall(Codec(1, 1).encode(frame))
+    assert link.exchange(4000, resting).tolist() == [0.0, 1.0, 0.0, 0.5]
 
 
 def test_sensors_have_the_rates_and_fields_that_px4_expects(wire: Wire, resting: Truth) -> None:
