@@ -44,6 +44,8 @@ def fly_short(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
 
     def fly(watcher=None, *, launch=start_vehicle, **changes):
+        if "link" in changes and not changes.get("eyes"):  # a flight without a world
+            changes = {"world": MissionConfig().world, "start": None, **changes}
         return fly_mission(replace(SHORT, **changes), out, watcher or Watcher(), launch=launch)
 
     return fly

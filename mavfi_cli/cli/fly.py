@@ -97,6 +97,12 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_mission("--realtime", is_flag=True, help="Pace the simulated vehicle by the wall clock.")
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
+@_mission("--eyes", is_flag=True,
+          help="Start depth camera and referee of --world beside the autopilot on --link. It "
+               "takes --vehicle for the vehicle's body.")  # fmt: skip
+@_mission("--origin", type=_Place(),
+          help="Local origin of the autopilot in the world, ENU, m  [the world's start; with mavfi "
+               "sitl, the world's origin].")  # fmt: skip
 @_mission("--autopilot", default="ours", show_default=True, metavar="ours|px4|ardupilot",
           help="Autopilot of the simulated vehicle. A real one is started and ended with the "
                "mission.")  # fmt: skip
@@ -241,18 +247,19 @@ def _mission_of(path: Path | None) -> MissionConfig:
 def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     """The mission with the given options in place."""
     from mavfi_cli.spec.detector import detector_of
-    from mavfi_cli.spec.mission import OWN_AUTOPILOT, stack_of
+    from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT, stack_of
     from mavfi_cli.spec.platform import measured_factor
 
     fault, instruction = _faults(base, given)
     link = given.get("link", base.link)
     land = given.pop("land", base.land or (link is not None and base.link is None))
     platform = given.get("platform", base.platform)
-    if link is not None and given.get("goal", base.goal) is None:
-        raise click.UsageError("--link needs --goal X,Y,Z (ENU, m, from its local origin)")
+    if link is not None and not given.get("eyes", base.eyes):
+        refuse_given(OF_THE_WORLD, "has no meaning with --link unless --eyes is given")
     if given.get("autopilot", base.autopilot) == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
-    if measured_factor(platform) is not None and not given.get("realtime", base.realtime):
+    paced = link is not None or given.get("realtime", base.realtime)
+    if measured_factor(platform) is not None and not paced:
         raise click.UsageError(f"--platform {platform} needs --realtime")
     own = {field.name for field in fields(base)} - {"fault", "instruction", "detector"}
     mission = replace(

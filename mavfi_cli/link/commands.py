@@ -47,7 +47,7 @@ class _CommandState(Enum):
 
 
 @dataclass(slots=True, kw_only=True)
-class _Ticket:
+class Ticket:
     """A submitted command."""
 
     command: int
@@ -76,7 +76,7 @@ class CommandChannel:
 
     def __init__(self, system: int, component: int) -> None:
         self._own = (system, component)
-        self._lanes: dict[tuple[int, int], deque[_Ticket]] = {}
+        self._lanes: dict[tuple[int, int], deque[Ticket]] = {}
         self._now_s = 0.0
 
     def submit(
@@ -86,7 +86,7 @@ class CommandChannel:
         component: int = dialect.MAV_COMP_ID_AUTOPILOT1,
         unused: float = 0.0,
         refusals: int = 0,
-    ) -> _Ticket:
+    ) -> Ticket:
         """Queue a COMMAND_LONG.
 
         Args:
@@ -97,7 +97,7 @@ class CommandChannel:
             refusals: Number of temporary refusals after which the command is repeated, 1 s later.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
-        ticket = _Ticket(
+        ticket = Ticket(
             command=command, component=component, parameters=padded, refusals_left=refusals
         )
         lane = self._lanes.setdefault((component, command), deque())
@@ -142,7 +142,7 @@ class CommandChannel:
                 self._close(lane, _CommandState.UNANSWERED)
         return due
 
-    def _send(self, ticket: _Ticket, system: int) -> Message:
+    def _send(self, ticket: Ticket, system: int) -> Message:
         confirmation = min(ticket.sent, 255)
         ticket.sent += 1
         ticket.sent_since_answer += 1
@@ -152,7 +152,7 @@ class CommandChannel:
         )
 
     @staticmethod
-    def _close(lane: deque[_Ticket], verdict: _CommandState) -> None:
+    def _close(lane: deque[Ticket], verdict: _CommandState) -> None:
         lane.popleft().verdict = verdict
 
 
@@ -171,12 +171,12 @@ class Requests:
         self._commands = commands
         self._telemetry = telemetry
         self.now_s = 0.0
-        self._asked: dict[int, tuple[_Ticket, float]] = {}  # message id -> request, next one's time
+        self._asked: dict[int, tuple[Ticket, float]] = {}  # message id -> request, next one's time
         self.begin()
 
     def begin(self) -> None:
         """Begin a phase and forget the requests of the last one."""
-        self._ticket: _Ticket | None = None  # the command that the phase depends on
+        self._ticket: Ticket | None = None  # the command that the phase depends on
         self._decided_s: float | None = None
         self._mode_since_s, self._mode_tries = -math.inf, 0
         self._texts_before = self._telemetry.texts.total

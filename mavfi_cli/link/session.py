@@ -11,11 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+
 from mavfi_cli.core.errors import LinkError, NoAutopilot, NoCamera, UnfitAutopilot
 from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.commands import CommandChannel, Requests
+from mavfi_cli.link.commands import CommandChannel, Requests, Ticket
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.texts import text_messages
 
@@ -100,7 +102,7 @@ class SessionSettings:
     component: int = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
     takeoff_height_m: float = 2.5  # above the ground at take-off
     request_streams: bool = True  # request message streams; lockstep sends them anyway
-    needs_camera: bool = False  # refuse the take-off until a camera has answered
+    needs_camera: bool = False  # wait for a camera, and for the origin that it may know
     state_rate_hz: float = 50.0
     connect_timeout_s: float = 10.0
     camera_timeout_s: float = 5.0
@@ -140,7 +142,8 @@ class OffboardSession:
         self.failure: LinkError | None = None
         self.failsafe_text: str | None = None
         self._commands = CommandChannel(self._settings.system, self._settings.component)
-        self._camera_heard = False
+        self._camera_heard = self._greeted = False
+        self._origin_asked: Ticket | None = None
         self._requests = Requests(self._commands, self.telemetry)
         self.hold()
         self._replies = _Replies()
@@ -233,8 +236,23 @@ class OffboardSession:
                 self._ask_camera()
 
     def _ask_camera(self) -> None:
-        information = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
-        self._commands.submit(dialect.MAV_CMD_REQUEST_MESSAGE, information, component=_CAMERA)
+        """Ask for the origin, or else, where positions are the world's, for information."""
+        wanted = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
+        if self._settings.needs_camera:
+            wanted = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
+        request = dialect.MAV_CMD_REQUEST_MESSAGE
+        self._origin_asked = self._commands.submit(request, wanted, component=_CAMERA)
+
+    def _told_origin(self, message: Message) -> None:
+        if message.get_srcComponent() == _CAMERA and self._is_of_vehicle(message):
+            origin = np.array([message.y, message.x, -message.z], dtype=np.float64)
+            if np.isfinite(origin).all():
+                self.telemetry.move_origin(origin)
+
+    def _camera_text(self, message: Message) -> None:
+        """Take a text of the camera, which has the referee of a foreign autopilot."""
+        if message.get_srcComponent() == _CAMERA and self._is_of_vehicle(message):
+            self.telemetry.take_text(message)
 
     def _is_of_vehicle(self, message: Message) -> bool:
         """Return True if a message comes from a component of the autopilot's system."""
@@ -297,34 +315,42 @@ class OffboardSession:
 
     def _connecting(self) -> None:
         self._require_fit()
-        if self.telemetry.heard:
+        if not self.telemetry.heard:
+            if self._elapsed_s() >= self._settings.connect_timeout_s:
+                raise NoAutopilot(self._url, self._settings.connect_timeout_s)
+            return
+        if not self._greeted:
+            self._greeted, self._phase_since_s = True, self._now_s
             if self._settings.request_streams:
                 self._requests.streams(self._settings.state_rate_hz)
             if self._settings.needs_camera:
                 self._ask_camera()
+        if self._knows_place():
             self._enter(Phase.WAITING_READY)
-        elif self._elapsed_s() >= self._settings.connect_timeout_s:
-            raise NoAutopilot(self._url, self._settings.connect_timeout_s)
 
     def _require_fit(self) -> None:
         """Refuse what cannot be flown, until the vehicle has taken off."""
         if self.telemetry.unfit:
             raise UnfitAutopilot(self._url, self.telemetry.unfit)
 
-    def _has_camera(self) -> bool:
-        """Return False while a needed camera has not answered, until the time is over."""
-        if self._camera_heard or not self._settings.needs_camera:
+    def _knows_place(self) -> bool:
+        """Return True once a needed camera has told the origin, if it knows one, and a state came.
+
+        Raises:
+            NoCamera: No camera has answered for some seconds.
+            CommandRefused: No state has arrived within the time to get ready.
+        """
+        settings, asked = self._settings, self._origin_asked
+        if not settings.needs_camera or asked is None:
             return True
-        timeout_s = self._settings.camera_timeout_s
-        if self._elapsed_s() >= timeout_s:
-            raise NoCamera(self._url, timeout_s)
-        return False
+        if not self._camera_heard and self._elapsed_s() >= settings.camera_timeout_s:
+            raise NoCamera(self._url, settings.camera_timeout_s)
+        self._require_soon()
+        return self._camera_heard and not asked.pending and self.telemetry.state is not None
 
     def _waiting_ready(self) -> None:
         telemetry, requests = self.telemetry, self._requests
         self._require_fit()
-        if not self._has_camera():
-            return
         if telemetry.armed and telemetry.in_air and telemetry.state is not None:
             self._was_up = True
             self._enter(Phase.TAKING_OFF)
@@ -339,9 +365,12 @@ class OffboardSession:
             self._ground_m = float(telemetry.state.position_enu_m[2])
             self._enter(Phase.ARMING)
             return
+        self._require_soon()
+
+    def _require_soon(self) -> None:
         timeout_s = self._settings.ready_timeout_s
         if self._elapsed_s() >= timeout_s:
-            requests.refuse("arming", f"{self._missing()} within {timeout_s:g} s")
+            self._requests.refuse("arming", f"{self._missing()} within {timeout_s:g} s")
 
     def _missing(self) -> str:
         if self.telemetry.state is None:
@@ -439,4 +468,6 @@ _HANDLERS: dict[type, Callable[[OffboardSession, Message], None]] = {
     dialect.MAVLink_heartbeat_message: OffboardSession._heartbeat,
     dialect.MAVLink_timesync_message: OffboardSession._timesync,
     dialect.MAVLink_ping_message: OffboardSession._ping,
+    dialect.MAVLink_local_position_ned_system_global_offset_message: OffboardSession._told_origin,
+    dialect.MAVLink_statustext_message: OffboardSession._camera_text,
 }

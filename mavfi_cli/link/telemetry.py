@@ -188,6 +188,7 @@ class Telemetry:
         system: System id of the autopilot; 0 before its first message.
         unfit: Why an autopilot on the link cannot be flown; "" without a reason.
         state: Position, velocity and attitude in ENU; None before both are known.
+        origin_enu_m: Origin of the autopilot's positions in the world (3,); None for the world's.
         armed: Armed flag in HEARTBEAT.
         mode: Name of the flight mode; "" before the first HEARTBEAT.
         landed_state: Landed state in EXTENDED_SYS_STATE, a known MAV_LANDED_STATE.
@@ -205,6 +206,7 @@ class Telemetry:
         self.unfit = ""
         self.autopilot: _AutopilotProfile = PX4
         self.state: VehicleState | None = None
+        self.origin_enu_m: FloatArray | None = None
         self.armed = False
         self.mode = ""
         self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED
@@ -261,9 +263,12 @@ class Telemetry:
         velocity = (message.vy, message.vx, -message.vz)
         if self._quaternion is None or not math.isfinite(sum(position) + sum(velocity)):
             return
+        place = np.array(position, dtype=np.float64)
+        if self.origin_enu_m is not None:
+            place += self.origin_enu_m
         state = VehicleState(
             stamp_s=message.time_boot_ms / 1e3,
-            position_enu_m=np.array(position, dtype=np.float64),
+            position_enu_m=place,
             velocity_enu_mps=np.array(velocity, dtype=np.float64),
             quaternion=self._quaternion,
             yaw_rad=yaw_from_quaternion(self._quaternion.tolist()),
@@ -303,7 +308,16 @@ class Telemetry:
         if self.home_amsl_m is None:
             self.home_amsl_m = (message.alt - message.relative_alt) / 1e3
 
-    def _status_text(self, message: Message) -> None:
+    def move_origin(self, origin_enu_m: FloatArray) -> None:
+        """Set the origin of the positions (3,). States with another one are forgotten."""
+        before = np.zeros(3) if self.origin_enu_m is None else self.origin_enu_m
+        if np.array_equal(origin_enu_m, before):
+            return
+        self.origin_enu_m = origin_enu_m
+        self.state, self.history = None, _StateHistory()
+
+    def take_text(self, message: Message) -> None:
+        """Handle a STATUSTEXT of the autopilot, or of a component that speaks for it."""
         before = self.texts.total
         self.texts.add(message, self.now_s)
         self._look_for_collision(before)
@@ -335,5 +349,5 @@ _HANDLERS: dict[type, Callable[[Telemetry, Message], None]] = {
     dialect.MAVLink_extended_sys_state_message: Telemetry._extended_sys_state,
     dialect.MAVLink_home_position_message: Telemetry._home,
     dialect.MAVLink_global_position_int_message: Telemetry._global_position,
-    dialect.MAVLink_statustext_message: Telemetry._status_text,
+    dialect.MAVLink_statustext_message: Telemetry.take_text,
 }

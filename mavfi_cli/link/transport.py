@@ -13,11 +13,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Protocol
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.link.codec import begins_with_frame
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, parse_endpoint
 
 MAX_PEERS = 16  # of one listener
 MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
 _JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost
+_PEER_SILENCE_S = 5.0  # time after which another sender may take a silent peer's place
 _PUMPED = 1000  # datagrams that one pass reads
 _CONNECT_TIMEOUT_S = 5.0
 _SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
@@ -25,7 +27,6 @@ _MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 _CHUNK = 1 << 16
 _SMALL_CHUNK = 2048  # bytes that a client of a listener hands over at once, a datagram at most
 _BACKLOG = 1 << 16  # bytes that wait for a slow client of a listener
-_MARKERS = (0xFD, 0xFE)
 
 
 class Transport(Protocol):
@@ -69,7 +70,13 @@ class Listener(Protocol):
         """Stop listening. This closes UDP peers, too, because they share the socket."""
 
 
-def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = False) -> Transport:
+def open_transport(
+    url: str,
+    *,
+    signed: bool = False,
+    allow_unsigned: bool = False,
+    admits: Callable[[bytes], bool] = begins_with_frame,
+) -> Transport:
     """Open one end of a link.
 
     Args:
@@ -77,6 +84,7 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
             `serial:device[:baud]` or `fd:number`; without a host it listens on loopback.
         signed: The caller signs this link, so it may reach beyond this machine.
         allow_unsigned: Allow an unsigned link to reach beyond this machine.
+        admits: Tells from a datagram of an unknown sender whether `udpin` takes it for its peer.
 
     Raises:
         EndpointError: The URL is malformed, its scheme is unknown, its port is in use, nobody
@@ -89,15 +97,10 @@ def open_transport(url: str, *, signed: bool = False, allow_unsigned: bool = Fal
         return _StreamTransport(_inherited(endpoint), url)
     opened = _open_socket(endpoint, beyond=signed or allow_unsigned)
     if opened.type == socket.SOCK_DGRAM:
-        return _UdpTransport(opened, url, follows=endpoint.scheme == "udpin")
+        return _UdpTransport(opened, url, admits if endpoint.scheme == "udpin" else None)
     if endpoint.scheme == "tcp":
         return _StreamTransport(opened, url)
     return _FirstClient(_TcpListener(opened, url))
-
-
-def looks_like_mavlink(data: bytes) -> bool:
-    """Return True if data begins with the marker of a frame."""
-    return bool(data) and data[0] in _MARKERS
 
 
 def open_listener(
@@ -105,7 +108,7 @@ def open_listener(
     *,
     signed: bool = False,
     allow_unsigned: bool = False,
-    admits: Callable[[bytes], bool] = looks_like_mavlink,
+    admits: Callable[[bytes], bool] = begins_with_frame,
 ) -> Listener:
     """Open an endpoint that serves several peers.
 
@@ -117,6 +120,8 @@ def open_listener(
         EndpointError: As in `open_transport`.
     """
     endpoint = parse_endpoint(url)
+    if endpoint.scheme == "fd":
+        return _OnePeer(_StreamTransport(_inherited(endpoint), url, patient=False))
     if endpoint.scheme not in LISTENING:
         return _OnePeer(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
     opened = _open_socket(endpoint, beyond=signed or allow_unsigned)
@@ -432,26 +437,43 @@ def _serial_reason(error: Exception, device: str) -> str:
 class _UdpTransport(_SocketOwner, _Receiver):
     """A UDP socket with one peer.
 
-    A connected socket receives from that peer only. One that `follows` sends to the last sender of
-    MAVLink. Before the first one, everything it sends is lost.
+    A connected socket receives from that peer only. Any other takes the first admitted sender, and
+    another one in its place after some silence. Before the first one, everything it sends is lost.
+
+    Args:
+        admits: Tells from its datagram whether a sender becomes the peer; None: it is connected.
     """
 
     datagram = True
 
-    def __init__(self, opened: socket.socket, url: str, *, follows: bool) -> None:
+    def __init__(
+        self, opened: socket.socket, url: str, admits: Callable[[bytes], bool] | None
+    ) -> None:
         super().__init__(opened, url)
-        self._follows = follows
+        self._admits = admits
         self._peer: Any = None
+        self._silent_from_s = 0.0  # then the peer has been silent for too long
 
     def send(self, data: bytes) -> None:
-        if self._peer is not None or not self._follows:
+        if self._peer is not None or self._admits is None:
             _send_datagrams(self._socket, data, self._peer)
 
     def _pull(self) -> bytes:
-        data, sender = _receive_datagram(self._socket, _CHUNK)
-        if self._follows and looks_like_mavlink(data):
+        for _ in range(_PUMPED):
+            data, sender = _receive_datagram(self._socket, _CHUNK)
+            if sender is None or self._admits is None or self._is_peer(data, sender):
+                return data
+        return b""
+
+    def _is_peer(self, data: bytes, sender: Any) -> bool:
+        now_s = time.monotonic()
+        if sender != self._peer:
+            assert self._admits is not None
+            if now_s < self._silent_from_s or not self._admits(data):
+                return False
             self._peer = sender
-        return data
+        self._silent_from_s = now_s + _PEER_SILENCE_S
+        return True
 
 
 def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:

@@ -18,6 +18,7 @@ from mavfi_cli.spec.mission import MissionConfig
 FILE = "briefing.json"
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home
 FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
+MOUNT_FLU_M = (0.1, 0.0, 0.0)  # of the stand-alone camera, unless it is told another one
 MARGIN_M = 30.0  # flight bounds round home and goal without a known world
 
 
@@ -39,21 +40,15 @@ def of_simulation(folder: Path) -> Briefing:
         raise VehicleProcessError(f"the vehicle process left no briefing ({error})") from None
 
 
-def of_config(config: MissionConfig) -> Briefing:
-    """Build the briefing for a foreign autopilot. The configuration must give the goal.
-
-    Raises:
-        ConfigError: The configuration has no goal.
-    """
-    if config.goal is None:
-        raise ConfigError("a foreign autopilot needs --goal X,Y,Z (ENU, m, from its local origin)")
+def of_config(config: MissionConfig, start_enu_m: FloatArray) -> Briefing:
+    """Build the briefing for a foreign autopilot without a known world, from its place (3,)."""
     goal = np.array(config.goal)
-    low, high = np.minimum(goal, 0.0) - MARGIN_M, np.maximum(goal, 0.0) + MARGIN_M
+    low, high = np.minimum(goal, start_enu_m) - MARGIN_M, np.maximum(goal, start_enu_m) + MARGIN_M
     return Briefing(
-        start_enu_m=np.zeros(3),
+        start_enu_m=start_enu_m,
         goal_enu_m=goal,
         bounds_enu_m=_flight_bounds([*low, *high]),
-        camera_offset_flu_m=np.zeros(3),
+        camera_offset_flu_m=np.array(MOUNT_FLU_M),
     )
 
 

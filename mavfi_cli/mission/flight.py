@@ -24,7 +24,7 @@ from mavfi_cli.companion.protection import NoProtection, Protection
 from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.link.codec import Message, Signing, dialect, key_from_file
+from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
@@ -36,6 +36,7 @@ from mavfi_cli.mission.foreign_clock import ForeignClock
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.tables import Trace
+from mavfi_cli.mission.vehicle import signing_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import Stack
@@ -47,17 +48,6 @@ _POSITION = dialect.MAVLink_local_position_ned_message
 _PACKET = dialect.MAVLink_encapsulated_data_message
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
-
-
-def _signing(config: MissionConfig) -> Signing | None:
-    """Return the signing of a mission's link.
-
-    Raises:
-        ConfigError: The key file cannot be read.
-    """
-    if config.key_file is None:
-        return None
-    return Signing(key_from_file(Path(config.key_file)), clock=time.time)
 
 
 def _start(
@@ -90,7 +80,7 @@ class Flight:
             transport,
             SYSTEM_ID,
             COMPONENT_ID,
-            signing=_signing(config),
+            signing=signing_of(config),
             clock=None if config.link is None else time.time,
         )
         self._session = self._new_session()
@@ -106,7 +96,7 @@ class Flight:
         self.logger = FlightLogger(watcher)
         self.trace = Trace()
         self.wall = WallClock()
-        self.stamp_s = 0.0
+        self.stamp_s = self.begun_s = 0.0  # of now, and of the first state
         self.takeover_s = float("inf")
         self.end_s = 0.0
         self.outcome: Outcome | None = None
@@ -121,6 +111,12 @@ class Flight:
         )
         url = self._config.link or "the simulated vehicle"
         return OffboardSession(settings, url=url, telemetry=telemetry)
+
+    @property
+    def place_enu_m(self) -> FloatArray:
+        """Where the vehicle stands (3,). Call it after `connect` only."""
+        assert self._session.state is not None
+        return self._session.state.position_enu_m
 
     # Before and after -----------------------------------------------------------------------------
 
@@ -313,6 +309,7 @@ class Flight:
 
     def _take_clock(self, stamp_s: float) -> None:
         """Adopt the foreign vehicle's clock at its first state and restart the session."""
+        self.begun_s = stamp_s
         telemetry = self._session.telemetry
         telemetry.now_s = stamp_s
         self._session = self._new_session(telemetry)
@@ -396,9 +393,8 @@ class Flight:
         if self._interrupts:
             self.end(Outcome.INTERRUPTED)
         elif session.telemetry.collision_text is not None:
-            self.end(
-                Outcome.COLLISION, session.telemetry.collision_text.removeprefix("Collision: ")
-            )
+            what = session.telemetry.collision_text.removeprefix("Collision: ")
+            self.end(Outcome.COLLISION, what, lands=self._config.link is not None)
         elif session.failsafe_text is not None:
             self.end(Outcome.FAILSAFE, session.failsafe_text)
         elif self._blind_s >= self._config.loss_limit_s:

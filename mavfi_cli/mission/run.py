@@ -126,11 +126,13 @@ def _begin(
         MavfiError: why it cannot fly; the vehicle's own reason where it has one.
     """
     try:
-        if vehicle is None:  # before connecting: then the vehicle's clock runs
-            flight.brief(briefing.of_config(config))
         flight.connect()
-        if vehicle is not None:
-            flight.brief(briefing.of_simulation(vehicle.folder))
+        if vehicle is None:
+            flight.brief(briefing.of_config(config, flight.place_enu_m))
+        else:
+            told = briefing.of_simulation(vehicle.folder)
+            foreign = config.link is not None
+            flight.brief(replace(told, start_enu_m=flight.place_enu_m) if foreign else told)
         if recorder is not None:
             flight.record(recorder)
     except MavfiError:
@@ -265,7 +267,7 @@ def _write(
         "reason": flight.reason,
         "config": replace(config, goal_tolerance_m=flight.goal_tolerance_m).to_dict(),
         "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
-        "simulated_s": flight.end_s,
+        "simulated_s": flight.end_s - flight.begun_s,
         "quality_of_flight": qof,
         **_statistics(companion, flight.images),
         "measured_platform": companion.latency.summary() if companion else None,

@@ -9,20 +9,25 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import shutil
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, VehicleProcessError
 from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.spec.mission import FIRMWARE, OWN_AUTOPILOT, MissionConfig
+
+START_LIMIT_S = 120.0  # of a camera; its first start compiles
 
 
 class VehicleInProcess:
@@ -72,20 +77,17 @@ class VehicleProcess:
         VehicleProcessError: it cannot be started.
     """
 
+    _name = "vehicle"
+
     def __init__(self, config: MissionConfig, folder: Path) -> None:
         self.folder = folder
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        line = [sys.executable, "-m", "sitl", *_arguments(config), "--truth", str(folder)]
-        line += ["--fd", str(theirs.fileno())]
-        if config.autopilot == OWN_AUTOPILOT:  # real firmware is paced by the wall clock alone
-            line.append("--lockstep")
-        if config.realtime:
-            line += ["--speed", "1"]
+        line = [sys.executable, "-m", *self._line(config, theirs.fileno())]
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    line,
+                    [*line, "--truth", str(folder)],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=self._errors,
@@ -95,8 +97,16 @@ class VehicleProcess:
             except OSError as error:
                 ours.close()
                 self._errors.close()
-                raise VehicleProcessError(f"cannot start the vehicle: {error}") from None
+                raise VehicleProcessError(f"cannot start the {self._name}: {error}") from None
         self.link: Transport = open_transport(f"fd:{ours.detach()}")
+
+    @staticmethod
+    def _line(config: MissionConfig, descriptor: int) -> list[str]:
+        """Return module and arguments of the process, which speaks on the descriptor."""
+        line = ["sitl", *_arguments(config), "--fd", str(descriptor)]
+        if config.autopilot == OWN_AUTOPILOT:  # real firmware is paced by the wall clock alone
+            line.append("--lockstep")
+        return [*line, "--speed", "1"] if config.realtime else line
 
     def end(self, timeout_s: float = 20.0) -> VehicleProcessError | None:
         """See `VehicleInProcess`; a vehicle that does not end is killed."""
@@ -122,20 +132,43 @@ class VehicleProcess:
         killed = code < 0
         how = f"was killed by {signal.Signals(-code).name}" if killed else f"ended with code {code}"
         last = f": {lines[-1]}" if lines else ""
-        return VehicleProcessError(f"the vehicle process {how}{last}")
+        return VehicleProcessError(f"the {self._name} process {how}{last}")
+
+
+class EyesProcess(VehicleProcess):
+    """`python -m sitl.camera`: camera and referee of a foreign autopilot, and the link to it."""
+
+    _name = "camera"
+
+    def __init__(self, config: MissionConfig, folder: Path) -> None:
+        super().__init__(config, folder)
+        select.select([self.link.fileno()], [], [], START_LIMIT_S)  # its first word, or its end
+
+    @staticmethod
+    def _line(config: MissionConfig, descriptor: int) -> list[str]:
+        assert config.link is not None
+        line = ["sitl.camera", *_of_the_world(config, "--size", "--rate")]
+        line += ["--link", config.link, "--link", f"fd:{descriptor}", *_place("origin", config)]
+        return line if config.key_file is None else [*line, "--key-file", config.key_file]
 
 
 def _arguments(config: MissionConfig) -> list[str]:
     """Return the arguments of `python -m sitl`, but for the link and the folder of the truth."""
-    line = [
+    return _of_the_world(config, "--camera-size", "--camera-rate") + _firmware_arguments(config)
+
+
+def _of_the_world(config: MissionConfig, size: str, rate: str) -> list[str]:
+    """Return the options of world, vehicle and camera; those of the camera have other names."""
+    return [
         "--world", config.world, "--seed", str(config.seed_of_world), "--vehicle", config.vehicle,
-        "--camera-size", f"{config.camera_columns}x{config.camera_rows}",
-        "--camera-rate", f"{config.camera_rate_hz:g}",
+        size, f"{config.camera_columns}x{config.camera_rows}", rate, f"{config.camera_rate_hz:g}",
+        *_place("start", config), *_place("goal", config),
     ]  # fmt: skip
-    for name, place in (("--start", config.start), ("--goal", config.goal)):
-        if place is not None:
-            line.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")
-    return line + _firmware_arguments(config)
+
+
+def _place(name: str, config: MissionConfig) -> list[str]:
+    place = getattr(config, name)
+    return [] if place is None else [f"--{name}={','.join(f'{value:.9g}' for value in place)}"]
 
 
 def _firmware_arguments(config: MissionConfig) -> list[str]:
@@ -179,6 +212,23 @@ def start_vehicle(config: MissionConfig, folder: Path) -> Vehicle:
     return start(config, folder)
 
 
+def signing_of(config: MissionConfig) -> Signing | None:
+    """Return the signing of a mission's link.
+
+    Raises:
+        ConfigError: The key file cannot be read.
+    """
+    if config.key_file is None:
+        return None
+    return Signing(key_from_file(Path(config.key_file)), clock=time.time)
+
+
+def _foreign_link(url: str, signing: Signing | None) -> Transport:
+    if signing is None:
+        return open_transport(url)
+    return open_transport(url, signed=True, admits=signing.vouches)
+
+
 @contextlib.contextmanager
 def other_end(
     config: MissionConfig, launch: StartVehicle = start_vehicle
@@ -188,15 +238,13 @@ def other_end(
     Raises:
         MavfiError: the link cannot be opened, or the vehicle cannot start.
     """
-    if config.link is not None:
-        with contextlib.closing(
-            open_transport(config.link, signed=config.key_file is not None)
-        ) as link:
+    if config.link is not None and not config.eyes:
+        with contextlib.closing(_foreign_link(config.link, signing_of(config))) as link:
             yield link, None
         return
     folder = Path(tempfile.mkdtemp(prefix="mavfi-"))
     with contextlib.ExitStack() as leaving:
         leaving.callback(shutil.rmtree, folder, ignore_errors=True)
-        vehicle = launch(config, folder)
+        vehicle = (EyesProcess if config.eyes else launch)(config, folder)
         leaving.callback(vehicle.end)
         yield vehicle.link, vehicle

@@ -49,13 +49,16 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
     with_what += f", stack {config['stack']}"
     flown = f"{config['vehicle']} in {config['world']}, seed {config['seed']}"
     if config["link"] is not None:
-        flown = f"foreign autopilot at {config['link']}, seed {config['seed']}"
+        where = f" in {config['world']}" if config["world"] else ""
+        flown = f"foreign autopilot at {config['link']}{where}, seed {config['seed']}"
     lines = [
         outcome_line(result),
         "",
         f"Mission     {flown}; {with_what}",
         *_flight_lines(flight),
     ]
+    if pose := (flight.referee or {}).get("pose"):
+        lines.append(f"Referee     on {pose}")
     lines += _fault_lines(flight.fault)
     lines += _node_lines(flight.nodes)
     lines += _detection_lines(flight.detection, detection_cost(result))

@@ -21,6 +21,11 @@ FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}
 OWN_AUTOPILOT = "ours"
 _REPEATING = (OWN_AUTOPILOT, "ardupilot")  # autopilots whose flights repeat exactly
 _LOSS_LIMIT_S = 5.0
+OF_THE_WORLD = (
+    "world", "world_seed", "vehicle", "start", "camera_columns", "camera_rows",
+)  # fmt: skip
+"""Settings of the world and of what is simulated in it."""
+
 Vector3 = tuple[float, float, float]
 LIMITS = {  # minimum and maximum of each number
     "takeoff_height_m": (1.0, 50.0),
@@ -58,6 +63,9 @@ class MissionConfig:
         camera_columns, camera_rows, camera_rate_hz: Depth image, and how often it comes.
         world_seed: Seed of a generated world, or of start and goal in a scene; None for `seed`.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
+        eyes: Start depth camera and referee of the world beside a foreign autopilot.
+        origin: Where the local origin of a foreign autopilot with `eyes` lies in the world; None
+            for the world's start.
         autopilot: Which autopilot flies the simulated vehicle: ours, or real firmware.
         firmware: SITL binary of a real autopilot; None for that of its environment variable.
         key_file: File with the signing passphrase of the link; None for an unsigned link.
@@ -93,6 +101,8 @@ class MissionConfig:
     camera_rate_hz: float = 10.0
     realtime: bool = False
     link: str | None = None
+    eyes: bool = False
+    origin: Vector3 | None = None
     autopilot: str = OWN_AUTOPILOT
     firmware: str | None = None
     key_file: str | None = None
@@ -114,7 +124,8 @@ class MissionConfig:
                 continue
             if not (math.isfinite(value) and low <= value <= high):
                 raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
-        for name, place in (("start", self.start), ("goal", self.goal)):
+        places = (("start", self.start), ("goal", self.goal), ("origin", self.origin))
+        for name, place in places:
             if place is not None and not all(map(math.isfinite, place)):
                 raise ConfigError("must be three finite numbers", key=name)
         if self.fault is not None and self.instruction is not None:
@@ -141,17 +152,35 @@ class MissionConfig:
                 raise ConfigError(f"must be within 0 and 2^31 - 1, got {seed}", key=name)
 
     def _check_link(self) -> None:
+        if self.eyes and self.link is None:
+            raise ConfigError("are for a foreign autopilot: needs --link", key="eyes")
+        if self.origin is not None and not self.eyes:
+            raise ConfigError("needs --eyes, which know the world", key="origin")
         if self.link is not None:
+            self._check_foreign()
             return
         if self.key_file is not None:
             raise ConfigError("signs a link to a foreign autopilot: needs --link", key="key_file")
         if self.loss_limit_s != _LOSS_LIMIT_S:
             raise ConfigError("is for a foreign autopilot: needs --link", key="loss_limit_s")
 
+    def _check_foreign(self) -> None:
+        """Reject what has no meaning for a foreign autopilot."""
+        if self.realtime:
+            raise ConfigError("paces the simulated vehicle: without --link", key="realtime")
+        if self.eyes:
+            return
+        if self.goal is None:
+            raise ConfigError("needs --goal X,Y,Z (ENU, m) or --eyes", key="link")
+        plain = MissionConfig(goal=self.goal)
+        for name in OF_THE_WORLD:
+            if getattr(self, name) != getattr(plain, name):
+                raise ConfigError("has no meaning with --link unless --eyes is given", key=name)
+
     def _check_platform(self) -> None:
         if measured_factor(self.platform) is None:
             return
-        if not self.realtime:
+        if not self.realtime and self.link is None:
             raise ConfigError(
                 f"{self.platform} needs --realtime: measured times differ from flight to flight, "
                 "and without it every flight repeats",
@@ -187,7 +216,9 @@ class MissionConfig:
         if self.autopilot == OWN_AUTOPILOT:
             del values["autopilot"], values["firmware"]
         if self.link is None:
-            del values["loss_limit_s"]
+            del values["loss_limit_s"], values["eyes"], values["origin"]
+        elif not self.eyes:  # nothing of a world took part
+            values.update(dict.fromkeys(OF_THE_WORLD))
         return values
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 import time
@@ -13,9 +14,11 @@ import numpy as np
 
 from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import Signing, key_from_file
-from mavfi_cli.link.transport import Transport, open_transport
+from sitl.briefing import write_briefing
 from sitl.camera.component import Camera
+from sitl.camera.router import Router
 from sitl.camera.station import PoseTracker, Station
+from sitl.camera.witness import Witness
 from sitl.command_line import (
     CONTEXT,
     Place,
@@ -27,6 +30,7 @@ from sitl.command_line import (
     key_file,
     stop_on_signals,
 )
+from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
 
@@ -39,7 +43,8 @@ from sitl.world import load_world
     "--origin",
     type=Place(),
     metavar="X,Y,Z",
-    help="Position of the autopilot's local origin in the world, ENU m  [the world's start].",
+    help="Position of the autopilot's local origin in the world, ENU m  [the world's start; with "
+    "mavfi sitl, the world's origin].",
 )
 @click.option(
     "--link",
@@ -56,10 +61,21 @@ from sitl.world import load_world
 @click.option(
     "--mount",
     type=Place(),
-    default="0.1,0,0",
-    show_default=True,
     metavar="F,L,U",
-    help="Offset of the lens from the vehicle's position: forward, left, up in m.",
+    help="Offset of the lens from the vehicle's position: forward, left, up in m  [--vehicle's].",
+)
+@click.option(
+    "--vehicle",
+    default="solo",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="Profile whose body and energy the referee takes for the vehicle's.",
+)
+@click.option(
+    "--truth",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for the briefing and, at the end, the referee's log and verdict.",
 )
 @camera_heartbeat
 @key_file
@@ -74,19 +90,23 @@ def _camera(
     size: tuple[int, int],
     rate_hz: float,
     hfov_deg: float,
-    mount: Triple,
+    mount: Triple | None,
+    vehicle: str,
+    truth: Path | None,
     camera_heartbeat_hz: float,
     key_file: Path | None,
     allow_unsigned: bool,
 ) -> None:
-    """Run a depth camera for an autopilot without a world, such as PX4 or ArduPilot SITL.
+    """Run depth camera and referee for an autopilot without a world, such as PX4 or ArduPilot SITL.
 
     The camera reads the vehicle's pose from ATTITUDE_QUATERNION (or ATTITUDE) and
     LOCAL_POSITION_NED, and requests these messages if they do not arrive. It sends frames as a
-    MAVLink camera (component 100) on all links once a client has sent IMAGE_START_CAPTURE.
+    MAVLink camera (component 100) on all links once a client has sent IMAGE_START_CAPTURE. The
+    referee judges the same pose, and tells a collision in a STATUSTEXT.
     """
     world = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
-    forward, left, up = mount
+    profile = load_profile(vehicle)
+    forward, left, up = profile.camera_mount_flu_m if mount is None else mount
     made = Camera(
         world.boxes_enu_m,
         columns=size[0],
@@ -96,20 +116,22 @@ def _camera(
         rate_hz=rate_hz,
         heartbeat_hz=camera_heartbeat_hz,
     )
-    key = None if key_file is None else key_from_file(key_file)
-    transports: list[Transport] = []
-    try:
-        for url in links:
-            signed = key is not None
-            transports.append(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
+    signing = None if key_file is None else Signing(key_from_file(key_file), time.time)
+    witness = Witness(world, profile, logs=truth is not None)
+    if truth is not None:
+        write_briefing(world, made.mount_offset_flu_m, truth)
+    stopped = stop_on_signals()
+    with contextlib.closing(
+        Router(links, signing=signing, allow_unsigned=allow_unsigned)
+    ) as router:
         station = Station(
             made,
             PoseTracker(world.start_enu_m if origin is None else np.array(origin)),
-            transports,
-            signing=lambda: None if key is None else Signing(key, time.time),
+            router,
+            witness=witness,
+            origin_given=origin is not None,
         )
         click.echo(f"depth camera in {world.name}, seed {seed}, on {', '.join(links)}", err=True)
-        stopped = stop_on_signals()
         try:
             station.run(lambda: not stopped())
         except LinkLost:
@@ -117,9 +139,8 @@ def _camera(
                 raise
         finally:
             click.echo(f"{station.frames_sent} frames sent", err=True)
-    finally:
-        for transport in transports:
-            transport.close()
+            if truth is not None:
+                witness.save(truth)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.frames import Vector, flu_enu_from_frd_ned, rotation_matrix
+from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned, rotation_matrix
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.telemetry import int32
 from sitl.camera.depth import render_depth
@@ -84,6 +84,9 @@ class Camera:
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
         origin: Geographic origin of the world, for the position fields.
 
+    Attributes:
+        local_origin_enu_m: Origin of LOCAL_POSITION_NED in the world (3,), m.
+
     Raises:
         ConfigError: The size, field of view or rate is invalid.
     """
@@ -115,6 +118,7 @@ class Camera:
         self.images = 0  # images since boot, which is also the next index
         self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
         self._origin = origin
+        self.local_origin_enu_m = np.zeros(3)
         self._default_interval_s = 1.0 / rate_hz
         # Load the compiled renderer now, so that the first frame does not stall a real-time flight.
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
@@ -132,6 +136,13 @@ class Camera:
             dialect.MAV_CMD_SET_CAMERA_MODE: self._set_mode,
             dialect.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
         }
+
+    def _local_origin(self) -> Message:
+        """Return LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET: add it for world coordinates."""
+        offset = enu_from_ned(self.local_origin_enu_m).tolist()
+        return dialect.MAVLink_local_position_ned_system_global_offset_message(
+            self._boot_ms, *offset, 0.0, 0.0, 0.0
+        )
 
     @property
     def capturing(self) -> bool:
@@ -344,5 +355,6 @@ _BUILDERS: dict[int | None, Callable[[Camera], Message | None]] = {
     dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: Camera._storage_information,
     dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS: Camera._capture_status,
     dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: Camera._fov_status,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET: Camera._local_origin,
 }
 """Messages that can be streamed or requested, by their ids."""

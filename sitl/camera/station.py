@@ -1,13 +1,8 @@
-"""Stand-alone depth camera: tracks a foreign autopilot's vehicle and serves frames.
-
-With several links it also forwards every MAVLink frame between them, so that an autopilot on the
-first and a companion on the second receive each other's messages and the camera's.
-"""
+"""Stand-alone depth camera: tracks a foreign autopilot's vehicle, serves frames and is referee."""
 
 from __future__ import annotations
 
 import math
-import selectors
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned, quaternion_from_euler
-from mavfi_cli.link.codec import Codec, Signing, dialect
-from mavfi_cli.link.transport import Transport
+from mavfi_cli.link.codec import dialect
+from mavfi_cli.link.texts import text_messages
 from sitl.camera.component import COMPONENT_ID, Camera
+from sitl.camera.router import Router
+from sitl.camera.witness import Witness
 
 _REBOOT_S = 1.0
 _LONGEST_EXTRAPOLATION_S = 0.5
@@ -26,6 +23,7 @@ _WAIT_S = 0.2
 _ASK_AGAIN_S = 2.0
 _POSE_INTERVAL_US = 20_000.0
 _ANNOUNCE_S = 1.0
+_PLACE_S = 1.0
 
 
 class PoseTracker:
@@ -34,12 +32,12 @@ class PoseTracker:
     There is a pose at each new attitude. The newest position is extrapolated to its stamp with the
     velocity, for 0.5 s at most, so that a slow position stream does not blur frames.
 
-    Args:
+    Attributes:
         origin_enu_m: Autopilot's local origin in the world (3,).
     """
 
     def __init__(self, origin_enu_m: Vector) -> None:
-        self._origin_enu_m = np.asarray(origin_enu_m, dtype=np.float64)
+        self.origin_enu_m = np.asarray(origin_enu_m, dtype=np.float64)
         self._position: tuple[float, Vector, Vector] | None = None  # stamp, NED m, NED m/s
         self._attitude: tuple[float, Vector] | None = None
         self._has_quaternions = False
@@ -83,6 +81,13 @@ class PoseTracker:
         length = float(np.linalg.norm(quaternion))
         return quaternion / length if math.isfinite(length) and length > 0.5 else None
 
+    @property
+    def velocity_enu_mps(self) -> Vector:
+        """Newest velocity (3,). Raises LookupError if there is none yet."""
+        if self._position is None:
+            raise LookupError("no velocity yet")
+        return enu_from_ned(self._position[2])
+
     def pose(self) -> tuple[float, Vector, Vector]:
         """Return stamp, s, position (3,) in the world and attitude (4,) FLU to ENU.
 
@@ -95,17 +100,19 @@ class PoseTracker:
         since_s, position, velocity = self._position
         ahead_s = max(0.0, min(stamp_s - since_s, _LONGEST_EXTRAPOLATION_S))
         local = enu_from_ned(position + ahead_s * velocity)
-        return stamp_s, self._origin_enu_m + local, flu_enu_from_frd_ned(quaternion)
+        return stamp_s, self.origin_enu_m + local, flu_enu_from_frd_ned(quaternion)
 
 
 class Station:
-    """Camera, pose and links of one autopilot.
+    """Camera, referee and links of one autopilot.
 
     Args:
         camera: Camera component, whose system id is set to the autopilot's.
         tracker: Tracker of the vehicle's pose.
-        links: Open transports. The autopilot may be on any of them.
-        signing: One object with the same key for each link, or none.
+        router: Links. The autopilot may be on any of them.
+        witness: Judges the poses; None without a referee.
+        origin_given: The tracker's origin holds. Otherwise another camera of ours on the link,
+            whose vehicle is simulated, knows a better one.
         clock: Monotonic clock in seconds for repeated requests, never for frames.
     """
 
@@ -113,51 +120,81 @@ class Station:
         self,
         camera: Camera,
         tracker: PoseTracker,
-        links: Sequence[Transport],
+        router: Router,
         *,
-        signing: Callable[[], Signing | None] = lambda: None,
+        witness: Witness | None = None,
+        origin_given: bool = True,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.camera = camera
         self.frames_sent = 0
-        self._tracker = tracker
-        self._links = [
-            (link, Codec(camera.system, COMPONENT_ID, signing=signing())) for link in links
-        ]
+        self._tracker, self._router, self._witness = tracker, router, witness
         self._clock = clock
         self._autopilot: int | None = None  # system id; None before its first heartbeat
+        self._placed = False
+        self._placed_at_s = math.inf
+        self._held: dict[tuple[int, int, int], Any] = {}
+        if origin_given:
+            self._place_at(tracker.origin_enu_m)
         self._ask_at_s = 0.0
         self._announce_at_s = 0.0
 
     def run(self, keep_on: Callable[[], bool]) -> None:
-        """Serve until `keep_on` returns False.
+        """Serve until `keep_on` returns False, or until an inherited connection closes.
 
         Raises:
             LinkLost: The peer of a link closed it.
         """
-        with selectors.DefaultSelector() as selector:
-            for link in self._links:
-                selector.register(link[0].fileno(), selectors.EVENT_READ)
-            while keep_on():
-                selector.select(_WAIT_S)
-                self.serve()
+        while keep_on() and not self._router.over:
+            self._router.wait(_WAIT_S)
+            self.serve()
 
     def serve(self) -> None:
         """Handle all waiting messages and send the due ones."""
-        for link, codec in self._links:
-            while data := link.receive(0.0):
-                for message in codec.decode(data, datagram=link.datagram):
-                    self._take(message, link)
+        self._router.serve(self._take)
         self._announce()
+        self._place()
         self._ask()
 
-    def _take(self, message: Any, source: Transport) -> None:
-        for link, _ in self._links:
-            if link is not source:
-                link.send(bytes(message.get_msgbuf()))
-        if self._is_autopilot(message) and self._tracker.take(message):
-            self._send(self.camera.poll(*self._tracker.pose()))
-        self._send(self.camera.handle(message))
+    def _take(self, message: Any) -> bool:
+        """Handle a message. Return True if the other peers get it, too.
+
+        What is for the camera or of another one stays here, so that there is one camera.
+        """
+        component = message.get_srcComponent()
+        if component == COMPONENT_ID and message.get_srcSystem() == self._autopilot:
+            if isinstance(message, dialect.MAVLink_local_position_ned_system_global_offset_message):
+                self._place_at(enu_from_ned(np.array([message.x, message.y, message.z])))
+            return False
+        if self._is_autopilot(message):
+            if self._witness is not None:
+                self._witness.take(message)
+            if self._tracker.take(message) and self._placed:
+                self._look()
+        for_camera = getattr(message, "target_component", 0) == COMPONENT_ID
+        if self._placed:
+            self._send(self.camera.handle(message))
+        elif for_camera and isinstance(message, dialect.MAVLink_command_long_message):
+            self._hold(message)
+        return not for_camera
+
+    def _hold(self, command: Any) -> None:
+        """Keep a command of a client until the origin is known."""
+        self._held[command.get_srcSystem(), command.get_srcComponent(), command.command] = command
+        progress = dialect.MAV_RESULT_IN_PROGRESS
+        sender = command.get_srcSystem(), command.get_srcComponent()
+        self._send([dialect.MAVLink_command_ack_message(command.command, progress, 0, 0, *sender)])
+
+    def _look(self) -> None:
+        """Send what is due at the newest pose, and let the referee judge it."""
+        stamp_s, position, quaternion = self._tracker.pose()
+        self._send(self.camera.poll(stamp_s, position, quaternion))
+        if self._witness is not None:
+            velocity = self._tracker.velocity_enu_mps
+            collision = self._witness.observe(stamp_s, position, quaternion, velocity)
+            if collision is not None:
+                text = collision.text.encode()
+                self._send(list(text_messages(dialect.MAV_SEVERITY_CRITICAL, text, 1)))
 
     def _is_autopilot(self, message: Any) -> bool:
         """Return True for a message of the autopilot, which its first heartbeat identifies."""
@@ -170,8 +207,8 @@ class Station:
             ):
                 return False
             self._autopilot = self.camera.system = message.get_srcSystem()
-            for _, codec in self._links:
-                codec.system = self._autopilot
+            self._router.system = self.camera.system
+            self._placed_at_s = self._clock() + _PLACE_S
         return bool(message.get_srcSystem() == self._autopilot)
 
     def _announce(self) -> None:
@@ -183,34 +220,45 @@ class Station:
     def _has_pose(self) -> bool:
         return self._tracker.has_position and self._tracker.has_attitude
 
+    def _place(self) -> None:
+        """Take the given origin if nobody has told a better one within a second."""
+        if not self._placed and self._clock() >= self._placed_at_s:
+            self._place_at(self._tracker.origin_enu_m)
+
+    def _place_at(self, origin_enu_m: Vector) -> None:
+        if not self._placed and np.isfinite(origin_enu_m).all():
+            self._placed = True
+            held, self._held = self._held, {}
+            self._tracker.origin_enu_m = self.camera.local_origin_enu_m = origin_enu_m
+            for command in held.values():
+                self._send(self.camera.handle(command))
+
     def _ask(self) -> None:
         """Request attitude and position from the autopilot until both arrive."""
         if self._autopilot is None or self._clock() < self._ask_at_s:
             return
         self._ask_at_s = self._clock() + _ASK_AGAIN_S
-        missing = []
+        autopilot, interval = (
+            dialect.MAV_COMP_ID_AUTOPILOT1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
+        )  # fmt: skip
         if not self._tracker.has_attitude:
-            missing.append(dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
+            self._command(autopilot, interval, dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
         if not self._tracker.has_position:
-            missing.append(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+            self._command(autopilot, interval, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+        if not self._placed:
+            offset = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
+            self._command(COMPONENT_ID, dialect.MAV_CMD_REQUEST_MESSAGE, offset)
+
+    def _command(self, component: int, command: int, message_id: int) -> None:
         self._send(
             [
                 dialect.MAVLink_command_long_message(
-                    self._autopilot,
-                    dialect.MAV_COMP_ID_AUTOPILOT1,
-                    dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
-                    0,
-                    float(message_id),
-                    _POSE_INTERVAL_US,
+                    self._autopilot, component, command, 0, float(message_id), _POSE_INTERVAL_US,
                     *[0.0] * 5,
                 )
-                for message_id in missing
             ]
-        )
+        )  # fmt: skip
 
     def _send(self, messages: Sequence[Any]) -> None:
-        if not messages:
-            return
         self.frames_sent += sum(m.get_type() == "CAMERA_IMAGE_CAPTURED" for m in messages)
-        for link, codec in self._links:
-            link.send(b"".join(codec.encode(message) for message in messages))
+        self._router.send(messages)

@@ -31,6 +31,11 @@ _SILENCE_US = 60_000_000
 _OUTBOX_LIMIT = 10_000
 
 
+def follows_companion(heartbeat: Any) -> bool:
+    """Return True if a HEARTBEAT's mode is the one in which its autopilot follows a companion."""
+    return bool(heartbeat.custom_mode == _FOLLOWING.get(heartbeat.autopilot))
+
+
 class FirmwareAutopilot:
     """A firmware behind a MAVLink link, as the autopilot of a simulation.
 
@@ -165,7 +170,7 @@ class FirmwareAutopilot:
         if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             self.state_stamp_us = message.time_boot_ms * 1000
         elif number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-            self._follows = message.custom_mode == _FOLLOWING.get(message.autopilot)
+            self._follows = follows_companion(message)
             if not self._prepared:
                 self._prepare()
         self._broadcast(message)

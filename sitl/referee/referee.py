@@ -113,6 +113,7 @@ class Referee:
         body_box_m: Length, width and height of the vehicle's body box, centred on its position.
         vehicle: Name of the vehicle, for the report.
         physics: Mass and thrust of the vehicle, for the report.
+        pose: Whose pose it judges, for the report; None for the true one.
         logs: Keep a row of truth for each observation, for `save`.
     """
 
@@ -123,11 +124,13 @@ class Referee:
         *,
         vehicle: str = "",
         physics: Mapping[str, float] | None = None,
+        pose: str | None = None,
         logs: bool = True,
     ) -> None:
         self.world = world
         self.vehicle = vehicle
         self.physics = dict(physics or {})
+        self._pose = pose
         self._logs = logs
         self.collision: Collision | None = None
         self.distance_m = 0.0
@@ -246,6 +249,7 @@ class Referee:
             "vehicle": self.vehicle,
             "physics": self.physics,
             "world": self.world.as_json(),
+            **({} if self._pose is None else {"pose": self._pose}),
         }
 
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:

@@ -19,12 +19,12 @@ from typing import Any
 import click
 
 from mavfi_cli.core.compiled import in_cache
-from mavfi_cli.core.errors import LinkLost, RecordError, VehicleProcessError
-from mavfi_cli.core.files import write_json
+from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.link.codec import Signing, begins_with_frame, dialect, key_from_file
 from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import Listener, memory_pair, open_listener, open_transport
 from sitl.autopilot.streams import STEP_US, TICK_US, Preset
+from sitl.briefing import write_briefing
 from sitl.command_line import exit_code, stop_on_signals
 from sitl.control.cascade import control_step
 from sitl.firmware.simulation import FirmwareSimulation
@@ -355,24 +355,9 @@ def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[
         server.close()
 
 
-def _write_briefing(simulation: Simulation, folder: Path) -> None:
-    """Write goal, bounds and camera mounting to `folder`, before the first message is sent.
-
-    Raises:
-        RecordError: the file cannot be written.
-    """
-    world = simulation.referee.world
-    briefing = {
-        "start_enu_m": world.start_enu_m.tolist(),
-        "goal_enu_m": world.goal_enu_m.tolist(),
-        "bounds_enu_m": world.bounds_enu_m.tolist(),
-        "camera_offset_flu_m": simulation.camera.mount_offset_flu_m.tolist(),
-    }
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordError(f"{folder}: {error.strerror or error}") from None
-    write_json(folder / "briefing.json", briefing)
+def _brief(simulation: Simulation, folder: Path) -> None:
+    mount = simulation.camera.mount_offset_flu_m
+    write_briefing(simulation.referee.world, mount, folder)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -389,7 +374,7 @@ def _serve(options: ServerOptions) -> None:
         warm_up()
     simulation = _simulation(options, logs=options.truth is not None)
     if options.truth is not None:
-        _write_briefing(simulation, options.truth)
+        _brief(simulation, options.truth)
     run = _lockstep if options.lockstep else _realtime
     try:
         run(options, simulation, stopped)
@@ -410,7 +395,7 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
     """
     simulation = _simulation(parse(arguments), logs=True)
-    _write_briefing(simulation, truth_folder)
+    _brief(simulation, truth_folder)
     return _EmbeddedVehicle(simulation, truth_folder)
 
 

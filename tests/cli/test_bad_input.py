@@ -1,12 +1,16 @@
 """Bad input gets one clear line on stderr and exit code 1; nothing is flown, nothing is left."""
 
 import contextlib
+import errno
+import os
 import resource
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+import serial
 from fake_autopilot import FakePX4
 from missions import SHORT_LINE
 
@@ -142,6 +146,34 @@ def test_a_link_that_is_no_url(refused):
     assert refused("--link", "udpx:1", "--goal", "1,2,3").startswith("udpx:1: unknown kind")
 
 
+def test_a_serial_device_without_permission(refused, monkeypatch):
+    def deny(*_args, **_options):
+        raise serial.SerialException(errno.EACCES, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", deny)
+    line = refused("--link", "serial:/dev/ttyACM0:57600", "--goal", "1,2,3")
+    assert line == "serial:/dev/ttyACM0:57600: no permission to open /dev/ttyACM0"
+
+
+def test_a_key_file_without_permission(refused, tmp_path, monkeypatch):
+    (tmp_path / "key").write_text("horse")
+    read_text = Path.read_text
+
+    def deny(path, *args, **options):
+        if path.name == "key":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return read_text(path, *args, **options)
+
+    monkeypatch.setattr(Path, "read_text", deny)
+    line = refused(*LINK, "--key-file", "key")
+    assert line == "key: cannot read the passphrase: Permission denied"
+
+
+def test_a_camera_that_cannot_start_says_why(refused):
+    line = refused(*LINK, "--eyes", "--world", "farm", "--goal", "900,0,5")
+    assert "goal (900, 0, 5) is outside the world" in line
+
+
 def test_a_port_in_use_for_the_companion(refused):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
@@ -215,6 +247,9 @@ def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -222,8 +257,15 @@ def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
         (["--field", "sign"], "--field needs --inject"),
         (["--level", "instruction"], "--level instruction needs --inject NODE"),
         (["--inject", "detector"], "--inject detector needs --detector NAME"),
-        (["--link", "udpin:127.0.0.1:14540"], "--link needs --goal X,Y,Z"),
+        (["--link", "udpin:127.0.0.1:14540"], "--link: needs --goal X,Y,Z"),
         (["--platform", "measured:2"], "--platform measured:2 needs --realtime"),
+        ([*LINK, "--world", "dense"], "--world has no meaning with --link unless --eyes is given"),
+        ([*LINK, "--vehicle", "solo"], "--vehicle has no meaning with --link unless --eyes"),
+        ([*LINK, "--start", "1,2,0"], "--start has no meaning with --link unless --eyes"),
+        ([*LINK, "--world-seed", "4"], "--world-seed has no meaning with --link unless --eyes"),
+        ([*LINK, "--eyes", "--realtime"], "--realtime: paces the simulated vehicle"),
+        (["--eyes"], "--eyes: are for a foreign autopilot: needs --link"),
+        ([*LINK, "--origin", "1,2,0"], "--origin: needs --eyes"),
         (["--inject", "planning", "--site", "flags"], "--site needs --level instruction"),
         (["--level", "instruction", "--inject", "octomap", "--at", "tick=3"], "--at needs --level"),
     ],

@@ -50,7 +50,7 @@ def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_eve
     assert run.result["world"] is None
     assert run.folder.path.name.startswith("link-")
     assert [e.text for e in watcher.events if e.kind == "phase"] == [
-        "waiting until ready", "arming", "taking off", "offboard", "landing", "done",
+        "connecting", "waiting until ready", "arming", "taking off", "offboard", "landing", "done",
     ]  # fmt: skip
     names = ("x_m", "y_m", "z_m")
     heard = np.column_stack([run.trace[name].to_numpy() for name in names])
@@ -163,6 +163,72 @@ def test_an_autopilot_of_an_unknown_type_is_not_flown(
     )
     with pytest.raises(UnfitAutopilot, match=rf"{url}: system 1 is {said}; PX4 and ArduPilot fly"):
         fly_short(link=url)
+
+
+# With --eyes -----------------------------------------------------------------------------------
+
+EYES = {"eyes": True, "world": "farm"}
+
+
+@pytest.mark.parametrize("autopilot", [FakePX4, FakeArduCopter])
+def test_eyes_bring_camera_world_and_referee(autopilot, autopilot_on_udp, fly_short):
+    """The autopilot stands at its local origin, which is the world's start: goals are the world's.
+
+    A second flight begins where the first has landed.
+    """
+    fake = autopilot()
+    _, url = autopilot_on_udp(fake, camera=False)
+    there = load_run(fly_short(link=url, land=True, **EYES).path)
+    assert there.result["outcome"] == "success", there.result["reason"]
+    assert there.result["referee"]["pose"] == "the autopilot's own pose"
+    assert there.result["referee"]["collision"] is None
+    assert there.result["world"]["start"] == [2.0, 2.0, 0.0]
+    assert there.result["config"]["eyes"] is True
+    quality = there.result["quality_of_flight"]
+    assert quality["min_clearance_m"] > 1.0
+    assert quality["energy_regression_j"] > 0.0
+    assert quality["energy_propeller_j"] is None
+    assert there.trace["x_m"][0].as_py() == pytest.approx(2.0, abs=0.5)
+    assert fake.position_enu_m[:2] == pytest.approx([8.0, 4.0], abs=1.5)
+    back = load_run(fly_short(link=url, goal=(3.0, 3.0, 5.0), land=True, **EYES).path)
+    assert back.result["outcome"] == "success", back.result["reason"]
+    assert fake.position_enu_m[:2] == pytest.approx([1.0, 1.0], abs=1.5)
+    flown_s = [each.result["simulated_s"] for each in (there, back)]
+    assert sum(flown_s) < fake.stamp_s  # the clock of the second began where the first had ended
+
+
+def test_a_given_origin_holds(autopilot_on_udp, fly_short):
+    _, url = autopilot_on_udp(FakePX4(), camera=False)
+    run = load_run(fly_short(link=url, origin=(9.0, 3.0, 0.0), time_limit_s=1.0, **EYES).path)
+    assert run.trace["x_m"][0].as_py() == pytest.approx(9.0, abs=0.5)
+
+
+def test_a_foreign_flight_into_a_box_is_a_collision(autopilot_on_udp, fly_short, tmp_path):
+    """Nothing stops a scripted autopilot at a wall that is not in its world but in the camera's."""
+    world = tmp_path / "wall.toml"
+    world.write_text(
+        'name = "wall"\nbounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]\n'
+        "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
+        "[[box]]\nmin_enu_m = [-1.0, 0.6, 4.0]\nmax_enu_m = [1.0, 3.0, 12.0]\n"
+    )
+    fake = FakePX4()
+    _, url = autopilot_on_udp(fake, camera=False)
+    drift = fake._move
+
+    def blown():
+        drift()
+        if fake.mode == "OFFBOARD":
+            fake.position_enu_m[1] += 0.04
+
+    fake._move = blown
+    run = load_run(
+        fly_short(
+            link=url, eyes=True, world=str(world), start=None, goal=None, land=True
+        ).path
+    )  # fmt: skip
+    assert (run.result["outcome"], run.result["reason"][:5]) == ("collision", "box 0")
+    assert run.result["referee"]["collision"]["what"] == "box 0"
+    assert not fake.armed  # it has landed
 
 
 def cut(link, *kinds):

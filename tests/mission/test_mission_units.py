@@ -25,7 +25,7 @@ from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.run_folder import load_run, new_run_folder
 from mavfi_cli.mission.record.tables import Trace
 from mavfi_cli.mission.run import response_times
-from mavfi_cli.spec.mission import ISOLATABLE, MissionConfig
+from mavfi_cli.spec.mission import ISOLATABLE, OF_THE_WORLD, MissionConfig
 
 # Configuration -------------------------------------------------------------------------------
 
@@ -49,7 +49,9 @@ LIMITED = {
 @pytest.mark.parametrize("name", LIMITED)
 def test_limits_are_inclusive_and_named_where_broken(name):
     low, high = LIMITED[name]
-    needed = {"link": "udpin:127.0.0.1:1"} if name == "loss_limit_s" else {}
+    needed = (
+        {"link": "udpin:127.0.0.1:1", "goal": (9.0, 9.0, 5.0)} if name == "loss_limit_s" else {}
+    )
     for good in (low, high):
         assert getattr(MissionConfig(**{name: good}, **needed), name) == good
     for bad in (math.nextafter(low, -1), math.nextafter(high, math.inf), math.nan, -math.inf):
@@ -61,8 +63,23 @@ def test_a_limit_on_loss_is_for_a_link_and_in_its_record_only():
     with pytest.raises(ConfigError, match=r"^loss_limit_s: .* needs --link"):
         MissionConfig(loss_limit_s=10.0)
     assert "loss_limit_s" not in MissionConfig().to_dict()
-    config = MissionConfig(link="udpin:127.0.0.1:1", loss_limit_s=10.0)
+    config = MissionConfig(link="udpin:127.0.0.1:1", eyes=True, loss_limit_s=10.0)
     assert config.to_dict()["loss_limit_s"] == 10.0
+
+
+def test_the_record_of_a_foreign_flight_names_no_world_that_took_no_part():
+    goal = (20.0, 1.0, 5.0)
+    blind = MissionConfig(link="udpin:127.0.0.1:1", goal=goal).to_dict()
+    seeing = MissionConfig(link="udpin:127.0.0.1:1", eyes=True).to_dict()
+    assert {blind[name] for name in OF_THE_WORLD} == {None}
+    assert (seeing["world"], seeing["vehicle"], seeing["eyes"]) == ("dense", "solo", True)
+    assert not {"eyes", "origin"} & MissionConfig().to_dict().keys()
+
+
+def test_settings_of_a_world_need_eyes():
+    for name, value in (("world", "farm"), ("start", (1.0, 2.0, 0.0)), ("camera_rows", 60)):
+        with pytest.raises(ConfigError, match=f"^{name}: has no meaning with --link"):
+            MissionConfig(link="udpin:127.0.0.1:1", goal=(9.0, 9.0, 5.0), **{name: value})
 
 
 @pytest.mark.parametrize("seed", [-1, 2**31])
@@ -80,11 +97,15 @@ def test_nodes_that_can_be_isolated():
 # Briefing ------------------------------------------------------------------------------------
 
 
-@given(st.tuples(*[st.floats(-500.0, 500.0)] * 2, st.floats(2.0, 10.0)))
-def test_a_foreign_mission_may_fly_between_home_and_goal_with_a_margin(goal):
-    told = briefing.of_config(MissionConfig(link="udpin:127.0.0.1:1", goal=goal))
+PLACES = st.tuples(*[st.floats(-500.0, 500.0)] * 2, st.floats(2.0, 10.0))
+
+
+@given(PLACES, PLACES)
+def test_a_foreign_mission_may_fly_between_start_and_goal_with_a_margin(start, goal):
+    config = MissionConfig(link="udpin:127.0.0.1:1", goal=goal)
+    told = briefing.of_config(config, np.array(start))
     low, high = told.bounds_enu_m[:3], told.bounds_enu_m[3:]
-    for place in (np.array(goal), np.zeros(3)):
+    for place in (np.array(goal), np.array(start)):
         assert (place[:2] - low[:2] >= briefing.MARGIN_M - 1e-9).all()
         assert (high[:2] - place[:2] >= briefing.MARGIN_M - 1e-9).all()
     assert (low[2], high[2]) == (briefing.LOWEST_M, briefing.HIGHEST_M)

@@ -7,6 +7,8 @@ autopilot has no referee.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 Truth = dict[str, np.ndarray]
@@ -34,13 +36,17 @@ def from_truth(
     found = from_states(stamps, flown["position_enu_m"], flown["velocity_enu_mps"], goal_enu_m)
     if len(stamps) < 2:
         return found
-    clearance_m = float(flown["clearance_m"].min())
     return {
         **found,
-        "min_clearance_m": clearance_m if np.isfinite(clearance_m) else None,
-        "energy_regression_j": float(np.trapezoid(flown["power_regression_w"], stamps)),
-        "energy_propeller_j": float(np.trapezoid(flown["power_propeller_w"], stamps)),
+        "min_clearance_m": _known(flown["clearance_m"].min()),
+        "energy_regression_j": _known(np.trapezoid(flown["power_regression_w"], stamps)),
+        "energy_propeller_j": _known(np.trapezoid(flown["power_propeller_w"], stamps)),
     }
+
+
+def _known(value: Any) -> float | None:
+    """Return a number; None without obstacles, or if the referee could not measure it."""
+    return float(value) if np.isfinite(value) else None
 
 
 def from_states(

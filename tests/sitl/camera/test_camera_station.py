@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +18,11 @@ from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import Transport, open_transport
 from sitl.camera.__main__ import main
 from sitl.camera.component import Camera
+from sitl.camera.router import Router
 from sitl.camera.station import PoseTracker, Station
+from sitl.camera.witness import Witness
+from sitl.vehicle.profile import load_profile
+from sitl.vehicle.vehicle import regression_power
 from sitl.world import load_world
 
 WORLD = load_world("dense", seed=1)
@@ -27,7 +34,7 @@ class Peer:
     def __init__(self, system: int, component: int) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self.link: Transport = open_transport(f"fd:{ours.detach()}")
-        self.station_link: Transport = open_transport(f"fd:{theirs.detach()}")
+        self.station_url = f"fd:{theirs.detach()}"
         self.codec = Codec(system, component)
 
     def send(self, *messages: Any) -> None:
@@ -58,17 +65,21 @@ def start_capture(system: int) -> Any:
 @pytest.fixture
 def scene() -> Iterator[tuple[Station, Peer, Peer, list[float]]]:
     autopilot, client = Peer(7, 1), Peer(255, 190)
-    now = [0.0]
+    now = [-5.0]
+    router = Router([autopilot.station_url, client.station_url], clock=lambda: now[0])
     station = Station(
-        Camera(WORLD.boxes_enu_m),
-        PoseTracker(np.zeros(3)),
-        [autopilot.station_link, client.station_link],
-        clock=lambda: now[0],
-    )
+        Camera(WORLD.boxes_enu_m), PoseTracker(np.zeros(3)), router,
+        witness=Witness(WORLD, load_profile("solo"), logs=False), clock=lambda: now[0],
+    )  # fmt: skip
+    client.send(heartbeat(dialect.MAV_AUTOPILOT_INVALID))
+    station.serve()
+    for peer in (autopilot, client):
+        peer.received()
+    now[0] = 0.0
     yield station, autopilot, client, now
+    router.close()
     for peer in (autopilot, client):
         peer.link.close()
-        peer.station_link.close()
 
 
 def test_it_asks_a_silent_autopilot_for_its_pose_until_it_comes(scene: Any) -> None:
@@ -109,9 +120,8 @@ def test_a_client_on_another_link_gets_frames_and_hears_the_autopilot(scene: Any
     assert kinds.count("LOCAL_POSITION_NED") == 51
     camera = [m for m in heard if m.get_srcComponent() == 100 and m.get_type() == "COMMAND_ACK"]
     assert camera[0].get_srcSystem() == 7
-    assert start_capture(7).command in [
-        m.command for m in autopilot.received() if m.get_type() == "COMMAND_LONG"
-    ]
+    asked = [m.command for m in autopilot.received() if m.get_type() == "COMMAND_LONG"]
+    assert start_capture(7).command not in asked  # it was for the camera, which is here
 
 
 def test_another_components_pose_is_not_the_vehicles(scene: Any) -> None:
@@ -206,3 +216,117 @@ def test_a_known_error_is_one_line(
 @pytest.mark.parametrize("arguments", [["--size", "64"], ["--mount", "1,2"], ["--seed", "x"]])
 def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     assert main(arguments) == 2
+
+
+# Where the autopilot's origin is ---------------------------------------------------------------
+
+
+def offset_answer(system: int) -> Any:
+    return dialect.MAVLink_command_long_message(system, 100, 512, 0, 89, 0, 0, 0, 0, 0, 0)
+
+
+def told_offsets(client: Peer) -> list[tuple[float, float, float]]:
+    kind = "LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET"
+    return [(m.x, m.y, m.z) for m in client.received() if m.get_type() == kind]
+
+
+@pytest.fixture
+def unplaced(scene: Any) -> Any:
+    """A station that does not know the origin of the autopilot. Its guess is the start."""
+    station, autopilot, client, now = scene
+    placeless = Station(
+        station.camera, PoseTracker(np.array([3.0, 4.0, 0.0])), station._router,
+        origin_given=False, clock=lambda: now[0],
+    )  # fmt: skip
+    return placeless, autopilot, client, now
+
+
+def test_the_origin_is_the_start_if_nobody_knows_a_better_one(unplaced: Any) -> None:
+    station, autopilot, client, now = unplaced
+    autopilot.send(heartbeat())
+    station.serve()
+    assert 89 in [round(m.param1) for m in autopilot.received() if m.get_type() == "COMMAND_LONG"]
+    client.send(offset_answer(7))
+    station.serve()
+    told = client.received()
+    assert [m.result for m in told if m.get_type() == "COMMAND_ACK"] == [5]  # in progress
+    now[0] = 2.0
+    station.serve()
+    assert told_offsets(client) == [(4.0, 3.0, 0.0)]
+
+
+def test_a_simulated_vehicle_of_ours_tells_its_origin(unplaced: Any) -> None:
+    station, autopilot, client, _ = unplaced
+    autopilot.send(heartbeat())
+    station.serve()
+    autopilot.codec.component = 100
+    kind = dialect.MAVLink_local_position_ned_system_global_offset_message
+    autopilot.send(kind(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    autopilot.codec.component = 1
+    station.serve()
+    client.send(offset_answer(7))
+    station.serve()
+    assert told_offsets(client) == [(0.0, 0.0, 0.0)]
+
+
+# The referee -----------------------------------------------------------------------------------
+
+
+def flying_pose(ms: int, east_m: float, north_m: float) -> list[Any]:
+    return [
+        dialect.MAVLink_local_position_ned_message(ms, north_m, east_m, -5, 0, 3, 0),
+        dialect.MAVLink_attitude_quaternion_message(ms, 1, 0, 0, 0, 0, 0, 0),
+    ]
+
+
+def test_a_flight_through_a_tower_is_a_collision(scene: Any) -> None:
+    station, autopilot, client, _ = scene
+    west, south, _, east, north, _ = WORLD.boxes_enu_m[0]
+    autopilot.send(dialect.MAVLink_heartbeat_message(2, 12, 0x80, 6 << 16, 4, 3))
+    heard: list[Any] = []
+    for k, x in enumerate(np.arange(west - 3.0, east + 3.0, 0.06)):
+        autopilot.send(*flying_pose(20 * (k + 1), float(x), (south + north) / 2))
+        station.serve()
+        heard += client.received()
+    texts = [m.text for m in heard if m.get_type() == "STATUSTEXT"]
+    assert len(texts) == 1
+    assert texts[0].startswith("Collision: box 0 at ")
+
+
+def test_the_verdict_is_saved_with_whose_pose_it_was(tmp_path: Path) -> None:
+    witness = Witness(WORLD, load_profile("solo"), logs=True)
+    witness.take(dialect.MAVLink_heartbeat_message(2, 12, 0x80, 6 << 16, 4, 3))
+    level, velocity = np.array([1.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    for k in range(51):
+        witness.observe(0.02 * k, np.array([0.02 * k, 0.0, 5.0]), level, velocity)
+    witness.save(tmp_path)
+    report = json.loads((tmp_path / "truth.json").read_text())
+    assert report["pose"] == "the autopilot's own pose"
+    assert report["collision"] is None
+    assert report["distance_m"] == pytest.approx(1.0)
+    steady_w = regression_power(velocity, np.zeros(3), load_profile("solo").energy.coefficients(0))
+    assert report["energies_j"] == {"regression": pytest.approx(steady_w, rel=1e-6)}
+
+
+def test_nothing_is_saved_of_a_vehicle_that_was_never_seen(tmp_path: Path) -> None:
+    Witness(WORLD, load_profile("solo"), logs=True).save(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Peers of a listening link ---------------------------------------------------------------------
+
+
+def test_a_second_companion_joins_where_the_first_was(tmp_path: Path) -> None:
+    """Neither takes the other's place, and a stranger's bytes are no peer."""
+    with contextlib.closing(Router(["udpin:127.0.0.1:0"])) as router:
+        port = router._doors[0].listener.port  # type: ignore[attr-defined]
+        heard: list[Any] = []
+        for name in (1, 2):
+            far = open_transport(f"udpout:127.0.0.1:{port}")
+            far.send(b"\xfd no frame")
+            far.send(Codec(name, 191).encode(heartbeat(8)))
+            router.wait(1.0)
+            router.serve(lambda message: bool(heard.append(message.get_srcSystem())))
+            far.close()
+        assert heard == [1, 2]
+        assert len(router._peers) == 2
