@@ -145,7 +145,7 @@ def _kernels_in_flight() -> Iterator[Claim]:
     )  # fmt: skip
     yield Claim(
         name="fig7-energy", item="fig7", low=0.0, unit=NUMBER,
-        words="FlownMission energy grows with flight time.",
+        words="Flight energy grows with flight time.",
         effect="correlation of the two over golden flights",
         find=find.energy_follows_time,
     )  # fmt: skip

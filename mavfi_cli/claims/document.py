@@ -156,15 +156,17 @@ def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
         known = sum(found.values()) - found[ClaimVerdict.NOT_FLOWN]
         if known:
             parts.append(
-                f"on {name}, {found[ClaimVerdict.REPRODUCED]} of {known} are reproduced, "
-                f"{found[ClaimVerdict.NOT_REPRODUCED]} are not, "
-                f"and {found[ClaimVerdict.OPEN]} cannot be "
-                "told apart from chance"
+                f"on {name}, {_are(found[ClaimVerdict.REPRODUCED])} reproduced, "
+                f"{_are(found[ClaimVerdict.NOT_REPRODUCED])} not, and "
+                f"{_are(found[ClaimVerdict.OPEN])} not distinguishable at this n, of {known}"
             )
     if not parts:
         return "None of the claims has been flown yet."
-    text = "; ".join(parts) + "."
-    return text[0].upper() + text[1:]
+    return _sentence(parts)
+
+
+def _are(number: int) -> str:
+    return f"{number} {'is' if number == 1 else 'are'}"
 
 
 def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
@@ -209,8 +211,13 @@ def _crash_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
     if not lost:
         return "No fault in an instruction has lost a mission."
     ended = wilson(sum(bool(each.node_ended) for each in lost), len(lost))
+    if ended.count == ended.total:
+        return (
+            f"All {ended.total:,} missions that a fault in an instruction loses follow a node that "
+            "crashed or hung, and none follows silent corruption."
+        )
     return (
-        f"Of the {len(lost):,} missions that a fault in an instruction loses, {_rate(ended)} "
+        f"Of the {ended.total:,} missions that a fault in an instruction loses, {_rate(ended)} "
         "follow a node that crashed or hung; the others follow silent corruption."
     )
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from mavfi_cli.claims.flights import LONGER, FlownMission, GoldenFlights
+from mavfi_cli.core.types import Stage
 from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.effects import (
     as_interval,
@@ -32,6 +33,7 @@ class Finding:
     told: str
 
 
+EVERY_STAGE = "+".join(stage.value for stage in Stage)
 NOTHING = Finding(effect=None, told="")
 
 
@@ -124,12 +126,12 @@ class Protected:
 
     @classmethod
     def of(
-        cls, flights: Sequence[FlownMission], detector: str, protect: str | None = None
+        cls, flights: Sequence[FlownMission], detector: str, protect: str = EVERY_STAGE
     ) -> Protected:
         """The faults of these flights that a detector has seen.
 
         Args:
-            protect: only with these protected stages; None takes all stages that the detector can.
+            protect: the protected stages.
         """
         golden = GoldenFlights(flights)
         bare = {(each.pair, each.fault): each for each in struck(flights)}
@@ -137,7 +139,7 @@ class Protected:
             (own, each)
             for each in flights
             if each.detector == detector
-            and (protect is None or each.protect == protect)
+            and each.protect == protect
             and (own := bare.get((each.pair, each.fault))) is not None
             and golden.of(own) is not None
         ]

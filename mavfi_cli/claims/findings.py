@@ -7,6 +7,7 @@ from typing import Any
 
 from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.claims.effects import (
+    EVERY_STAGE,
     NOTHING,
     Finding,
     Protected,
@@ -376,8 +377,7 @@ def gaussian_dearer(flights: Flights) -> Finding:
 
 
 def _watched(flights: Flights, detector: str) -> list[FlownMission]:
-    every = "+".join(STAGES)
-    return struck(where(_stage_faults(flights), protect=every), detector=detector)
+    return struck(where(_stage_faults(flights), protect=EVERY_STAGE), detector=detector)
 
 
 def energy_follows_time(flights: Flights) -> Finding:

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import CONFIG, numbers, paired
+from mavfi_cli.analysis.flights import numbers, paired
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.claims.sources import STACKS, Evidence
-from mavfi_cli.core.types import Outcome
+from mavfi_cli.core.types import Outcome, Stage
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.reproduction.evidence import model_report
 from mavfi_cli.reproduction.figures import draw_flights, draw_table
@@ -36,7 +36,12 @@ _SETTING = ("world", "platform", "planner", "fault_target", "fault_field", "faul
             "detector", "protect")  # fmt: skip
 _SEEDS = ("seed", "world_seed", "time_limit_s")
 _FAULTS = ("fault", "instruction")
-_TEXTS = (*CONFIG, "level", "fault_target", "fault_field", "detector", "protect", "path")
+_TEXTS = ("world", "planner", "platform", "stack", "vehicle", "level", "fault_target",
+          "fault_field", "detector", "protect", "state", "outcome", "path", "changes",
+          "pair")  # fmt: skip
+_COSTS = ("check_share", *(f"recovery_share_{stage.value}" for stage in Stage))
+_NUMBERS = ("flight_time_s", "distance_m", "energy_regression_j", "replans", *_COSTS)
+_KINDS = dict.fromkeys(_TEXTS, pa.string()) | dict.fromkeys(_NUMBERS, pa.float64())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +118,7 @@ def pooled(tables: Sequence[pa.Table], stack: str) -> pa.Table:
     """
     kept = [_filled(each.filter(pc.equal(each["stack"], stack))) for each in tables]
     if not kept:
-        return pa.table({name: pa.array([], pa.string()) for name in ("changes", *_TEXTS)})
+        return pa.table({name: pa.array([], kind) for name, kind in _KINDS.items()})
     whole = pa.concat_tables(kept, promote_options="permissive").combine_chunks()
     first: dict[str, int] = {}
     for place, changes in enumerate(whole["changes"].to_pylist()):
@@ -128,16 +133,13 @@ def _filled(table: pa.Table) -> pa.Table:
     if "succeeded" not in kept:
         succeeded = pc.equal(table["outcome"], Outcome.SUCCESS.value)
         table = table.append_column("succeeded", pc.fill_null(succeeded, False))  # noqa: FBT003
-    for name in _COSTS:
-        if name not in kept:
-            table = table.append_column(name, pa.nulls(table.num_rows, pa.float64()))
-    for name in _TEXTS:
-        place = table.column_names.index(name)
-        table = table.set_column(place, name, table[name].cast(pa.string()))
+    for name, kind in _KINDS.items():
+        if name in kept:
+            place = table.column_names.index(name)
+            table = table.set_column(place, name, table[name].cast(kind))
+        else:
+            table = table.append_column(name, pa.nulls(table.num_rows, kind))
     return table
-
-
-_COSTS = ("check_share", *(f"recovery_share_{s}" for s in ("perception", "planning", "control")))
 
 
 def _of_kind(item: Item, stack: str, table: pa.Table) -> pa.Table:

@@ -215,9 +215,10 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     for each in campaigns:
         over = len(each.flights) + each.errors
         if each.planned is not None and over < each.planned:
+            again = f"mavfi campaign run {each.path}" if each.spec else "the command that began it"
             yield (
-                f"{each.path}: {over:,} of {each.planned:,} missions have flown. "
-                f"`mavfi campaign run {each.path}` flies the rest."
+                f"{each.path}: {over:,} of {each.planned:,} missions have flown; {again} flies "
+                "the rest."
             )
         if each.errors:
             yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."

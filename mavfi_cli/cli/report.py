@@ -22,11 +22,13 @@ def report(places: tuple[Path, ...], output: Path, upsets: float) -> None:
     reproduce` makes it, or an exported .parquet file. The page needs no network. It opens on a
     phone, and prints to PDF. Needs: pip install 'mavfi[report]'.
     """
+    from mavfi_cli.report.page.render import render, require_page
+
+    require_page(output)  # before what takes long, and before what needs scipy
     from mavfi_cli.claims.document import document
     from mavfi_cli.claims.items import shown_items
     from mavfi_cli.claims.sources import gather
     from mavfi_cli.core.files import write_text
-    from mavfi_cli.report.page.render import render
 
     evidence = gather(places)
     for problem in evidence.problems:

@@ -51,7 +51,13 @@ def row(
 
 def table(rows):
     """An export of these rows."""
-    return pa.Table.from_pylist([{**each, "number": n} for n, each in enumerate(rows)])
+    names = dict.fromkeys(name for each in rows for name in each)
+    return pa.table(
+        {
+            name: [n if name == "number" else x.get(name) for n, x in enumerate(rows)]
+            for name in names
+        }
+    )
 
 
 def flights(rows):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.report.page.charts import (
     Chart,
     arm_chart,
@@ -20,8 +21,25 @@ from mavfi_cli.report.page.charts import (
 from mavfi_cli.report.tables.paper_table import as_csv, cells_of
 
 _FOLDER = Path(__file__).parent
+_LIBRARIES = ("jinja2", "scipy")  # of the extra `report`
 _NONE = "\N{EN DASH}"
 _DETECTORS = {None: "none", "": "none", "gad": "Gaussian", "aad": "autoencoder"}
+
+
+def require_page(path: Path) -> None:
+    """Check what a page needs before its numbers are computed.
+
+    Raises:
+        MavfiError: a library of the extra `report` is not installed. Says how to install it.
+        RecordError: the page's folder does not exist.
+    """
+    lacking = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+    if lacking:
+        raise MavfiError(
+            f"the report needs {' and '.join(lacking)}; install with: pip install 'mavfi[report]'"
+        )
+    if not path.absolute().parent.is_dir():
+        raise RecordError(f"{path}: its folder does not exist")
 
 
 def render(told: Mapping[str, Any]) -> str:
@@ -29,16 +47,9 @@ def render(told: Mapping[str, Any]) -> str:
 
     Args:
         told: `mavfi_cli.claims.document.document`.
-
-    Raises:
-        MavfiError: the template library is not installed. Says how to install it.
     """
-    try:
-        import jinja2
-    except ImportError:
-        raise MavfiError(
-            "the report needs jinja2 and scipy; install them with: pip install 'mavfi[report]'"
-        ) from None
+    import jinja2
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=_unbroken,

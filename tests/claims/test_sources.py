@@ -1,0 +1,157 @@
+"""What is found in folders, what is missing there, and what cannot be read."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+from flown import row, table
+
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.claims.items import pooled, shown_items
+from mavfi_cli.claims.sources import gather
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.versions import installed_versions
+from mavfi_cli.spec.mission import MissionConfig
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    """Make the folder of a campaign with planned and flown golden missions."""
+
+    def make(name, planned, flown, versions=None):
+        with Ledger(tmp_path / name, writing=True) as ledger:
+            told = json.dumps(installed_versions() | (versions or {}))
+            ledger.set_meta({"name": name, "versions": told})
+            ledger.plan(
+                PlannedMission(config=MissionConfig(seed=seed), labels={"setting": "golden"})
+                for seed in range(planned)
+            )
+            for number in range(flown):
+                ledger.add(
+                    number, state=ResultState.FLOWN, reason="", injected=Injected.GOLDEN,
+                    wall_s=1.0, attempts=1, path=None,
+                    result={"outcome": "success", "host": {"machine": "x86_64", "cores": 4}},
+                )  # fmt: skip
+        return tmp_path / name
+
+    return make
+
+
+@pytest.fixture
+def export(tmp_path):
+    """Write an export of some rows."""
+
+    def make(name, *rows):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table(rows), path)
+        return path
+
+    return make
+
+
+def test_a_whole_campaign_has_no_problems(campaign):
+    found = gather([campaign("whole", 3, 3)])
+    assert found.problems == []
+    (source,) = found.campaigns
+    assert (source.name, source.planned, len(source.flights)) == ("whole", 3, 3)
+    assert source.host["machine"] == "x86_64"
+    assert source.versions == installed_versions()
+
+
+def test_what_has_not_flown_is_told(campaign):
+    (problem,) = gather([campaign("half", 5, 2)]).problems
+    assert "2 of 5 missions have flown" in problem
+
+
+def test_campaigns_of_several_builds_are_told(campaign, tmp_path):
+    campaign("new", 1, 1)
+    campaign("old", 1, 1, {"numpy": "1.0"})
+    (problem,) = gather([tmp_path]).problems
+    assert "old and" in problem
+    assert "numpy was" in problem
+    assert "is 1.0" in problem
+
+
+def test_a_build_that_is_not_this_one_is_told(campaign):
+    (problem,) = gather([campaign("old", 1, 1, {"ompl": "0.1"})]).problems
+    assert "another build than this one" in problem
+    assert "ompl was 0.1" in problem
+
+
+def test_nothing_is_an_error(tmp_path, campaign):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RecordError, match="empty: holds no campaign"):
+        gather([tmp_path / "empty"])
+    with pytest.raises(RecordError, match="does not exist"):
+        gather([tmp_path / "absent"])
+    with pytest.raises(RecordError, match="no mission has flown yet"):
+        gather([campaign("unflown", 4, 0)])
+
+
+def test_an_empty_folder_beside_another_is_told(tmp_path, campaign):
+    (tmp_path / "empty").mkdir()
+    (problem,) = gather([campaign("whole", 1, 1), tmp_path / "empty"]).problems
+    assert "empty: holds no campaign" in problem
+
+
+def test_what_cannot_be_read_is_told_and_the_rest_is_used(tmp_path, campaign):
+    campaign("whole", 1, 1)
+    (tmp_path / "torn").mkdir()
+    (tmp_path / "torn" / "ledger.sqlite").write_bytes(b"SQLite format 3\0 and no more")
+    (tmp_path / "other.parquet").write_bytes(b"PAR1")
+    pq.write_table(table([row()]).select(["number", "world"]), tmp_path / "foreign.parquet")
+    (tmp_path / "kernels.json").write_text("[]")
+    found = gather([tmp_path])
+    assert len(found.campaigns) == 1
+    told = "\n".join(found.problems)
+    for name in ("torn", "other.parquet", "foreign.parquet", "kernels.json"):
+        assert name in told
+    assert "no column 'pair'" in told
+
+
+def test_a_campaigns_own_folders_are_no_campaigns(tmp_path, campaign, export):
+    campaign("whole", 1, 1)
+    export("whole/runs/0-sparse-1/trace.parquet", row())
+    export("whole/world-search/found.parquet", row())
+    export("whole/kernels.parquet", row())
+    assert len(gather([tmp_path]).campaigns) == 1
+
+
+def test_a_part_has_the_specification_beside_it(export, tmp_path):
+    (tmp_path / "mine.toml").write_text("repetitions = 3\n[[setting]]\n")
+    (source,) = gather([export("mine-part2.parquet", row())]).campaigns
+    assert source.spec.repetitions == 3
+    assert source.planned is None
+    assert len(source.digest) == 64
+
+
+def test_a_mission_in_two_places_counts_once(export):
+    places = [export("one.parquet", row(seed=1)), export("two.parquet", row(seed=1), row(seed=2))]
+    found = gather(places)
+    assert len(found.missions()) == 2
+    assert pooled([each.table for each in found.campaigns], "mavbench").num_rows == 2
+    assert found.missions("hardened") == []
+
+
+def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
+    rows = []
+    for seed in (7, 8):
+        rows.append(row(seed=seed))
+        for field in ("sign", "mantissa"):
+            fault = {"field": field, "together": True}
+            rows.append(row("waypoint_position", seed=seed, fault=fault))
+    rows.append(row("waypoint_position", seed=7, fault={"field": "sign"}))  # not all components
+    shown = {
+        (each.item.name, each.stack): each
+        for each in shown_items(gather([export("a.parquet", *rows)]))
+    }
+    found = shown["fig9", "mavbench"]
+    counts = {line.labels[0]: line.cells[0].count for line in found.table.rows}
+    assert counts == {"golden": 2, "sign": 2, "mantissa": 2}
+    assert {each["fault_field"] for each in found.flights} == {"sign", "mantissa"}
+    assert shown["fig9", "hardened"].table is None
+    assert shown["table4", "mavbench"].table is None
+    assert shown["fig6", "isolated kernels"].table is None
+    assert shown["fig15", "performance model"].figure is not None

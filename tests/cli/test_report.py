@@ -1,0 +1,64 @@
+"""`mavfi report`: one file, and one line for what is wrong."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+
+
+def test_it_writes_one_page(command_line, tmp_path):
+    page = tmp_path / "page.html"
+    left, out, err = command_line("report", str(RESULTS / "latency-part1.parquet"), "-o", str(page))
+    assert (left, err) == (0, "")
+    assert out.startswith(f"40 missions in {page} (")
+    assert [each.name for each in tmp_path.iterdir()] == ["page.html"]
+    assert page.read_text(encoding="utf-8").rstrip().endswith("</html>")
+
+
+def test_what_is_missing_is_on_stderr_and_in_the_page(command_line, tmp_path):
+    (tmp_path / "empty").mkdir()
+    page = tmp_path / "page.html"
+    left, _, err = command_line(
+        "report", str(tmp_path / "empty"), str(RESULTS / "latency-part1.parquet"), "-o", str(page)
+    )
+    assert left == 0
+    assert err.startswith("note: ")
+    assert "holds no campaign" in err
+    assert "holds no campaign" in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("place", "output", "told"),
+    [
+        ("absent", "page.html", "absent: does not exist"),
+        (".", "page.html", "holds no campaign, no export"),
+        (str(RESULTS / "latency-part1.parquet"), "no/where.html", "its folder does not exist"),
+        (str(RESULTS / "README.md"), "page.html", "README.md"),
+    ],
+)
+def test_bad_input_is_one_line(command_line, tmp_path, monkeypatch, place, output, told):
+    monkeypatch.chdir(tmp_path)
+    left, out, err = command_line("report", place, "-o", output)
+    assert (left, out) == (1, "")
+    (line,) = err.splitlines()
+    assert line.startswith("error: ")
+    assert told in line
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize("library", ["jinja2", "scipy"])
+def test_a_missing_library_names_the_extra(command_line, tmp_path, monkeypatch, library):
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.setattr(sys, "path_importer_cache", {})
+    left, _, err = command_line("report", str(tmp_path), "-o", str(tmp_path / "page.html"))
+    assert left == 1
+    assert f"needs {library}" in err
+    assert "pip install 'mavfi[report]'" in err
+
+
+def test_a_rate_below_zero_is_wrong_usage(command_line):
+    left, _, err = command_line("report", ".", "-o", "page.html", "--upsets", "-1")
+    assert left == 2
+    assert "--upsets" in err

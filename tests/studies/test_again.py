@@ -1,0 +1,76 @@
+"""`mavfi replay CAMPAIGN --mission`: a mission of a ledger and of an export, flown again."""
+
+import json
+from dataclasses import replace
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from mavfi_cli import library
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.run import run_campaign
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.studies.again import mission_of
+
+FAULT = FaultConfig(target="waypoint_position", together=True, field="sign", seed=3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, short_config):
+    """A campaign of a golden and a faulty mission."""
+    made = tmp_path_factory.mktemp("campaign")
+    missions = [
+        PlannedMission(config=config, labels={"n": n})
+        for n, config in enumerate((short_config, replace(short_config, fault=FAULT)))
+    ]
+    run_campaign(missions, made).close()
+    return made
+
+
+@pytest.fixture(scope="module")
+def export(folder, tmp_path_factory):
+    """Its export."""
+    path = tmp_path_factory.mktemp("export") / "mine.parquet"
+    pq.write_table(library.campaign(folder).table, path)
+    return path
+
+
+def test_a_faulty_mission_repeats_from_both(folder, export, mavfi, tmp_path):
+    for place in (folder, export):
+        done = mavfi("replay", str(place), "--mission", "1", "--out", str(tmp_path), "--json")
+        told = json.loads(done.stdout)
+        assert (done.returncode, told["identical"], told["differing_measures"]) == (0, True, [])
+        assert told["outcomes"][0] == told["outcomes"][1]
+
+
+def test_without_the_fault_it_is_the_golden_one(folder, export):
+    assert mission_of(folder, 1).golden == mission_of(export, 0).config
+    assert mission_of(export, 1).config.fault == FAULT
+
+
+def test_what_differs_is_named_and_ends_with_1(export, mavfi, tmp_path):
+    rows = pq.read_table(export).to_pylist()
+    rows[0]["distance_m"] += 1e-9
+    rows[0]["outcome"] = "collision"
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "other.parquet")
+    done = mavfi(
+        "replay", str(tmp_path / "other.parquet"), "--mission", "0", "--out", str(tmp_path)
+    )
+    assert done.returncode == 1
+    assert "DIFFERENT in outcome, distance_m" in done.stdout
+
+
+def test_no_such_mission(folder, export, tmp_path):
+    for place in (folder, export):
+        with pytest.raises(ConfigError, match="no mission 7"):
+            mission_of(place, 7)
+    with pytest.raises(RecordError):
+        mission_of(tmp_path, 0)
+
+
+def test_a_debugger_needs_a_run_folder(folder, mavfi):
+    done = mavfi("replay", str(folder), "--mission", "0", "--gdb")
+    assert done.returncode == 2
+    assert "--gdb needs a run folder" in done.stderr
