@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,12 @@ def test_the_source_archive_has_the_documents(source, tmp_path):
     wanted = {"README.md", "CITATION.cff", "Containerfile", "constraints.txt", "docs/conf.py"}
     wanted |= {str(each.relative_to(source)) for each in source.glob("docs/**/*.md")}
     assert wanted <= found
+
+
+def test_the_page_of_the_installation_names_every_extra():
+    page = (ROOT / "docs" / "how-to" / "install.md").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert [name for name in project["optional-dependencies"] if f"mavfi[{name}]" not in page] == []
 
 
 def test_the_citation_is_of_this_version():
