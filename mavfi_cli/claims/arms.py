@@ -54,8 +54,8 @@ class Arm:
         golden: lost golden flights.
         by_site: lost missions of each injection site.
         lost: lost missions of all sites.
-        p_value: McNemar's exact test against the unprotected arm, corrected by Holm over all arms;
-            None of the unprotected arm.
+        p_value: McNemar's exact test against the unprotected arm; None of that arm itself.
+        corrected_p: by Holm, over all arms.
     """
 
     name: str
@@ -63,6 +63,7 @@ class Arm:
     by_site: Mapping[str, Share]
     lost: Share
     p_value: float | None
+    corrected_p: float | None
 
 
 def arm_of(flight: FlownMission) -> str:
@@ -106,7 +107,8 @@ def arms(flights: Sequence[FlownMission]) -> list[Arm]:
             golden=lost_share([each for own, each in named if own == name and each.golden]),
             by_site=_by_site(those),
             lost=lost_share(those),
-            p_value=corrected.get(name),
+            p_value=tests.get(name),
+            corrected_p=corrected.get(name),
         )
         for name, those in kept.items()
     ]

@@ -61,7 +61,7 @@ def document(
         "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
         "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
         "items": _items(items),
-        "left_out": LEFT_OUT,
+        "left_out": {_as_printed(name): why for name, why in LEFT_OUT.items()},
         "detectors": ("", "gad", "aad"),
         "upsets_per_hour": upsets_per_hour,
         "hourly": {stack: hourly_failures(flights[stack], upsets_per_hour) for stack in STACKS},
@@ -88,6 +88,13 @@ def _items(shown: Iterable[Any]) -> list[dict[str, Any]]:
         else:
             told["shown"].append(each)
     return [*found.values()]
+
+
+def _as_printed(name: str) -> str:
+    """Such as `Table I` of `table1`."""
+    if name.startswith("table"):
+        return "Table " + "I" * int(name.removeprefix("table"))
+    return f"Fig. {name.removeprefix('fig')}"
 
 
 def _kernels(evidence: Evidence) -> Kernels:

@@ -60,7 +60,7 @@ _ALLOW_PTRACE = (
     "allow ptrace: sysctl kernel.yama.ptrace_scope=1; in a container --cap-add SYS_PTRACE"
 )
 _INSTALL = "pip install -e . in the project's folder"
-_EXTRAS = {"train": "torch", "cluster": "distributed"}
+_EXTRAS = {"train": "torch", "cluster": "distributed", "report": "jinja2"}
 
 
 def check_machine() -> Iterator[Check]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -86,15 +87,19 @@ def rate_difference(first: Share, second: Share) -> Interval:
     R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the two
     Wilson intervals, added in squares. NaN if one has no observations.
     """
-    count = min(first.total, second.total)
-    if not count:
+    if not (first.total and second.total):
         return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
-    value = first.share - second.share
-    below = math.hypot(first.share - first.low, second.high - second.share)
-    above = math.hypot(first.high - first.share, second.share - second.low)
-    return Interval(
-        value=value, low=max(-1.0, value - below), high=min(1.0, value + above), count=count
-    )
+    found = effect_difference(as_interval(first), as_interval(second))
+    return replace(found, low=max(-1.0, found.low), high=min(1.0, found.high))
+
+
+def effect_difference(first: Interval, second: Interval) -> Interval:
+    """First minus second of two independent effects: their distances added in squares (MOVER)."""
+    value = first.value - second.value
+    below = math.hypot(first.value - first.low, second.high - second.value)
+    above = math.hypot(first.high - first.value, second.value - second.low)
+    count = min(first.count, second.count)
+    return Interval(value=value, low=value - below, high=value + above, count=count)
 
 
 def paired_difference(test: McNemar, confidence: float = 0.95) -> Interval:

@@ -81,7 +81,7 @@ def test_arms_are_counted_on_the_faults_that_the_unprotected_flight_read():
     assert (plain.lost.count, plain.lost.total) == (5, 6)
     assert (guarded.lost.count, guarded.lost.total) == (0, 6)
     assert guarded.by_site["position"].total == 6
-    assert guarded.p_value == pytest.approx(2 / 2**5)
+    assert guarded.p_value == guarded.corrected_p == pytest.approx(2 / 2**5)
     assert plain.p_value is None
 
 

@@ -12,6 +12,7 @@ from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.effects import (
     ClaimVerdict,
     correlation,
+    effect_difference,
     excess_over_mean,
     fisher,
     judge,
@@ -65,6 +66,12 @@ def test_a_difference_turns_its_sign_with_its_order(total, first, second):
     there, back = rate_difference(one, other), rate_difference(other, one)
     assert (there.low, there.high) == pytest.approx((-back.high, -back.low))
     assert there.low <= there.value <= there.high
+
+
+def test_a_difference_of_effects_adds_distances_in_squares():
+    found = effect_difference(between(0.1, 0.3), between(-0.1, 0.1))
+    half = math.hypot(0.1, 0.1)
+    assert (found.value, found.low, found.high) == pytest.approx((0.2, 0.2 - half, 0.2 + half))
 
 
 def test_a_paired_difference_narrows_with_the_pairs_and_keeps_a_width():

@@ -117,8 +117,8 @@ def arm_chart(campaign: str, arms: Sequence[Any]) -> Chart:
     axes = figure.add_subplot()
     print_axes(axes)
     for place, arm in enumerate(arms):
-        telling = arm.p_value is not None and arm.p_value < 0.05
-        colour = _LOST if arm.p_value is None else DETECTORS["gad"] if telling else NONE
+        telling = arm.corrected_p is not None and arm.corrected_p < 0.05
+        colour = _LOST if arm.corrected_p is None else DETECTORS["gad"] if telling else NONE
         axes.hlines(place, 100 * arm.lost.low, 100 * arm.lost.high, color=colour, linewidth=1.4)
         axes.plot(100 * arm.lost.share, place, "o", color=colour, markersize=4)
     axes.set_yticks(range(len(arms)), [each.name for each in arms], fontsize=SMALLEST)
@@ -127,7 +127,7 @@ def arm_chart(campaign: str, arms: Sequence[Any]) -> Chart:
     axes.set_xlabel("missions lost, % (95 % interval)", fontsize=SMALLEST)
     rows = [
         {"arm": each.name, "lost": each.lost.count, "of": each.lost.total, "low": each.lost.low,
-         "high": each.lost.high, "p": "" if each.p_value is None else each.p_value}
+         "high": each.lost.high, "p": "" if each.corrected_p is None else each.corrected_p}
         for each in arms
     ]  # fmt: skip
     return chart(f"arms-{campaign}", f"Lost missions of each arm of {campaign}", figure, rows)
