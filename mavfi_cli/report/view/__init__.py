@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mavfi_cli.core.errors import ConfigError, MavfiError
+from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError
 
 if TYPE_CHECKING:
     from mavfi_cli.report.view.entries import ViewedFlight
@@ -26,6 +26,7 @@ def require_viewer(path: Path | None) -> None:
     Raises:
         ConfigError: The name has another suffix.
         MavfiError: A package is not installed. Says how to install it.
+        RecordError: There is no such folder.
     """
     suffix = None if path is None else path.suffix.lower()
     if suffix not in _NEEDED:
@@ -34,6 +35,8 @@ def require_viewer(path: Path | None) -> None:
     if find_spec(package) is None:
         what = "rerun's window" if path is None else f"a {suffix} file"
         raise MavfiError(f"{what} needs more packages: pip install 'mavfi[{extra}]'")
+    if path is not None and not path.parent.is_dir():
+        raise RecordError(f"{path}: No such file or directory")
 
 
 def save(flights: Sequence[ViewedFlight], path: Path) -> None:

@@ -176,7 +176,7 @@ def _world(record: FlightRecord) -> Iterator[Entry]:
 
 def _plans(flight: ViewedFlight) -> Iterator[Entry]:
     for plan in flight.run.record.plans:
-        yield _line(flight, "plan", plan["stamp_s"], np.array(plan["points_enu_m"]), PLAN, 0.04)
+        yield _line(flight, "plan", plan["stamp_s"], np.array(plan["points_enu_m"]), PLAN, 0.08)
 
 
 def _notes(flight: ViewedFlight) -> Iterator[Entry]:
@@ -219,7 +219,7 @@ def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
         if row["command_vx"] is not None:
             velocity = np.array([row[f"command_v{axis}"] for axis in "xyz"])
             way = np.stack([position, position + _SETPOINT_S * velocity])
-            yield _line(flight, "setpoint", stamp_s, way, flight.colour, 0.06)
+            yield _line(flight, "setpoint", stamp_s, way, flight.colour, 0.1)
         yield Values(path=f"{flight.name}/states", stamp_s=stamp_s, values=row)
 
 
@@ -230,7 +230,7 @@ def _path(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
     last = len(stamps) - 1
     for row in sorted({*range(0, last, _PATH_EVERY_TICKS), last} - {-1}):
         points = np.concatenate([places[:row:_PATH_STEP_TICKS], places[row : row + 1]])
-        yield _line(flight, "path", float(stamps[row]), points, flight.colour, 0.08)
+        yield _line(flight, "path", float(stamps[row]), points, flight.colour, 0.15)
 
 
 def _line(
