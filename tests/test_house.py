@@ -92,7 +92,7 @@ def test_a_chain_of_imports_is_short():
 
 
 def test_one_module_forks():
-    forking = mentions(r"\bos\.fork(pty)?\(|get_context\(\"fork")
+    forking = mentions(r"\bos\.fork(pty)?\b|get_context\(\"fork")
     assert {module.rpartition(".")[2] for module in forking} == {"processes"}
 
 
