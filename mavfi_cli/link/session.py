@@ -150,6 +150,7 @@ class OffboardSession:
         self._now_s = 0.0
         self._phase_since_s: float | None = None
         self._ground_m: float | None = None
+        self._ground_amsl_m: float | None = None
         self._was_up = False
         self._down_since_s: float | None = None
 
@@ -363,6 +364,8 @@ class OffboardSession:
             requests.home()
         elif in_mode and telemetry.ready and telemetry.state is not None:
             self._ground_m = float(telemetry.state.position_enu_m[2])
+            if self._settings.needs_camera:  # home may be that of an earlier flight
+                self._ground_amsl_m = telemetry.amsl_m
             self._enter(Phase.ARMING)
             return
         self._require_soon()
@@ -407,7 +410,8 @@ class OffboardSession:
     def _takeoff_altitude_m(self) -> float:
         if not self.telemetry.autopilot.takeoff_amsl:
             return self._settings.takeoff_height_m
-        return (self.telemetry.home_amsl_m or 0.0) + self._settings.takeoff_height_m
+        ground_m = self._ground_amsl_m or self.telemetry.home_amsl_m or 0.0
+        return ground_m + self._settings.takeoff_height_m
 
     def _climbed(self) -> bool:
         state = self.telemetry.state

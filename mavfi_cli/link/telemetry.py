@@ -193,6 +193,7 @@ class Telemetry:
         mode: Name of the flight mode; "" before the first HEARTBEAT.
         landed_state: Landed state in EXTENDED_SYS_STATE, a known MAV_LANDED_STATE.
         ready: True if SYS_STATUS reports that the pre-arm checks pass.
+        amsl_m: Altitude of the vehicle above sea level, m; None if unknown.
         home_amsl_m: Altitude of home above sea level, m; None if unknown.
         battery_remaining: Remaining charge, 0..1; None if unknown.
         battery_voltage_v: Battery voltage, V; None if unknown.
@@ -211,6 +212,7 @@ class Telemetry:
         self.mode = ""
         self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED
         self.ready = False
+        self.amsl_m: float | None = None
         self.home_amsl_m: float | None = None
         self.battery_remaining: float | None = None
         self.battery_voltage_v: float | None = None
@@ -305,6 +307,7 @@ class Telemetry:
         self.home_amsl_m = message.altitude / 1e3
 
     def _global_position(self, message: Message) -> None:
+        self.amsl_m = message.alt / 1e3
         if self.home_amsl_m is None:
             self.home_amsl_m = (message.alt - message.relative_alt) / 1e3
 
