@@ -21,6 +21,7 @@ class Progress:
         inside_s: wall time within missions, summed over the workers, s.
         workers: missions that can fly at the same time; None where that changes, as on a cluster.
         outcomes: of the missions that this run flew, by setting, in the order of the list.
+        beyond_s: wall time of what follows the missions, s.
     """
 
     total: int
@@ -32,6 +33,7 @@ class Progress:
     inside_s: float
     workers: int | None = None
     outcomes: Mapping[str, Counter[str]] = field(default_factory=dict)
+    beyond_s: float = 0.0
 
     @property
     def rate_per_h(self) -> float:
@@ -40,9 +42,9 @@ class Progress:
 
     @property
     def eta_s(self) -> float | None:
-        """Time until the last mission is over at this rate; None before the first is."""
+        """Time until all is over at this rate; None before the first mission is."""
         rate = self.rate_per_h
-        return 3600.0 * (self.total - self.over) / rate if rate > 0.0 else None
+        return 3600.0 * (self.total - self.over) / rate + self.beyond_s if rate > 0.0 else None
 
     @property
     def outside(self) -> float | None:
@@ -86,3 +88,6 @@ class Spectator:
 
     def on_note(self, text: str) -> None:
         """Handle a note for the user."""
+
+    def on_step(self, text: str, elapsed_s: float) -> None:
+        """Handle progress of what is not missions, as one line; wall time since its begin, s."""

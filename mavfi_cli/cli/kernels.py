@@ -150,25 +150,20 @@ def _attacked(
 
 def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.kernels.catalogue import select
-    from mavfi_cli.attack.kernels.target import KernelTarget
-    from mavfi_cli.mission.kernel_inputs import inputs_of_flight
     from mavfi_cli.report.drawing import write_svg
     from mavfi_cli.report.kernel_plot import draw_kernel_plot
-    from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, summarise, table
-    from mavfi_cli.spec.mission import MissionConfig
+    from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise, table
+    from mavfi_cli.studies.kernels import kernel_flight, kernel_targets
 
     plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
-    # Collision check, planner and control have the parameters of `hardened`.
-    config = MissionConfig(world=options["world"], seed=options["world_seed"], stack="hardened")
+    config = kernel_flight(options["world"], options["world_seed"])
     with _folder(out) as folder:
         click.echo(f"inputs: world {config.world}, seed {config.seed}", err=True)
-        fed = inputs_of_flight(config, folder)
-        tolerance = options["tolerance"]
-        targets = [KernelTarget(kernel=each, tolerance=tolerance, **fed) for each in kernels]
+        targets = kernel_targets(kernels, config, folder, options["tolerance"])
         campaign = _attacked(plan, targets, options, folder)
         summary = summarise(plan, campaign)
         if out is not None:
-            _save(out, summary, campaign, KERNEL_COLUMNS)
+            save_runs(out, summary, campaign, KERNEL_COLUMNS)
             write_svg(draw_kernel_plot(summary), out / "kernels.svg")
     _tell(summary, table(summary), "kernels.json, kernels.csv, kernels.svg, runs.jsonl", options)
 
@@ -183,13 +178,18 @@ def _folder(out: Path | None) -> Iterator[Path]:
 
 
 def _attack_program(options: dict[str, Any]) -> None:
-    from mavfi_cli.report.tables.attacks import PROGRAM_COLUMNS, program_table, summarise_program
+    from mavfi_cli.report.tables.attacks import (
+        PROGRAM_COLUMNS,
+        program_table,
+        save_runs,
+        summarise_program,
+    )
 
     plan, out = _plan(options), options["out"]
     campaign = _attacked(plan, [_program(options)], options, out)
     told = summarise_program(plan, campaign[0])
     if out is not None:
-        _save(out, told, campaign, PROGRAM_COLUMNS)
+        save_runs(out, told, campaign, PROGRAM_COLUMNS)
     summary = told["summary"]
     _tell(summary, program_table(summary), "kernels.json, kernels.csv, runs.jsonl", options)
 
@@ -226,16 +226,6 @@ def _variable(text: str) -> tuple[str, str]:
     if not name or not equals:
         raise ConfigError(f"{text!r} is not NAME=VALUE", key="env")
     return name, value
-
-
-def _save(
-    folder: Path, told: dict[str, Any], campaign: list[TargetRuns], columns: Sequence[str]
-) -> None:
-    from mavfi_cli.core.files import write_json, write_text
-    from mavfi_cli.report.tables.attacks import runs_csv
-
-    write_text(folder / "kernels.csv", runs_csv(columns, campaign))
-    write_json(folder / "kernels.json", told)
 
 
 def _tell(summary: dict[str, Any], table: str, files: str, options: dict[str, Any]) -> None:

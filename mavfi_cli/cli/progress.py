@@ -104,6 +104,9 @@ class _MissionsView(Spectator):
     def on_note(self, text: str) -> None:
         self._screen.note(text)
 
+    def on_step(self, text: str, elapsed_s: float) -> None:
+        self._screen.update(text, elapsed_s)
+
 
 @contextmanager
 def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:

@@ -40,20 +40,31 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     """
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
-    from mavfi_cli.reproduction.flying import FlightsPlan, fly_items
+    from mavfi_cli.report.tables.paper_table import as_text
+    from mavfi_cli.reproduction.evidence import tables
+    from mavfi_cli.reproduction.flying import FlightsPlan
+    from mavfi_cli.reproduction.flying import reproduce as run
     from mavfi_cli.reproduction.items import items_named
 
-    items = items_named(names)
     plan = FlightsPlan(
-        items=items, stack=options["stack"], scale=options["scale"], out=options["out"]
+        items=items_named(names),
+        stack=options["stack"],
+        scale=options["scale"],
+        out=options["out"],
     )
     with missions_view(quiet=quiet) as view:
-        fly_items(
+        run(
             plan,
             Options(jobs=options["jobs"] or 0),
             view,
             lambda forecast: view.on_note(forecast_line(forecast)),
         )
+    for table in tables(plan):
+        one_line = f"{table.title}\n  {table.result}\n"
+        click.echo(as_text(table) if len(plan.items) == 1 else one_line, nl=False)
+    if any(item.preset for item in plan.items):
+        click.echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
+        click.echo(f"The page            mavfi report {plan.folder} -o report.html")
 
 
 def forecast_line(forecast: Forecast) -> str:
@@ -61,11 +72,13 @@ def forecast_line(forecast: Forecast) -> str:
     from mavfi_cli.campaigns.progress import duration
 
     left = forecast.missions - forecast.over
-    done = f"{forecast.missions} missions, {forecast.over} of them flown"
-    if not left:
+    parts = [f"{forecast.missions} missions, {forecast.over} of them flown"]
+    parts += [f"{forecast.runs} runs of kernels"] if forecast.runs else []
+    done = "; ".join(parts)
+    if not (left or forecast.runs):
         return done
+    measured = f", from {forecast.measured} missions" if left else ""
     return (
-        f"{done}; the other {left} take about {duration(forecast.seconds)} with "
-        f"{forecast.jobs} at a time on this machine (from {forecast.measured} missions) and "
-        f"{forecast.disk_bytes / 1e9:.2g} GB"
+        f"{done}; what is left takes about {duration(forecast.seconds)} on this machine "
+        f"({forecast.jobs} at a time{measured}) and {forecast.disk_bytes / 1e6:.0f} MB"
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,17 +11,16 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.core.errors import RecordError
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.reproduction.flying import FlightsPlan, stored_plan
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
+from mavfi_cli.reproduction.kernels import kernel_summary
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
 from mavfi_cli.reproduction.missions import key_of, missions_of
 from mavfi_cli.vpm.model import schemes_with
 from mavfi_cli.vpm.report import Choices, report
 from mavfi_cli.vpm.vehicle import load_vehicle
 
-KERNELS, SUMMARY = "kernels", "kernels.json"  # folder beside those of the stacks
 _VEHICLES = ("airsim", "spark")
 
 
@@ -40,22 +38,6 @@ def items_of_preset(name: str) -> tuple[Item, ...]:
     """The items that a preset flies; the one of its own name first."""
     found = [item for item in ITEMS if item.preset == name]
     return tuple(sorted(found, key=lambda item: item.name != name))
-
-
-def kernel_runs(out: Path) -> Mapping[str, Any]:
-    """The summary of the isolated kernels of a reproduction.
-
-    Raises:
-        RecordError: they were not run, or the file is damaged.
-    """
-    path = out / KERNELS / SUMMARY
-    try:
-        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordError(f"{path}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise RecordError(f"{path}: damaged ({error})") from None
-    return found
 
 
 def model_report() -> Mapping[str, Any]:
@@ -99,4 +81,6 @@ def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
 
 
 def _unflown(item: Item, out: Path) -> PaperTable:
-    return of_model(model_report()) if item.source is Source.MODEL else of_kernels(kernel_runs(out))
+    return (
+        of_model(model_report()) if item.source is Source.MODEL else of_kernels(kernel_summary(out))
+    )

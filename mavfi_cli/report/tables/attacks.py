@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
@@ -20,6 +21,7 @@ from mavfi_cli.attack.outcome import (
     shares_to_json,
     signal_name,
 )
+from mavfi_cli.core.files import write_json, write_text
 from mavfi_cli.report.tables.columns import blocks, csv_text
 from mavfi_cli.stats.shares import Share
 
@@ -285,6 +287,18 @@ def runs_csv(columns: Sequence[str], campaign: Iterable[TargetRuns]) -> str:
     return csv_text(
         (_cells(entry, columns) for runs in campaign for entry in runs.records), columns
     )
+
+
+def save_runs(
+    folder: Path, told: Mapping[str, Any], campaign: Iterable[TargetRuns], columns: Sequence[str]
+) -> None:
+    """Write kernels.csv, a line a run, and kernels.json, the summary.
+
+    Raises:
+        RecordError: a file cannot be written.
+    """
+    write_text(folder / "kernels.csv", runs_csv(columns, campaign))
+    write_json(folder / "kernels.json", told)
 
 
 def _cells(entry: Record, columns: Sequence[str]) -> dict[str, str]:
