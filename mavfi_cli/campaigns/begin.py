@@ -42,8 +42,8 @@ from mavfi_cli.spec.stack import load_stack
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
 _APPEND = "--append adds what is new"
-# Missions that differ in these only are checked once.
-_ALIKE = ("seed", "time_limit_s", "isolate")
+# Missions that differ in these only are checked once. Each world is checked with its vehicle.
+_ALIKE = ("seed", "time_limit_s", "isolate", "world")
 
 
 def chosen(
@@ -267,10 +267,10 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
     for mission in missions:
         config = mission.config
         key = canonical(_kind(changes_of(config)))
-        if key in seen:
-            continue
         simple = changes_of(replace(golden_of(config), seed=0))
         vehicle = canonical({**simple, "planner": None, "platform": None, "stack": None})
+        if key in seen and vehicle in seen:
+            continue
         with naming(mission.labels):
             check_names(config, start=vehicle not in seen)
         seen |= {key, vehicle}

@@ -273,7 +273,8 @@ def draw_histograms(
         for kind, values, axes in zip(("value", "delta"), both, panels, strict=True):
             print_axes(axes, f"{name}: {kind}")
             axes.hist(values, bins=61, range=(-max(spans), max(spans)), color=PALETTE[0])
-            axes.set_yscale("log")
+            if len(values):
+                axes.set_yscale("log")
             axes.yaxis.set_minor_formatter(NullFormatter())
     figure.supylabel("control ticks", fontsize=SMALLEST + 0.5)
     return figure

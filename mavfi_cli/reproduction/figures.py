@@ -51,7 +51,7 @@ def draw(table: PaperTable, ledger: Ledger, item: Item | None, columns: str) -> 
     Args:
         columns: width, `one` or `two`.
     """
-    if item is None or item.name not in _DRAWN:
+    if item is None or item.name not in DRAWN:
         return draw_table(table, columns)
     return draw_flights(item.name, table, item_flights(item, ledger), columns)
 
@@ -67,7 +67,7 @@ def draw_flights(name: str, table: PaperTable, flights: pa.Table, columns: str) 
     Args:
         flights: as `analysis.flights.flights`. `fig13` needs their kept run folders.
     """
-    drawn = _DRAWN.get(name)
+    drawn = DRAWN.get(name)
     return draw_table(table, columns) if drawn is None else drawn(flown(flights), columns)
 
 
@@ -186,7 +186,7 @@ def _fig13(table: pa.Table, columns: str) -> Figure:
     return figure
 
 
-_DRAWN: Mapping[str, Callable[[pa.Table, str], Figure]] = {
+DRAWN: Mapping[str, Callable[[pa.Table, str], Figure]] = {
     "fig7": _fig7,
     "fig8": _by_value("fault_target"),
     "fig9": _by_value("fault_field"),

@@ -337,10 +337,10 @@ def table5(flights: pa.Table) -> PaperTable:
     shown = PaperColumn(title="", digits=4)
     sums = [row for row in rows if row.labels[1] == "sum" and row.cells]
     return _table(
-        "table5", ["% of flight time", ""],
-        [PaperColumn(title=world, digits=4) for world in worlds], rows,
-        notes=["detection: time of the computer that flew, one check for all stages; recovery: "
-               "simulated"],
+        "table5", ["%", "of flight time"],
+        [PaperColumn(title=world, digits=4, ends=2) for world in worlds], rows,
+        notes=["stages: their recovery, simulated time; detection: one check for all stages, "
+               "host time"],
         result="detection and recovery, " + "; ".join(
             f"{row.labels[0]} {_told(row.cells[-1], shown, ' %')} in {worlds[-1]}" for row in sums
         ),
@@ -351,7 +351,7 @@ def _parts(detector: str) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
     """Rows of a detector: columns that add up, and the keys of the paper's number."""
     recovery = [f"recovery_share_{stage}" for stage in STAGES]
     apart = {
-        f"recovery, {stage}": ([column], ["recovery", detector, stage])
+        stage: ([column], ["recovery", detector, stage])
         for stage, column in zip(STAGES, recovery, strict=True)
     }
     if detector == "aad":  # recomputes control only
