@@ -14,6 +14,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.report.paper_figures import (
+    SMALLEST,
     WIDTHS_IN,
     Strip,
     StripPanel,
@@ -181,6 +182,10 @@ def _fig13(table: pa.Table, columns: str) -> Figure:
         for panel in chosen["panels"]
     ]
     figure = draw_trajectories(panels, across=1 if columns == "one" else 2)
+    for axes in figure.axes:  # room for the legend below the smaller panel
+        axes.tick_params(labelsize=SMALLEST, pad=1)
+        axes.set_xlabel(axes.get_xlabel(), fontsize=SMALLEST, labelpad=0)
+        axes.set_ylabel(axes.get_ylabel(), fontsize=SMALLEST, labelpad=0)
     width, height = figure.get_size_inches()
     figure.set_size_inches(WIDTHS_IN[columns], height * WIDTHS_IN[columns] / width + 0.6)
     return figure
