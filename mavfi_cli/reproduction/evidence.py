@@ -14,7 +14,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.reproduction.flying import FlightsPlan, stored_plan
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
-from mavfi_cli.reproduction.kernels import kernel_summary
+from mavfi_cli.reproduction.kernel_folder import kernel_summary
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
 from mavfi_cli.reproduction.missions import key_of, missions_of
 from mavfi_cli.vpm.model import schemes_with

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
 from mavfi_cli.campaigns.progress import Spectator, duration
-from mavfi_cli.core.errors import RecordError
 from mavfi_cli.report.drawing import write_svg
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
 from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise
-from mavfi_cli.studies.kernels import kernel_flight, kernel_targets
+from mavfi_cli.reproduction.kernel_folder import FOLDER, SUMMARY, kernel_summary
 
-FOLDER, SUMMARY = "kernels", "kernels.json"
 PAPER_RUNS = 5000  # of each kernel
 _SEED = 1
 # The forecast measures the quickest kernel and takes the others from docs/results/kernels.json.
@@ -62,6 +57,8 @@ class KernelRuns:
 
     def forecast_s(self) -> float:
         """Wall time of all runs, from a few runs of the quickest kernel."""
+        from mavfi_cli.studies.kernels import kernel_flight, kernel_targets  # loads the mission
+
         with tempfile.TemporaryDirectory(prefix="mavfi-kernels-") as scratch:
             targets = kernel_targets(select([_QUICKEST]), kernel_flight(), Path(scratch))
             (measured,) = run_campaign(Plan(runs=_MEASURED, seed=_SEED), targets)
@@ -75,6 +72,8 @@ class KernelRuns:
         Raises:
             MavfiError: as `attack.campaign.run_campaign`.
         """
+        from mavfi_cli.studies.kernels import kernel_flight, kernel_targets  # loads the mission
+
         plan = Plan(runs=self.runs, seed=_SEED)
         targets = kernel_targets(select(()), kernel_flight(), self.folder)
         names, begun = [target.name for target in targets], time.monotonic()
@@ -99,19 +98,3 @@ class KernelRuns:
         summary = summarise(plan, campaign)
         save_runs(self.folder, summary, campaign, KERNEL_COLUMNS)
         write_svg(draw_kernel_plot(summary), self.folder / "kernels.svg")
-
-
-def kernel_summary(out: Path) -> Mapping[str, Any]:
-    """The summary of the runs of a reproduction.
-
-    Raises:
-        RecordError: there is none, or it is damaged.
-    """
-    path = out / FOLDER / SUMMARY
-    try:
-        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except OSError:
-        raise RecordError(f"{path.parent}: no runs of kernels (mavfi reproduce fig6)") from None
-    except ValueError as error:
-        raise RecordError(f"{path}: damaged ({error})") from None
-    return found

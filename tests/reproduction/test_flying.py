@@ -14,8 +14,9 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.reproduction import flying
+from mavfi_cli.reproduction import reproduce as reproducing
 from mavfi_cli.reproduction.evidence import item_flights, table_of_item
-from mavfi_cli.reproduction.flying import FlightsPlan, reproduce, stored_plan
+from mavfi_cli.reproduction.flying import FlightsPlan, stored_plan
 from mavfi_cli.reproduction.items import BY_NAME, items_named
 from mavfi_cli.reproduction.missions import missions_of
 from mavfi_cli.spec.mission import MissionConfig
@@ -40,7 +41,7 @@ def plan(out, *names, scale=SCALE, stack="mavbench"):
 def flown(asked, options=TASK, spectator=None):
     """Reproduce; the forecast."""
     told = []
-    reproduce(asked, options, spectator or Spectator(), told.append)
+    reproducing.reproduce(asked, options, spectator or Spectator(), told.append)
     (forecast,) = told
     return forecast
 
@@ -153,7 +154,7 @@ def test_other_versions_are_refused(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_told_before_the_flights(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(flying.shutil, "disk_usage", lambda place: usage(1000, 1000, 0))
+    monkeypatch.setattr(reproducing.shutil, "disk_usage", lambda place: usage(1000, 1000, 0))
     with pytest.raises(RecordError, match="GB are free"):
         flown(plan(tmp_path, "fig16"))
     assert over(plan(tmp_path)) == 12
