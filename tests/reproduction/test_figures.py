@@ -5,7 +5,7 @@ import math
 
 import matplotlib.colors
 import pytest
-from flown import flight, struck, table
+from made_flights import flight, struck, table
 from matplotlib.text import Text
 
 from mavfi_cli.core.errors import RecordError

@@ -6,7 +6,7 @@ import itertools
 import re
 
 import pytest
-from flown import flight, struck, table
+from made_flights import flight, struck, table
 
 from mavfi_cli.report.tables.paper_table import FORMATS, PaperCell, PaperColumn, as_text, cells_of
 from mavfi_cli.reproduction.layouts import OF_FLIGHTS, of_flights

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
-from flown import flight, struck, table
+from made_flights import flight, struck, table
 
 from mavfi_cli.reproduction.evidence import model_report
 from mavfi_cli.reproduction.items import ITEMS, Source
