@@ -162,10 +162,11 @@ def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
         found = _counted(claims, name)
         known = sum(found.values()) - found[ClaimVerdict.NOT_FLOWN]
         if known:
+            place = f"about {name}" if name == _ISOLATED else f"flown on {name}"
             parts.append(
-                f"on {name}, {_are(found[ClaimVerdict.REPRODUCED])} reproduced, "
+                f"of {known} claims {place}, {_are(found[ClaimVerdict.REPRODUCED])} reproduced, "
                 f"{_are(found[ClaimVerdict.NOT_REPRODUCED])} not, and "
-                f"{_are(found[ClaimVerdict.OPEN])} not distinguishable at this n, of {known}"
+                f"{_are(found[ClaimVerdict.OPEN])} not distinguishable at this n"
             )
     if not parts:
         return "None of the claims has been flown yet."
@@ -197,19 +198,16 @@ def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
 def _saved_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
     parts = []
     for stack, those in flights.items():
+        saved = {}
         for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
-            pairs = Protected.of(those, detector).pairs
-            lost = [each for own, each in pairs if own.lost]
+            lost = [each for own, each in Protected.of(those, detector).pairs if own.lost]
             if lost:
-                saved = wilson(sum(not each.lost for each in lost), len(lost))
-                parts.append(f"on {stack}, {name} saves {_rate(saved)} of the lost missions")
-            elif pairs:
-                parts.append(
-                    f"on {stack}, no fault that {name} saw loses a mission without it, "
-                    "so there is nothing to save"
-                )
+                saved[name] = _rate(wilson(sum(not each.lost for each in lost), len(lost)))
+        if saved:
+            told = " and ".join(f"{name} saves {share}" for name, share in saved.items())
+            parts.append(f"on {stack}, {told} of the missions that are lost without a detector")
     if not parts:
-        return "No fault was flown both without and with a detector."
+        return "No mission that a fault loses was flown again with a detector."
     return _sentence(parts)
 
 

@@ -1,0 +1,83 @@
+"""The report as plain values: its sentences, its tables, its commands."""
+
+from pathlib import Path
+
+import pytest
+from flown import row, table
+
+from mavfi_cli.claims.document import document
+from mavfi_cli.claims.flights import flights_of
+from mavfi_cli.claims.sources import CampaignSource, Evidence
+from mavfi_cli.stats.effects import ClaimVerdict
+
+
+def evidence(rows, name="mine", problems=()):
+    path = Path(f"{name}.parquet")
+    told = table(rows)
+    source = CampaignSource(
+        path=path, name=name, spec=None, planned=None, flights=flights_of(told, path), table=told
+    )
+    return Evidence(campaigns=[source], kernels=[], problems=problems)
+
+
+@pytest.fixture(scope="module")
+def told():
+    """Ten missions in `dense`: two lost by a node's crash, one saved by the autoencoder."""
+    rows = []
+    for seed in range(1, 11):
+        where = {"config": {"world": "dense"}, "seed": seed, "instruction": True}
+        lost = {"outcome": "timeout", "node_ended": "killed by SIGSEGV"} if seed < 3 else {}
+        rows.append(row(config={"world": "dense"}, seed=seed))
+        rows.append(row("planning", **where, **lost, time_s=20.0 + seed / 10))
+        saved = {} if seed != 2 else {"outcome": "collision"}
+        rows.append(row("planning", **where, detector="aad", **saved))
+    return document(evidence(rows, problems=["something is missing."]), [], 2.0)
+
+
+def test_five_sentences_say_what_was_counted(told):
+    first, verdicts, cost, saved, crashes = told["summary"]
+    assert first == "This page judges 43 claims of the paper by 30 missions."
+    told_of = [c["name"] for c in told["claims"] if c["cells"].get("mavbench", {}).get("effect")]
+    assert told_of == ["table4-dense", "table4-aad", "fig12-dense", "fig13-planning"]
+    assert verdicts.startswith("Of 4 claims flown on mavbench, ")
+    assert "loses 20 % (2 of 10; 95 % interval 6 to 51 %) of the missions that 10 golden" in cost
+    assert "the autoencoder saves 50 % (1 of 2; 95 % interval 9 to 91 %)" in saved
+    assert crashes.startswith("All 2 missions that a fault in an instruction loses follow a node")
+
+
+def test_nothing_flown_is_said_in_sentences_too():
+    found = document(evidence([row()]), [])
+    assert found["summary"][1:] == [
+        "None of the claims has been flown yet.",
+        "No flight with a fault has a golden flight beside it, so the cost is not known.",
+        "No mission that a fault loses was flown again with a detector.",
+        "No fault in an instruction has lost a mission.",
+    ]
+
+
+def test_every_claim_has_a_cell_for_each_stack(told):
+    assert told["problems"] == ["something is missing."]
+    for claim in told["claims"]:
+        stacks = {"isolated kernels"} if claim["isolated"] else {"mavbench", "hardened"}
+        assert claim["cells"].keys() == stacks
+    dense = next(each for each in told["claims"] if each["name"] == "table4-dense")
+    assert dense["cells"]["hardened"]["verdict"] is ClaimVerdict.NOT_FLOWN
+
+
+def test_failures_an_hour_are_at_the_rate(told):
+    (hourly,) = told["hourly"]["mavbench"]
+    assert hourly.per_hour[""][0] == pytest.approx(0.4)
+
+
+def test_lost_and_longest_missions_have_their_command(told):
+    (mine,) = told["missions"]
+    assert [each["number"] for each in mine["lost"]] == [1, 4, 5]
+    assert mine["lost"][0]["command"] == "mavfi replay mine.parquet --mission 1"
+    assert mine["longest"][0]["number"] == 28  # seed 10: 21 s
+    assert mine["longest"][0]["ratio"] == pytest.approx(1.05)
+
+
+def test_a_kept_run_is_replayed_from_its_folder():
+    rows = [row(), row("planning", outcome="crash", path="/there/0-run")]
+    (mine,) = document(evidence(rows), [])["missions"]
+    assert mine["lost"][0]["command"] == "mavfi replay /there/0-run"
