@@ -59,10 +59,11 @@ def _again(run: Run) -> Recorder | None:
     """Fly a run again and return what its nodes received; None if it does not repeat."""
     from mavfi_cli.core.errors import RecordError
     from mavfi_cli.mission.repetition import watch_again
+    from mavfi_cli.mission.replay import config_of
 
-    config = run.record.config
-    _note(f"flying again: {config['world']}, seed {config['seed']}")
     try:
+        config = config_of(run)
+        _note(f"flying again: {config.world}, seed {config.seed}")
         recorder, same = watch_again(run)
     except RecordError as error:
         _note(f"without depth frames, cloud and map: {error}; `mavfi fly --record` keeps them")
