@@ -37,11 +37,12 @@ from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.tables import Trace
 from mavfi_cli.mission.vehicle import signing_of
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import Stack
 
 SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts as lost
+BOOT_S = 300.0  # the same for real firmware, which may boot by the wall clock
 IDLE_S = 0.1  # period of messages to a silent foreign autopilot
 CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
 _POSITION = dialect.MAVLink_local_position_ned_message
@@ -90,6 +91,7 @@ class Flight:
         self._seen_s = 0.0  # when the newest frame arrived, or frames were asked for
         self._clock = None if config.link is None else ForeignClock()
         self._unspoken_s = 0.0
+        self._patience_s = SILENCE_S if config.autopilot == OWN_AUTOPILOT else BOOT_S
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
         self.injection = NoInjection()
@@ -249,10 +251,10 @@ class Flight:
         """Receive messages and run the control tick of every state among them."""
         if self._clock is not None:
             self._turn_by_wall(self._clock)
-        elif data := self._receive(SILENCE_S):
+        elif data := self._receive(self._patience_s):
             self._tick(self._take(data))
         else:
-            raise LinkLost(f"the simulated vehicle said nothing for {SILENCE_S:g} s")
+            raise LinkLost(f"the simulated vehicle said nothing for {self._patience_s:g} s")
 
     def _turn_by_wall(self, clock: ForeignClock) -> None:
         """Run a tick for a foreign autopilot, also without a new state, until it counts as lost."""

@@ -7,6 +7,7 @@ import functools
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ from sitl.geodesy import Origin
 _LOOPBACK = "127.0.0.1"
 _OUTPUT = "output.txt"
 _PX4_LOCAL_PORT = 14580
+_PX4_SOCKET = "/tmp/px4-sock-{}"  # on which a running instance serves its commands
 _EPOCH_S = 1_600_000_000  # start of ArduPilot's clock: the same in every flight
 
 # PX4 sources these scripts instead of its own: the parameters of the vehicle before its modules
@@ -108,6 +110,12 @@ def require_program(path: Path) -> Path:
     if not os.access(path, os.X_OK):
         raise VehicleProcessError(f"no permission to execute {path}")
     return path.resolve()
+
+
+def px4_is_running(instance: int) -> bool:
+    """Return True if a PX4 of this number runs on this machine. It would not start a second."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        return probe.connect_ex(_PX4_SOCKET.format(instance)) == 0
 
 
 def start_px4(

@@ -17,7 +17,12 @@ from mavfi_cli.link.transport import Transport, open_transport
 from sitl.firmware import ardupilot, px4
 from sitl.firmware.ardupilot import ArduPilotLink
 from sitl.firmware.autopilot import FirmwareAutopilot
-from sitl.firmware.process import FirmwareProcess, start_ardupilot, start_px4
+from sitl.firmware.process import (
+    FirmwareProcess,
+    px4_is_running,
+    start_ardupilot,
+    start_px4,
+)
 from sitl.firmware.px4 import Px4Link
 from sitl.firmware.sensors import Sensors
 from sitl.firmware.tuning import Parameters, ardupilot_parameters, px4_parameters
@@ -175,10 +180,15 @@ def _open_px4(order: _Order) -> _Opened:
 def _px4_server(tries: int) -> tuple[Transport, int]:
     """Open the first free port of PX4's instances, and return it with its number.
 
+    Args:
+        tries: Number of instances to try. More than one is for a PX4 that will be started.
+
     Raises:
         EndpointError: All of them are in use.
     """
     for port in range(px4.PORT, px4.PORT + tries - 1):
+        if px4_is_running(port - px4.PORT):
+            continue
         with contextlib.suppress(EndpointError):
             return open_transport(f"tcpin:127.0.0.1:{port}"), port
     last = px4.PORT + tries - 1

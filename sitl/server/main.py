@@ -233,6 +233,8 @@ class _Realtime:
     def run(self, stopped: Callable[[], bool]) -> None:
         """Run until stopped, or until an inherited connection closes."""
         self._simulation.begin(stopped)
+        if (kind := self._options.firmware_kind) is not None and not stopped():
+            click.echo(f"{kind.value} is ready: clients may connect", err=True)
         self._welcome()
         while not stopped() and not self._over:
             self._each(Client.send_tick)

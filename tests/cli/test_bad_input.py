@@ -254,6 +254,8 @@ LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
     ("arguments", "said"),
     [
         (["--bits", "3"], "--bits needs --inject"),
+        (["--loss-limit", "3"], "--loss-limit: is for a foreign autopilot: needs --link"),
+        (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
         (["--field", "sign"], "--field needs --inject"),
         (["--level", "instruction"], "--level instruction needs --inject NODE"),
         (["--inject", "detector"], "--inject detector needs --detector NAME"),

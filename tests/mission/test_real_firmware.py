@@ -1,6 +1,8 @@
 """Real firmware flies our vehicle, where the environment names its SITL binary."""
 
 import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -79,3 +81,23 @@ def test_a_fault_is_withheld_by_a_detector_as_with_our_autopilot(fly):
     assert result["outcome"] == "success"
     assert result["detection"]["alarms"][0]["stage"] == "control"
     assert result["fault"]["activation"]["activation"] == "withheld"
+
+
+@pytest.mark.parametrize(("option", "autopilot"), [("--hil", "px4"), ("--json", "ardupilot")])
+def test_the_recipe_with_parts(option, autopilot, mavfi, free_port, tmp_path):
+    """`mavfi sitl` in one terminal, `mavfi fly --link` in another."""
+    if not (binary := os.environ.get(FIRMWARE[autopilot])):
+        pytest.skip(f"{FIRMWARE[autopilot]} names no SITL binary of {autopilot}")
+    line = ["sitl", option, autopilot, "--firmware", binary, "--world", "sparse", "--seed", "1"]
+    line += ["--link", f"onboard=udpin:127.0.0.1:{free_port}"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "mavfi_cli", *line], stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert any(f"{autopilot} is ready" in told for told in process.stderr)
+            url = f"udpout:127.0.0.1:{free_port}"
+            done = mavfi("fly", "--link", url, "--goal", "30,40,5", "--quiet", cwd=tmp_path)
+        finally:
+            process.terminate()
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("SUCCESS")

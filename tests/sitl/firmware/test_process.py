@@ -12,6 +12,7 @@ import pytest
 from live_processes import gone
 
 from mavfi_cli.core.errors import EndpointError, VehicleProcessError
+from sitl.firmware import process, px4, start
 from sitl.firmware.process import FirmwareProcess, require_program, start_px4
 from sitl.firmware.start import Firmware, FirmwareKind, open_firmware
 from sitl.vehicle.profile import load_profile
@@ -95,3 +96,19 @@ def test_a_port_in_use_is_told(kind: FirmwareKind, family: int, port: int) -> No
             holder.listen()
         with pytest.raises(EndpointError, match="in use"):
             _open(kind, None)
+
+
+def test_a_number_that_another_px4_has_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "_PX4_SOCKET", str(tmp_path / "px4-{}"))
+    monkeypatch.setattr(px4, "PORT", 45_600)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+        other.bind(str(tmp_path / "px4-0"))
+        other.listen()
+        server, port = start._px4_server(5)
+        server.close()
+    assert port > 45_600
+    server, port = start._px4_server(5)
+    server.close()
+    assert port == 45_600
