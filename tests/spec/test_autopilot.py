@@ -27,7 +27,7 @@ def test_an_unknown_autopilot_is_refused():
 @pytest.mark.parametrize(
     "other",
     [
-        {"autopilot": "px4", "link": "udpin:127.0.0.1:14540"},
+        {"autopilot": "px4", "link": "udpin:127.0.0.1:14540", "goal": (30.0, 40.0, 5.0)},
         {"autopilot": "px4", "instruction": PLANNER},
         {"autopilot": "ardupilot", "instruction": PLANNER, "realtime": True},
     ],
