@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaigns.specification_file import to_toml
@@ -341,7 +342,8 @@ def _listed(flight: FlownMission, golden: GoldenFlights) -> dict[str, Any]:
     """One line of the list; the command repeats the flight."""
     struck_state = f"{flight.fault_target}, {flight.fault_field or 'any'}"
     what = "golden" if flight.golden else struck_state
-    place = flight.path or f"{flight.source} --mission {flight.number}"
+    kept = flight.path is not None and Path(flight.path).is_dir()
+    place = flight.path if kept else f"{flight.source} --mission {flight.number}"
     return {
         "number": flight.number,
         "what": " + ".join(filter(None, (what, flight.detector))),

@@ -77,7 +77,11 @@ def test_lost_and_longest_missions_have_their_command(told):
     assert mine["longest"][0]["ratio"] == pytest.approx(1.05)
 
 
-def test_a_kept_run_is_replayed_from_its_folder():
-    rows = [row(), row("planning", outcome="crash", path="/there/0-run")]
+def test_a_kept_run_is_replayed_from_its_folder_as_long_as_it_is_there(tmp_path):
+    rows = [row(), row("planning", outcome="crash", path=str(tmp_path))]
+    rows.append(row("control", outcome="crash", path=str(tmp_path / "removed")))
     (mine,) = document(evidence(rows), [])["missions"]
-    assert mine["lost"][0]["command"] == "mavfi replay /there/0-run"
+    assert [each["command"] for each in mine["lost"]] == [
+        f"mavfi replay {tmp_path}",
+        "mavfi replay mine.parquet --mission 2",
+    ]
