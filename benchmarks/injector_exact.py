@@ -11,6 +11,8 @@
    the same way, and lie in the 95 % interval of the estimate as often as it says.
 4. In runs of each kernel: the register after the flip differs from the one before in exactly the
    planned bits, read back from the stopped process.
+5. The same faults again, where a detour counted: breakpoints alone reach the same execution, with
+   the same registers, activation, outcome and output.
 """
 
 from __future__ import annotations
@@ -21,19 +23,23 @@ import shutil
 import subprocess
 import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
-from mavfi_cli.attack.campaign import Plan, one_processor, run_campaign
+from mavfi_cli.attack.campaign import Plan, Record, completed, one_processor, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
 from mavfi_cli.attack.program import ProgramTarget, Workplace
 from mavfi_cli.attack.target import TargetProfile
+from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.fault import (
     CountedStop,
@@ -64,6 +70,7 @@ int main(void) {{
     return 0;
 }}
 """
+RESUME_FLAG = 1 << 16
 MOST_HITS = 20_000  # of an instruction whose executions are counted one by one
 
 
@@ -177,17 +184,37 @@ def estimates(
     )
 
 
-def planned_bits(target: KernelTarget, runs: int) -> tuple[int, int]:
+def planned_bits(records: Sequence[Record]) -> tuple[int, int]:
     """In how many of the applied flips exactly the planned bits changed."""
-    (campaign,) = run_campaign(Plan(runs=runs, seed=1), [target])
     exact = applied = 0
-    for entry in campaign.records:
+    for entry in records:
         injection = entry["injection"]
         if injection.get("applied"):
             changed = int(injection["before"], 16) ^ int(injection["after"], 16)
             applied += 1
             exact += changed == sum(1 << bit for bit in entry["corruption"]["bits"])
     return exact, applied
+
+
+def same_by_breakpoints(target: KernelTarget, records: Sequence[Record]) -> tuple[int, int]:
+    """Of the runs in which a detour counted, how many are the same without one, and all of them."""
+    detoured = [entry for entry in records if any("detour" in stage for stage in entry["trigger"])]
+    same = 0
+    with one_processor(), closing(target.open()) as place:
+        attackers = [Attacker(place=each, golden=golden_run(each)) for each in place.inputs]
+        for entry in detoured:
+            fault = record.fault_of(entry)
+            stages = tuple(replace(stage, detour=None) for stage in fault.trigger)
+            again = attackers[entry["input"]].run(replace(fault, trigger=stages))
+            same += seen(completed(entry, again)) == seen(entry)
+    return same, len(detoured)
+
+
+def seen(entry: Record) -> list[Any]:
+    """What a record says about a run, without the flag that a breakpoint leaves in rflags."""
+    injection = entry["injection"]
+    values = [int(injection.get(key, "0"), 16) & ~RESUME_FLAG for key in ("before", "after")]
+    return values + [entry[key] for key in ("outcome", "signal", "output_sha256", "activation")]
 
 
 def main() -> None:
@@ -202,7 +229,7 @@ def main() -> None:
     print(f"exact stops: {met} of {faults} predicted outputs", flush=True)
     with tempfile.TemporaryDirectory() as scratch:
         fed = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))
-        all_exact = all_applied = 0
+        all_exact = all_applied = all_same = all_detoured = 0
         for kernel in catalogue.select(options.kernel):
             target = KernelTarget(kernel=kernel, **fed)
             with one_processor(), closing(target.open()) as place:
@@ -213,9 +240,13 @@ def main() -> None:
                     else:
                         said = estimates(where, profile, 20, rng)
                     print(f"{kernel}, input {number}: {said}", flush=True)
-            exact, applied = planned_bits(target, options.faults // 7)
+            (campaign,) = run_campaign(Plan(runs=options.faults // 7, seed=1), [target])
+            exact, applied = planned_bits(campaign.records)
             all_exact, all_applied = all_exact + exact, all_applied + applied
+            same, detoured = same_by_breakpoints(target, campaign.records)
+            all_same, all_detoured = all_same + same, all_detoured + detoured
     print(f"exactly the planned bits: {all_exact} of {all_applied} flips")
+    print(f"the same by breakpoints: {all_same} of {all_detoured} runs")
 
 
 if __name__ == "__main__":

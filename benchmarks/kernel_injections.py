@@ -3,16 +3,18 @@
     python benchmarks/kernel_injections.py [--runs 100] [--replays 50] [--kernel NAME ...]
 
 For each kernel: exact injections per hour and core (sum of the runs' durations, hangs included; and
-with the preparation spread over 5,000 runs), the share of a run that goes into process start, the
-counted executions and the golden computation, the stop time, and how many of the replays came out
-identical. Targets: 50,000 an hour for PID and point cloud, 5,000 for OctoMap and RRT*; stop median
-under 0.2 ms, 99th percentile under 1 ms; 1,000 identical replays over all kernels. What a null
-injection costs is measured by `kernel_null.py`.
+with the preparation spread over 5,000 runs), the same per hour of processor time (of tracer,
+template and runs, which other programs on the machine change less), the share of a run that goes
+into process start, the counted executions and the golden computation, the stop time, and how many
+of the replays came out identical. Targets: 50,000 an hour for PID and point cloud, 5,000 for
+OctoMap and RRT*; stop median under 0.2 ms, 99th percentile under 1 ms; 1,000 identical replays over
+all kernels. What a null injection costs is measured by `kernel_null.py`.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import tempfile
 import time
@@ -42,9 +44,22 @@ def starts(place: KernelPlace, runs: int = 4) -> tuple[float, float]:
     return float(np.mean(ready)), float(np.mean(call))
 
 
+def used_s() -> float:
+    """Processor time of this process and its children, ended ones included."""
+    spent_s = time.process_time()
+    for child in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
+        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+        spent_s += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+    return spent_s
+
+
 def measure(plan: Plan, target: KernelTarget, folder: Path, replays: int) -> tuple[int, int]:
     """Print the figures of one kernel; identical replays and all replays."""
-    (runs,) = run_campaign(plan, [target], folder=folder)
+    used: list[float] = []  # from the first run's end on
+    (runs,) = run_campaign(
+        plan, [target], folder=folder,
+        progress=lambda _, done: used.append(used_s()) if done else None,
+    )  # fmt: skip
     name, records = target.name, runs.records
     run_s = np.array([entry["run_s"] for entry in records])
     stops = [entry["injection"].get("stop_s") for entry in records]
@@ -54,10 +69,12 @@ def measure(plan: Plan, target: KernelTarget, folder: Path, replays: int) -> tup
     hangs = sum(entry["outcome"] == "hang" for entry in records)
     mean_s = run_s.mean()
     spread_s = mean_s + runs.prepare_s / 5000
+    cpu_s = (used[-1] - used[0]) / (len(used) - 1)
     rest = max(0.0, 1.0 - (ready_s + call_s) / mean_s)
     print(
         f"{name}: {3600 / mean_s:,.0f} injections per hour and core ({3600 / spread_s:,.0f} with "
-        f"{runs.prepare_s:.0f} s of preparation over 5,000 runs); {hangs} hangs"
+        f"{runs.prepare_s:.0f} s of preparation over 5,000 runs), {3600 / cpu_s:,.0f} per hour of "
+        f"processor time; {hangs} hangs"
     )
     print(
         f"  a run takes {1e3 * mean_s:.1f} ms: process start {ready_s / mean_s:.0%}, golden "
