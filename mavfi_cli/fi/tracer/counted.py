@@ -49,7 +49,8 @@ class CountedRun:
         flows = [flow(code_at(address), address) for address in addresses]
         counts = _without_repeats(addresses, [executions[each] for each in addresses], flows)
         joined = _joined(addresses, counts, flows)
-        sizes = [_straight_bytes(at, flows, joined) for at in range(len(addresses))]
+        known = dict(zip(addresses, counts, strict=True))
+        sizes = [_straight_bytes(address, code_at, known.get) for address in addresses]
         detours = tuple(_detours(addresses, sizes, flows))
         return cls(
             addresses=np.array(addresses, np.int64),
@@ -106,22 +107,29 @@ class CountedRun:
         return (*first, CountedStop(here, 1))
 
 
-def detour_at(address: int, code_at: CodeAt, executions: Callable[[int], int]) -> Detour | None:
+def detour_at(
+    address: int, code_at: CodeAt, executions: Callable[[int], int | None]
+) -> Detour | None:
     """The detour at one instruction; None if none fits there.
 
     Args:
         executions: function from an address to the number of its executions.
     """
+    size = _straight_bytes(address, code_at, executions)
+    return Detour(size) if size >= TRAITS.jump_bytes else None
+
+
+def _straight_bytes(address: int, code_at: CodeAt, executions: Callable[[int], int | None]) -> int:
+    """Bytes of the instructions from one on that a detour can replace, as many as it needs."""
     size, expected = 0, None
     while (how := flow(code_at(address + size), address + size)) is not None and how.movable:
         size += how.size
-        if size >= TRAITS.jump_bytes:
-            return Detour(size)
-        if expected is None:
-            expected = executions(address)
-        if not how.straight or executions(address + size) != expected:
-            return None
-    return None
+        if size >= TRAITS.jump_bytes or not how.straight:
+            return size
+        expected = expected or executions(address)
+        if executions(address + size) != expected:
+            return size
+    return size if how is not None else 0
 
 
 def _without_repeats(
@@ -147,17 +155,6 @@ def _joined(addresses: list[int], counts: list[int], flows: list[Flow | None]) -
         for at, how in enumerate(flows[:-1])
     ]
     return [*joined, False]
-
-
-def _straight_bytes(at: int, flows: list[Flow | None], joined: list[bool]) -> int:
-    """Bytes of the instructions from one on that a detour can replace, as many as it needs."""
-    size = 0
-    while (how := flows[at]) is not None and how.movable:
-        size += how.size
-        if size >= TRAITS.jump_bytes or not joined[at]:
-            return size
-        at += 1
-    return size if how is not None and size >= TRAITS.short_jump_bytes else 0
 
 
 def _detours(
