@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import pickle
 import signal
@@ -11,18 +12,20 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 _LENGTH = 8
+_libc = ctypes.CDLL(None)
 
 
-def fork(work: Callable[[], int], call: Callable[[], int] = os.fork) -> int:
+def fork(work: Callable[[], int], *, exact: bool = False) -> int:
     """Do work in a fork of this process, which exits with the returned code, or 1 on an error.
 
     Args:
-        call: Forks the process.
+        exact: Skip Python's hooks, which draw new random numbers, so that every fork has the same
+            memory. The process must have one thread.
 
     Returns:
         Process id of the fork.
     """
-    child = call()
+    child = int(_libc.fork()) if exact else os.fork()
     if child:
         return child
     code = 1

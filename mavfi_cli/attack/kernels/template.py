@@ -13,7 +13,6 @@ fork to the next.
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import os
 import resource
@@ -39,7 +38,6 @@ TIMES = struct.Struct("<dd")
 PID_BYTES = 4
 RUN, GO, ASK_SCOPE = b"r", b"g", b"s"
 OUTPUT = 1
-_libc = ctypes.CDLL(None)
 _LARGEST_FILE = 1 << 28
 
 
@@ -76,11 +74,8 @@ def _give_up(why: str) -> NoReturn:
 
 
 def _in_child(work: Callable[[], int]) -> int:
-    """Do work in a fork of this process; return its wait status when it has ended.
-
-    Python's own fork would draw new random numbers, so every fork would have another memory.
-    """
-    return os.waitpid(fork(work, _libc.fork), 0)[1]
+    """Do work in a fork of this process; return its wait status when it has ended."""
+    return os.waitpid(fork(work, exact=True), 0)[1]
 
 
 def _limit(extra_mb: int) -> None:
