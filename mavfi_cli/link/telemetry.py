@@ -11,9 +11,11 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
 from mavfi_cli.core.types import FloatArray, VehicleState
 from mavfi_cli.link.codec import Message, dialect
@@ -22,13 +24,13 @@ from mavfi_cli.link.texts import TextCollector
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _AutopilotProfile:
-    """Modes and command conventions of one autopilot."""
+    """Modes and command conventions of one autopilot, a table of `autopilots.toml`."""
 
     name: str
     modes: dict[str, int]  # mode name -> HEARTBEAT.custom_mode
     offboard_mode: str  # mode in which it follows our setpoints
     land_mode: str
-    arming_modes: tuple[str, ...]  # modes that allow arming; the session requests the first
+    arming_modes: list[str]  # modes that allow arming; the session requests the first
     takeoff_amsl: bool  # NAV_TAKEOFF altitude is above sea level instead of above home
     unused: float  # value of an unused command parameter
     early_setpoints: bool  # requires setpoints before the mode; False: they would abort take-off
@@ -48,57 +50,8 @@ class _AutopilotProfile:
         return float(number), 0.0
 
 
-def _px4(main: int, sub: int = 0) -> int:
-    return main << 16 | sub << 24
-
-
-PX4 = _AutopilotProfile(
-    name="PX4",
-    modes={
-        "MANUAL": _px4(1),
-        "ALTCTL": _px4(2),
-        "POSCTL": _px4(3),
-        "AUTO.READY": _px4(4, 1),
-        "AUTO.TAKEOFF": _px4(4, 2),
-        "AUTO.LOITER": _px4(4, 3),
-        "AUTO.MISSION": _px4(4, 4),
-        "AUTO.RTL": _px4(4, 5),
-        "AUTO.LAND": _px4(4, 6),
-        "ACRO": _px4(5),
-        "OFFBOARD": _px4(6),
-        "STABILIZED": _px4(7),
-    },
-    offboard_mode="OFFBOARD",
-    land_mode="AUTO.LAND",
-    arming_modes=("AUTO.LOITER", "AUTO.TAKEOFF", "POSCTL"),
-    takeoff_amsl=True,
-    unused=math.nan,
-    early_setpoints=True,
-)
-
-ARDUCOPTER = _AutopilotProfile(
-    name="ArduCopter",
-    modes={
-        "STABILIZE": 0,
-        "ACRO": 1,
-        "ALT_HOLD": 2,
-        "AUTO": 3,
-        "GUIDED": 4,
-        "LOITER": 5,
-        "RTL": 6,
-        "CIRCLE": 7,
-        "LAND": 9,
-        "BRAKE": 17,
-        "SMART_RTL": 21,
-    },
-    offboard_mode="GUIDED",
-    land_mode="LAND",
-    arming_modes=("GUIDED",),
-    takeoff_amsl=False,
-    unused=0.0,
-    early_setpoints=False,
-)
-
+_PROFILES, _ = read_toml(Path(__file__).with_name("autopilots.toml"))
+PX4, ARDUCOPTER = (_AutopilotProfile(**_PROFILES[each]) for each in ("px4", "ardupilot"))
 
 _PROFILES = {
     dialect.MAV_AUTOPILOT_PX4: PX4,

@@ -1,8 +1,8 @@
 """Parameters of the autopilot with PX4's names, types and defaults, and their wire format.
 
-Parameters marked as acting affect the flight. The others exist because ground stations request
-them. Limits apply to the values that the flight code uses, not to stored values, as PX4 stores any
-value. On the wire a value is a REAL32, or an INT32 bytewise in the float field.
+`parameters.toml` lists them. Some act on the flight. The others exist because ground stations
+request them. Limits apply to the values that the flight code uses, not to stored values, as PX4
+stores any value. On the wire a value is a REAL32, or an INT32 bytewise in the float field.
 """
 
 from __future__ import annotations
@@ -11,14 +11,18 @@ import math
 import struct
 import zlib
 from enum import Enum
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from mavfi_cli.core.config import read_toml
 from mavfi_cli.link.codec import dialect
 
 TYPE_INT32: int = dialect.MAV_PARAM_TYPE_INT32
 TYPE_REAL32: int = dialect.MAV_PARAM_TYPE_REAL32
 HASH_NAME = "_HASH_CHECK"
 HASH_INDEX = 65535
+_TABLES = Path(__file__).with_suffix(".toml")
 
 
 class _Parameter(NamedTuple):
@@ -45,73 +49,17 @@ class _Parameter(NamedTuple):
         return struct.pack("<i" if self.is_integer else "<f", value)
 
 
-_ACTING = (
-    _Parameter("BAT_CRIT_THR", 0.07, 0.0, 0.5),
-    _Parameter("BAT_LOW_THR", 0.15, 0.0, 0.5),
-    _Parameter("COM_DISARM_LAND", 2.0, -1.0, 60.0),
-    _Parameter("COM_DISARM_PRFLT", 10.0, -1.0, 600.0),
-    _Parameter("COM_OBL_RC_ACT", 3, 0, 7),
-    _Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0),
-    _Parameter("COM_RC_LOSS_T", 0.5, 0.1, 35.0),
-    _Parameter("COM_SPOOLUP_TIME", 1.0, 0.0, 30.0),
-    _Parameter("LNDMC_TRIG_TIME", 1.0, 0.1, 10.0),
-    _Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 500.0),
-    _Parameter("MPC_ACC_HOR", 3.0, 0.5, 15.0),
-    _Parameter("MPC_LAND_ALT1", 10.0, 0.0, 1000.0),
-    _Parameter("MPC_LAND_ALT2", 5.0, 0.0, 1000.0),
-    _Parameter("MPC_LAND_SPEED", 0.7, 0.2, 5.0),
-    _Parameter("MPC_MAN_Y_MAX", 150.0, 1.0, 400.0),
-    _Parameter("MPC_TKO_RAMP_T", 3.0, 0.0, 5.0),
-    _Parameter("MPC_TKO_SPEED", 1.5, 0.5, 5.0),
-    _Parameter("MPC_VEL_MANUAL", 10.0, 0.5, 20.0),
-    _Parameter("MPC_XY_CRUISE", 5.0, 0.5, 20.0),
-    _Parameter("MPC_XY_VEL_MAX", 12.0, 0.1, 20.0),
-    _Parameter("MPC_Z_VEL_MAX_DN", 1.5, 0.2, 10.0),
-    _Parameter("MPC_Z_VEL_MAX_UP", 3.0, 0.2, 10.0),
-    _Parameter("MPC_Z_V_AUTO_DN", 1.5, 0.2, 10.0),
-    _Parameter("MPC_Z_V_AUTO_UP", 3.0, 0.2, 10.0),
-    _Parameter("NAV_ACC_RAD", 2.0, 0.1, 200.0),
-    _Parameter("NAV_MC_ALT_RAD", 0.8, 0.05, 200.0),
-    _Parameter("RTL_CONE_ANG", 45, 0, 90),
-    _Parameter("RTL_DESCEND_ALT", 30.0, 0.0, 1000.0),
-    _Parameter("RTL_MIN_DIST", 10.0, 0.5, 100.0),
-    _Parameter("RTL_RETURN_ALT", 60.0, 0.0, 1000.0),
-)
-
-_PRESENT = (
-    _Parameter("BAT1_CAPACITY", -1.0),
-    _Parameter("BAT1_N_CELLS", 4),
-    _Parameter("BAT_EMERGEN_THR", 0.05),
-    _Parameter("CAL_ACC0_ID", 1310988),
-    _Parameter("CAL_GYRO0_ID", 1310988),
-    _Parameter("CAL_MAG0_ID", 197388),
-    _Parameter("CBRK_SUPPLY_CHK", 0),
-    _Parameter("COM_FLTMODE1", -1),
-    _Parameter("COM_LOW_BAT_ACT", 0),
-    _Parameter("COM_RC_IN_MODE", 3),
-    _Parameter("EKF2_HGT_REF", 1),
-    _Parameter("GF_ACTION", 2),
-    _Parameter("MAV_PROTO_VER", 2),
-    _Parameter("MAV_TYPE", 2),
-    _Parameter("NAV_DLL_ACT", 0),
-    _Parameter("NAV_RCL_ACT", 2),
-    _Parameter("RTL_LAND_DELAY", 0.0),
-    _Parameter("RTL_TYPE", 0),
-    _Parameter("SYS_AUTOSTART", 10040),
-    _Parameter("SYS_AUTOCONFIG", 0),
-    _Parameter("SYS_HAS_BARO", 1),
-    _Parameter("SYS_HAS_GPS", 1),
-    _Parameter("SYS_HAS_MAG", 1),
-)
-
-
+@cache
 def _parameter_table(system_id: int) -> tuple[_Parameter, ...]:
     """Return all parameters in index order, which is alphabetical."""
-    fixed = (
+    tables, _ = read_toml(_TABLES)
+    rows = [
+        *(_Parameter(name, *values) for name, values in tables["acting"].items()),
+        *(_Parameter(name, default) for name, default in tables["present"].items()),
         _Parameter("MAV_COMP_ID", 1, read_only=True),
         _Parameter("MAV_SYS_ID", system_id, read_only=True),
-    )
-    return tuple(sorted((*_ACTING, *_PRESENT, *fixed), key=lambda row: row.name))
+    ]
+    return tuple(sorted(rows, key=lambda row: row.name))
 
 
 class SetResult(Enum):

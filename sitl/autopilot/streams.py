@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
+from mavfi_cli.core.config import read_toml
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.telemetry import BUILDERS, Builder, Snapshot
 
@@ -15,47 +17,16 @@ STEPS_A_TICK = 5
 STEP_US = TICK_US // STEPS_A_TICK  # step of the physics, the shortest interval of any stream
 _OUTBOX = 500  # messages that wait for a client; the oldest are dropped first
 
-_SLOW: Mapping[str, float] = {
-    "HEARTBEAT": 1.0,
-    "SYSTEM_TIME": 1.0,
-    "PING": 1.0,
-    "ESTIMATOR_STATUS": 1.0,
-    "MISSION_CURRENT": 1.0,
-    "GPS_GLOBAL_ORIGIN": 1.0,
-    "BATTERY_STATUS": 0.5,
-    "HOME_POSITION": 0.5,
-    "VIBRATION": 0.5,
-}
-
 
 class Preset(Enum):
-    """Set of default rates of a link."""
+    """Set of default rates of a link, in `streams.toml`."""
 
     ONBOARD = "onboard"  # PX4 v1.17's link to a companion
     GCS = "gcs"  # PX4 v1.17's link to a ground station
     LOCKSTEP = "lockstep"  # only the messages that a companion in lockstep needs
 
 
-_RATES_HZ: Mapping[Preset, Mapping[str, float]] = {
-    Preset.ONBOARD: {
-        **_SLOW, "ATTITUDE": 50.0, "HIGHRES_IMU": 50.0, "ATTITUDE_QUATERNION": 50.0,
-        "GLOBAL_POSITION_INT": 50.0, "LOCAL_POSITION_NED": 30.0, "ODOMETRY": 30.0,
-        "TIMESYNC": 10.0, "ALTITUDE": 10.0, "ATTITUDE_TARGET": 10.0,
-        "POSITION_TARGET_LOCAL_NED": 10.0, "SERVO_OUTPUT_RAW": 10.0, "VFR_HUD": 10.0,
-        "GPS_RAW_INT": 8.0, "SYS_STATUS": 5.0, "EXTENDED_SYS_STATE": 5.0,
-    },
-    Preset.GCS: {
-        **_SLOW, "LOCAL_POSITION_NED": 50.0, "ATTITUDE": 50.0, "GLOBAL_POSITION_INT": 50.0,
-        "ATTITUDE_TARGET": 50.0, "POSITION_TARGET_LOCAL_NED": 50.0, "SERVO_OUTPUT_RAW": 50.0,
-        "TIMESYNC": 10.0, "GPS_RAW_INT": 5.0, "VFR_HUD": 4.0, "SYS_STATUS": 1.0,
-        "EXTENDED_SYS_STATE": 1.0, "ALTITUDE": 1.0,
-    },
-    Preset.LOCKSTEP: {
-        "LOCAL_POSITION_NED": 50.0, "ATTITUDE_QUATERNION": 50.0, "HEARTBEAT": 1.0,
-        "SYS_STATUS": 1.0, "EXTENDED_SYS_STATE": 5.0, "BATTERY_STATUS": 0.5,
-        "HOME_POSITION": 0.5,
-    },
-}  # fmt: skip
+_RATES_HZ, _ = read_toml(Path(__file__).with_suffix(".toml"))
 
 
 class _Stream:
@@ -83,7 +54,7 @@ class Link:
         self.in_lockstep = preset is Preset.LOCKSTEP
         self.outbox: list[Any] = []
         self.parameters_left: deque[int] = deque()
-        self._rates_hz = _RATES_HZ[preset]
+        self._rates_hz: Mapping[str, float] = _RATES_HZ[preset.value]
         self._streams = {
             number: _Stream(build, self._default_us(number)) for number, build in BUILDERS.items()
         }
