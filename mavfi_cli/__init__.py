@@ -11,14 +11,13 @@ if TYPE_CHECKING:
     from mavfi_cli.campaigns.missions import PlannedMission
     from mavfi_cli.campaigns.run import run_campaign
     from mavfi_cli.core.errors import MavfiError
-    from mavfi_cli.core.versions import __version__
+    from mavfi_cli.core.installed import __version__
     from mavfi_cli.fi.value import inject
     from mavfi_cli.library import campaign, fly
     from mavfi_cli.mission.golden import paired_golden
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.spec.detector import DetectorConfig
-    from mavfi_cli.spec.fault import FaultConfig
-    from mavfi_cli.spec.instruction import InstructionConfig
+    from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
     from mavfi_cli.spec.mission import MissionConfig
 
 __all__ = [
@@ -40,11 +39,11 @@ __all__ = [
 _MODULES = {  # name -> module that defines it
     "DetectorConfig": "mavfi_cli.spec.detector",
     "FaultConfig": "mavfi_cli.spec.fault",
-    "InstructionConfig": "mavfi_cli.spec.instruction",
+    "InstructionConfig": "mavfi_cli.spec.fault",
     "MavfiError": "mavfi_cli.core.errors",
     "MissionConfig": "mavfi_cli.spec.mission",
     "PlannedMission": "mavfi_cli.campaigns.missions",
-    "__version__": "mavfi_cli.core.versions",
+    "__version__": "mavfi_cli.core.installed",
     "campaign": "mavfi_cli.library",
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.value",

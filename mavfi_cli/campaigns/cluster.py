@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.campaigns.workers import TASK, AttemptEnd, CampaignStopped, LocalWorkers, Workers
 from mavfi_cli.core.fork_server import SCRATCH
-from mavfi_cli.core.versions import installed_versions, version_differences
+from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.mission.record.run_folder import FAULT, RESULT
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, nearest
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.spec.detector import DetectorConfig
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 SAMPLE = 20  # `sampled` keeps about one success in 20

@@ -22,8 +22,7 @@ from mavfi_cli.core.errors import ConfigError, FaultSpecError
 
 if TYPE_CHECKING:
     from mavfi_cli.spec.detector import DetectorConfig
-    from mavfi_cli.spec.fault import FaultConfig
-    from mavfi_cli.spec.instruction import InstructionConfig
+    from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
     from mavfi_cli.spec.mission import MissionConfig
 
 _SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together"}
@@ -282,8 +281,7 @@ def _faults(
     base: MissionConfig, given: dict[str, Any]
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
     """The mission's fault at source or instruction level, checked."""
-    from mavfi_cli.spec.fault import FaultConfig
-    from mavfi_cli.spec.instruction import InstructionConfig
+    from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
     source = given.get("level", "source" if base.instruction is None else "instruction") == "source"
     prior = base.fault if source else base.instruction

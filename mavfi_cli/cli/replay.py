@@ -39,7 +39,7 @@ def replay(
         return
     from mavfi_cli.core.errors import Interrupted
     from mavfi_cli.core.files import file_digest
-    from mavfi_cli.core.versions import installed_versions, version_differences
+    from mavfi_cli.core.installed import installed_versions, version_differences
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.repetition import fly_again
     from mavfi_cli.mission.replay import (

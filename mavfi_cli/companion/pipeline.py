@@ -27,8 +27,7 @@ from mavfi_cli.companion.executor import Executor, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of
 from mavfi_cli.companion.latency import LatencyModel
-from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
-from mavfi_cli.companion.recovery import Recovery
+from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Recovery, Response
 from mavfi_cli.core.states import Message, of_stage
 from mavfi_cli.core.types import (
     Briefing,

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from mavfi_cli.core.plug_ins import installed, load_plug_in
+from mavfi_cli.core.installed import installed, load_plug_in
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect.preprocess import Codes
 

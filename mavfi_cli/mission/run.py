@@ -24,9 +24,9 @@ from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
 from mavfi_cli.core.files import file_digest, write_json, write_parquet
+from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome, Reaction
-from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.link.images import ImageReceiver
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.flight import Flight

@@ -9,8 +9,7 @@ from typing import Any
 from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.spec.detector import DetectorConfig
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.platform import measured_factor
 from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack
 

@@ -19,8 +19,8 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, fly_missing
 from mavfi_cli.campaigns.specification import Keep, Setting, Spec
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.types import Stage
-from mavfi_cli.core.versions import installed_versions
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import DEFAULT

@@ -23,7 +23,7 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import PROFILES, Options
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError, RecordError
-from mavfi_cli.core.versions import installed_versions
+from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.model import training_flights
 from mavfi_cli.spec.detector import detector_of, model_path

@@ -18,8 +18,7 @@ from mavfi_cli.core.types import Stage
 from mavfi_cli.detect.base import detector_names
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.spec.detector import STAGES, DetectorConfig, detector_of
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.studies.flying import require_named
 

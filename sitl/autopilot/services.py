@@ -12,11 +12,10 @@ import numpy as np
 
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.commander import GPS_FIX_US, FlightMode, Result, Severity
-from sitl.autopilot.descriptions import DESCRIPTIONS
 from sitl.autopilot.parameters import HASH_INDEX, HASH_NAME, SetResult
 from sitl.autopilot.setpoint import SetpointRefused, global_setpoint, local_setpoint
 from sitl.autopilot.streams import Link
-from sitl.autopilot.telemetry import BUILDERS, int32
+from sitl.autopilot.telemetry import BUILDERS, DESCRIPTIONS, int32
 
 if TYPE_CHECKING:
     from sitl.autopilot.autopilot import Autopilot

@@ -39,7 +39,7 @@ run_campaign(planned(*worlds), Path(folder), options, Telling()).close()
 # A worker of another build: what it says of its versions is changed before it serves.
 OTHER_BUILD = """
 import sys
-import mavfi_cli.core.versions as versions
+import mavfi_cli.core.installed as versions
 versions.__dict__["__version__"] = "0.0.1"
 from distributed.cli.dask_worker import main
 sys.argv = ["dask-worker", *sys.argv[1:]]

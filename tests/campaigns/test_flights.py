@@ -10,8 +10,7 @@ from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.mission.record.run_folder import RunFolder
 from mavfi_cli.spec.detector import DetectorConfig
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 FAULT = FaultConfig(target="waypoint_position", at="time=1", together=True, field="mantissa")
 DETECTOR = DetectorConfig(name="gad", protect=("planning", "control"))

@@ -17,8 +17,7 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 ROW = {

@@ -12,8 +12,7 @@ from mavfi_cli.mission import run as run_module
 from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams
-from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
-from mavfi_cli.companion.recovery import Recovery
+from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Recovery, Response
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.detect.gate import Alarm
 from mavfi_cli.fi.source.injector import Follower

@@ -10,8 +10,7 @@ from record_digest import record_digest
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.spec.detector import DetectorConfig
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 _WAYPOINT = FaultConfig(target="planning", seed=25)

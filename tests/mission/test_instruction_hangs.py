@@ -17,7 +17,7 @@ from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 SEGMENT = "numba:segment_free"

@@ -4,7 +4,7 @@ import pytest
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.mission.vehicle import with_firmware
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 PLANNER = InstructionConfig(target="planner")

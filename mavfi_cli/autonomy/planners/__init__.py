@@ -9,7 +9,7 @@ from mavfi_cli.autonomy.planners.base import (
     pose_problem,
 )
 from mavfi_cli.autonomy.planners.ompl import OMPL_PLANNERS
-from mavfi_cli.core.plug_ins import installed, load_plug_in
+from mavfi_cli.core.installed import installed, load_plug_in
 
 __all__ = [
     "PlanResult",

@@ -37,7 +37,7 @@ from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 T = TypeVar("T")
