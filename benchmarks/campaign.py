@@ -19,8 +19,7 @@ from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.fault import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 STACK = "hardened"  # of the figures in docs/results/speed.md

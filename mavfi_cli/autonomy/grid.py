@@ -8,8 +8,8 @@ one voxel diagonal more than needed. Unknown space is free, as in MAVBench.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,45 @@ class ObstacleGrid:
     bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax; outside is blocked
     radius_m: float
 
+    @classmethod
+    def build(cls, snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> Self:
+        """Build the grid of a map inside `bounds_enu_m` (6,), dilated by `radius_m`.
+
+        Occupied voxels outside the bounds count if their dilation reaches inside.
+        """
+        resolution = snapshot.resolution_m
+        reach = math.ceil(radius_m / resolution) + 1
+        leaves = occupied_leaves(snapshot.payload)
+        low, size = _extent(leaves, bounds_enu_m, resolution, reach)
+        blocked = np.zeros(tuple(size), np.uint8)
+        if blocked.size and len(leaves):
+            occupied = np.zeros_like(blocked)
+            _rasterise(leaves, low, occupied)
+            _dilate(occupied, _run_half_widths(radius_m, resolution), blocked)
+        return cls(
+            blocked=blocked,
+            origin_enu_m=low.astype(np.float64) * resolution,
+            resolution_m=resolution,
+            bounds_enu_m=np.asarray(bounds_enu_m, np.float64),
+            radius_m=radius_m,
+        )
+
+    def blended(self, inner: ObstacleGrid, centre_enu_m: FloatArray, radius_m: float) -> Self:
+        """Return the grid with the blocked voxels of `inner` within the radius of the centre."""
+        blocked = self.blocked.copy()
+        resolution = self.resolution_m
+        to_inner = np.rint((self.origin_enu_m - inner.origin_enu_m) / resolution).astype(np.int64)
+        indices = np.indices(blocked.shape, sparse=True)
+        centre = (centre_enu_m - self.origin_enu_m) / resolution - 0.5
+        near = sum((indices[axis] - centre[axis]) ** 2 for axis in range(3))
+        chosen = np.argwhere(near <= (radius_m / resolution) ** 2)
+        inside = chosen + to_inner
+        known = ((inside >= 0) & (inside < inner.blocked.shape)).all(axis=1)
+        values = np.zeros(len(chosen), np.uint8)
+        values[known] = inner.blocked[tuple(inside[known].T)]
+        blocked[tuple(chosen.T)] = values
+        return replace(self, blocked=blocked)
+
     def point_free(self, point_enu_m: FloatArray) -> bool:
         """Return True if the vehicle's centre may be at the point (3,)."""
         return self.segment_free(point_enu_m, point_enu_m)
@@ -56,29 +95,6 @@ class ObstacleGrid:
             np.ascontiguousarray(points_enu_m),
         )  # fmt: skip
         return free
-
-
-def build(snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> ObstacleGrid:
-    """Build the grid of a map inside `bounds_enu_m` (6,), dilated by `radius_m`.
-
-    Occupied voxels outside the bounds count if their dilation reaches inside.
-    """
-    resolution = snapshot.resolution_m
-    reach = math.ceil(radius_m / resolution) + 1
-    leaves = occupied_leaves(snapshot.payload)
-    low, size = _extent(leaves, bounds_enu_m, resolution, reach)
-    blocked = np.zeros(tuple(size), np.uint8)
-    if blocked.size and len(leaves):
-        occupied = np.zeros_like(blocked)
-        _rasterise(leaves, low, occupied)
-        _dilate(occupied, _run_half_widths(radius_m, resolution), blocked)
-    return ObstacleGrid(
-        blocked=blocked,
-        origin_enu_m=low.astype(np.float64) * resolution,
-        resolution_m=resolution,
-        bounds_enu_m=np.asarray(bounds_enu_m, np.float64),
-        radius_m=radius_m,
-    )
 
 
 def _extent(
@@ -234,22 +250,3 @@ def path_free(
         ):  # fmt: skip
             return False
     return True
-
-
-def blend(
-    grid: ObstacleGrid, inner: ObstacleGrid, centre_enu_m: FloatArray, radius_m: float
-) -> Blocked:
-    """Return the blocked voxels of `inner` within the radius of the centre, of `grid` elsewhere."""
-    blocked = grid.blocked.copy()
-    resolution = grid.resolution_m
-    to_inner = np.rint((grid.origin_enu_m - inner.origin_enu_m) / resolution).astype(np.int64)
-    indices = np.indices(blocked.shape, sparse=True)
-    centre = (centre_enu_m - grid.origin_enu_m) / resolution - 0.5
-    near = sum((indices[axis] - centre[axis]) ** 2 for axis in range(3))
-    chosen = np.argwhere(near <= (radius_m / resolution) ** 2)
-    inside = chosen + to_inner
-    known = ((inside >= 0) & (inside < inner.blocked.shape)).all(axis=1)
-    values = np.zeros(len(chosen), np.uint8)
-    values[known] = inner.blocked[tuple(inside[known].T)]
-    blocked[tuple(chosen.T)] = values
-    return blocked

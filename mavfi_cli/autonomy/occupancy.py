@@ -44,6 +44,19 @@ class MapSnapshot:
     resolution_m: float
     payload: bytes  # node stream after the header's `data` line; empty for an empty map
 
+    @classmethod
+    def empty(cls, resolution_m: float = 0.2) -> MapSnapshot:
+        """Return the snapshot of an empty map."""
+        return cls(stamp_s=-math.inf, resolution_m=resolution_m, payload=b"")
+
+    @classmethod
+    def of_points(cls, points_enu_m: FloatArray, resolution_m: float = 0.2) -> MapSnapshot:
+        """Return a snapshot in which exactly the voxels of the points (n, 3) are occupied."""
+        codes = np.empty(len(points_enu_m), np.int64)
+        count = octree.morton_codes(np.asarray(points_enu_m, np.float64), resolution_m, codes)
+        payload = octree.encode(np.unique(codes[:count]))
+        return cls(stamp_s=0.0, resolution_m=resolution_m, payload=payload)
+
     def signed_bytes(self) -> NDArray[np.int8]:
         """Return the payload (n,) in the type that `fcl.OcTree` takes."""
         return np.frombuffer(self.payload, np.int8)
@@ -143,16 +156,3 @@ class OccupancyMap:
         octree.voxel_centres(self._ended_in, resolution, centres)
         inside = ((centres >= low - resolution) & (centres <= high + resolution)).all(axis=1)
         self._occupied[inside] = self._tree.getLabels(centres[inside]) == 1
-
-
-def empty_snapshot(resolution_m: float = 0.2) -> MapSnapshot:
-    """Return the snapshot of an empty map."""
-    return MapSnapshot(stamp_s=-math.inf, resolution_m=resolution_m, payload=b"")
-
-
-def snapshot_of(points_enu_m: FloatArray, resolution_m: float = 0.2) -> MapSnapshot:
-    """Return a snapshot in which exactly the voxels of the points (n, 3) are occupied."""
-    codes = np.empty(len(points_enu_m), np.int64)
-    count = octree.morton_codes(np.asarray(points_enu_m, np.float64), resolution_m, codes)
-    payload = octree.encode(np.unique(codes[:count]))
-    return MapSnapshot(stamp_s=0.0, resolution_m=resolution_m, payload=payload)

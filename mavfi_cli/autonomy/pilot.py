@@ -106,7 +106,7 @@ class PilotParams:
 
 
 @dataclass(slots=True)
-class Counters:
+class _Counters:
     """Counters of the mission's record."""
 
     plans_requested: int = 0
@@ -146,7 +146,7 @@ class Pilot:
     def __init__(self, params: PilotParams, goal_enu_m: FloatArray) -> None:
         self.params = params
         self.goal_enu_m = goal_enu_m
-        self.counters = Counters()
+        self.counters = _Counters()
         self.mode = PilotMode.WAITING
         self.active = ActivePlan(params.v_max_mps, params.brake_mps2)
         self._next: Trajectory | None = None

@@ -246,7 +246,7 @@ def _mission_of(path: Path | None) -> MissionConfig:
 def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     """The mission with the given options in place."""
     from mavfi_cli.spec.detector import detector_of
-    from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT, stack_of
+    from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT
     from mavfi_cli.spec.platform import measured_factor
 
     fault, instruction = _faults(base, given)
@@ -269,7 +269,7 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
         land=land,
         **{name: value for name, value in given.items() if name in own},
     )
-    stack_of(mission)
+    mission.loaded_stack()
     if mission.detector is not None:
         detector_of(mission.detector, mission.stack)
     elif fault is not None and fault.attacks_detector:

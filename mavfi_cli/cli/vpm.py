@@ -99,7 +99,7 @@ def vpm(
     from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
     from mavfi_cli.vpm.model import schemes_with
     from mavfi_cli.vpm.report import report
-    from mavfi_cli.vpm.vehicle import load_vehicle
+    from mavfi_cli.vpm.vehicle import ModelVehicle
 
     if as_json and as_csv:
         raise click.UsageError("--json or --csv, not both")
@@ -112,7 +112,7 @@ def vpm(
             refuse_given(["chain"], "or --response, not both: either is the response time")
     if options["models"] is not None and options["train"]:
         raise click.UsageError("--models or --train, not both")
-    chosen = [load_vehicle(name) for name in vehicles or ("airsim", "spark")]
+    chosen = [ModelVehicle.load(name) for name in vehicles or ("airsim", "spark")]
     require_distinct([vehicle.name for vehicle in chosen], "vehicle")
     choices = _choices(options)
     platform = choices.platform
@@ -196,13 +196,13 @@ def _flown(
 def _choices(options: dict[str, Any]) -> Any:
     from mavfi_cli.spec.platform import load_platform
     from mavfi_cli.vpm.report import Choices
-    from mavfi_cli.vpm.vehicle import load_board
+    from mavfi_cli.vpm.vehicle import Board
 
     platform, board = options["platform"], options["board"]
     return Choices(
         platform=None if platform is None else load_platform(platform),
         chain=options["chain"],
-        board=None if board is None else load_board(board),
+        board=None if board is None else Board.load(board),
         response_s=options["response"],
         range_m=options["range_"],
         distance_m=options["distance"],

@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 
 from mavfi_cli.autonomy.collision import CollisionInputs
-from mavfi_cli.autonomy.occupancy import MapSnapshot, empty_snapshot
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams, PlanRequest
 from mavfi_cli.autonomy.planners.base import Planner
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
@@ -383,7 +383,7 @@ class Companion:
     def _octomap_is_up(self) -> None:
         """Nodes in OctoMap's process have lost the map."""
         if self._octomap.mates:
-            self._map = empty_snapshot(self._config.map_resolution_m)
+            self._map = MapSnapshot.empty(self._config.map_resolution_m)
 
     def _planner_is_up(self) -> None:
         """Repeat the lost request unless a newer one is waiting."""

@@ -58,8 +58,28 @@ class ImageFrame:
 
     stamp_s: float  # time of capture on the vehicle's boot clock
     index: int
-    pixels: NDArray[np.uint8]  # (rows, columns), read-only
+    pixels: NDArray[np.uint8]  # (rows, columns), read-only; steps of 0.1 m, 255: nothing in range
     hfov_rad: float | None  # None until the camera reports it
+
+    def depth_frame(
+        self, state: VehicleState, *, hfov_rad: float, mount_offset_flu_m: FloatArray
+    ) -> DepthFrame:
+        """Convert to metres and add the pose of the camera at the capture.
+
+        Args:
+            state: Vehicle state at the image's stamp.
+            hfov_rad: Horizontal field of view to use if the image has none.
+            mount_offset_flu_m: Offset (3,) of the optical centre from the vehicle's centre. The
+                camera looks along the vehicle's x axis.
+        """
+        offset_m = rotation_matrix(state.quaternion) @ np.asarray(mount_offset_flu_m, np.float64)
+        return DepthFrame(
+            stamp_s=self.stamp_s,
+            depth_m=_DEPTH_M.take(self.pixels),
+            hfov_rad=hfov_rad if self.hfov_rad is None else self.hfov_rad,
+            position_enu_m=state.position_enu_m + offset_m,
+            quaternion=state.quaternion,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -298,25 +318,3 @@ def _shape_of(message: Message) -> _Shape | None:
 
 
 _DEPTH_M[NOTHING] = np.inf
-
-
-def depth_frame(
-    image: ImageFrame, state: VehicleState, *, hfov_rad: float, mount_offset_flu_m: FloatArray
-) -> DepthFrame:
-    """Convert an image to metres and add the pose of the camera at its capture.
-
-    Args:
-        image: Image in steps of 0.1 m; 255 means that nothing was in range.
-        state: Vehicle state at the image's stamp.
-        hfov_rad: Horizontal field of view to use if the image has none.
-        mount_offset_flu_m: Offset (3,) of the optical centre from the vehicle's centre. The camera
-            looks along the vehicle's x axis.
-    """
-    offset_enu_m = rotation_matrix(state.quaternion) @ np.asarray(mount_offset_flu_m, np.float64)
-    return DepthFrame(
-        stamp_s=image.stamp_s,
-        depth_m=_DEPTH_M.take(image.pixels),
-        hfov_rad=hfov_rad if image.hfov_rad is None else image.hfov_rad,
-        position_enu_m=state.position_enu_m + offset_enu_m,
-        quaternion=state.quaternion,
-    )

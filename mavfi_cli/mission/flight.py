@@ -25,7 +25,7 @@ from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.images import ImageFrame, ImageReceiver, depth_frame
+from mavfi_cli.link.images import ImageFrame, ImageReceiver
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.tlog import RecordedLink
@@ -376,8 +376,7 @@ class Flight:
             pose = self._session.state_at(image.stamp_s)
             if pose is not None:
                 companion.take_frame(
-                    depth_frame(
-                        image,
+                    image.depth_frame(
                         pose,
                         hfov_rad=self._briefing.hfov_rad,
                         mount_offset_flu_m=self._briefing.camera_offset_flu_m,

@@ -33,7 +33,7 @@ from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.measures import record_of
-from mavfi_cli.mission.record.run_folder import RunFolder, new_run_folder, stem_of
+from mavfi_cli.mission.record.run_folder import RunFolder, stem_of
 from mavfi_cli.mission.record.tables import Timetable, write_plans, write_timetable
 from mavfi_cli.mission.vehicle import (
     StartVehicle,
@@ -42,7 +42,7 @@ from mavfi_cli.mission.vehicle import (
     start_vehicle,
     with_firmware,
 )
-from mavfi_cli.spec.mission import MissionConfig, stack_of
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 
 COMPILING = "compiling the kernels, once on this machine: this takes a while"
@@ -74,7 +74,7 @@ def fly_mission(
             or its record could not be written.
     """
     config = with_firmware(config)
-    platform, stack = load_platform(config.platform), stack_of(config)
+    platform, stack = load_platform(config.platform), config.loaded_stack()
     planner = planners.find(config.planner)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
@@ -88,7 +88,7 @@ def fly_mission(
             flight.injection = injection
         _begin(flight, config, vehicle, recorder)
         name = stem_of(config.world) if config.link is None else "link"
-        folder = new_run_folder(out, f"{name}-{config.seed}")
+        folder = RunFolder.new(out, f"{name}-{config.seed}")
         flight.injection.begin(folder.fault)
         flight_begun_s = time.perf_counter()
         with flight.isolated_nodes():

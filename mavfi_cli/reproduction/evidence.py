@@ -19,7 +19,7 @@ from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
 from mavfi_cli.reproduction.missions import key_of, missions_of
 from mavfi_cli.vpm.model import schemes_with
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 _VEHICLES = ("airsim", "spark")
 
@@ -42,7 +42,7 @@ def items_of_preset(name: str) -> tuple[Item, ...]:
 
 def model_report() -> Mapping[str, Any]:
     """The performance model of the paper's two vehicles, with the paper's overheads."""
-    vehicles = [load_vehicle(name) for name in _VEHICLES]
+    vehicles = [ModelVehicle.load(name) for name in _VEHICLES]
     return report(vehicles, Choices(), schemes_with({}))
 
 

@@ -234,8 +234,7 @@ class MissionConfig:
         files = tuple(name for name in named if name.endswith(".toml"))
         return files + tuple(name for name in (model, self.firmware) if name)
 
-
-def stack_of(config: MissionConfig) -> Stack:
-    """Return the stack of a mission with its goal tolerance. Raises as `load_stack`."""
-    stack, own_m = load_stack(config.stack), config.goal_tolerance_m
-    return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)
+    def loaded_stack(self) -> Stack:
+        """Return the stack of the mission with its goal tolerance. Raises as `load_stack`."""
+        stack, own_m = load_stack(self.stack), self.goal_tolerance_m
+        return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)

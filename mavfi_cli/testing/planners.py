@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.autonomy import planners
-from mavfi_cli.autonomy.occupancy import MapSnapshot, empty_snapshot, snapshot_of
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem, pose_problem
 from mavfi_cli.core.types import FloatArray
 
@@ -22,7 +22,7 @@ START, GOAL = np.array([0.0, 0.0, 5.0]), np.array([20.0, 0.0, 5.0])
 Corner = tuple[float, float, float]
 
 
-def slab(low: Corner | FloatArray, high: Corner | FloatArray) -> FloatArray:
+def _slab(low: Corner | FloatArray, high: Corner | FloatArray) -> FloatArray:
     """Points that fill the voxels of a box."""
     axes = [
         np.arange(a, b, RESOLUTION_M) + 0.5 * RESOLUTION_M for a, b in zip(low, high, strict=True)
@@ -32,9 +32,9 @@ def slab(low: Corner | FloatArray, high: Corner | FloatArray) -> FloatArray:
 
 def wall_with_gap(gap_m: float = 4.0) -> MapSnapshot:
     """A wall across all of the bounds but for a gap at y = 6."""
-    below = slab((10, -13, 0), (10.4, 6 - gap_m / 2, 11))
-    above = slab((10, 6 + gap_m / 2, 0), (10.4, 13, 11))
-    return snapshot_of(np.vstack([below, above]))
+    below = _slab((10, -13, 0), (10.4, 6 - gap_m / 2, 11))
+    above = _slab((10, 6 + gap_m / 2, 0), (10.4, 13, 11))
+    return MapSnapshot.of_points(np.vstack([below, above]))
 
 
 def _closed_box(around: FloatArray, half: float = 3.0) -> MapSnapshot:
@@ -45,8 +45,8 @@ def _closed_box(around: FloatArray, half: float = 3.0) -> MapSnapshot:
             low, high = around - half, around + half + RESOLUTION_M
             low[axis] = around[axis] + side
             high[axis] = low[axis] + RESOLUTION_M
-            faces.append(slab(low, high))
-    return snapshot_of(np.vstack(faces))
+            faces.append(_slab(low, high))
+    return MapSnapshot.of_points(np.vstack(faces))
 
 
 def posed(
@@ -59,7 +59,7 @@ def posed(
     return pose_problem(snapshot, start, goal, BOUNDS, params)
 
 
-def clearance(path: FloatArray, snapshot: MapSnapshot) -> float:
+def _clearance(path: FloatArray, snapshot: MapSnapshot) -> float:
     """Exact distance between a path and the map, by FCL."""
     tree = fcl.CollisionObject(fcl.OcTree(snapshot.resolution_m, snapshot.signed_bytes()))
     smallest = np.inf
@@ -96,7 +96,7 @@ class PlannerContract:
             np.testing.assert_array_equal(result.path_enu_m[-1], GOAL)
             assert (result.path_enu_m >= BOUNDS[:3]).all()
             assert (result.path_enu_m <= BOUNDS[3:]).all()
-            assert clearance(result.path_enu_m, snapshot) >= PARAMS.radius_m - 1e-6
+            assert _clearance(result.path_enu_m, snapshot) >= PARAMS.radius_m - 1e-6
 
     def test_is_a_function_of_problem_and_seed(self, name: str) -> None:
         problem = posed(wall_with_gap())
@@ -127,7 +127,7 @@ class PlannerContract:
         assert 17.0 < result.nearest_m <= 20.0
 
     def test_free_sight_is_flown_straight(self, name: str) -> None:
-        result = planners.find(name).plan(posed(empty_snapshot()), 1)
+        result = planners.find(name).plan(posed(MapSnapshot.empty()), 1)
         assert result.found
         assert result.length_m == pytest.approx(20.0, rel=0.01)
 
@@ -154,4 +154,4 @@ class PlannerContract:
         result = planners.find(name).plan(posed(wall_with_gap(), start), 2)
         assert result.found, result.reason
         far = np.linalg.norm(result.path_enu_m - start, axis=1) > PARAMS.escape_radius_m + 0.2
-        assert clearance(result.path_enu_m[far], wall_with_gap()) >= PARAMS.radius_m - 1e-6
+        assert _clearance(result.path_enu_m[far], wall_with_gap()) >= PARAMS.radius_m - 1e-6

@@ -26,7 +26,7 @@ from mavfi_cli.vpm.model import (
     outcome,
     safe_velocity_mps,
 )
-from mavfi_cli.vpm.vehicle import SMALLEST, Board, ModelVehicle, load_board
+from mavfi_cli.vpm.vehicle import SMALLEST, Board, ModelVehicle
 
 # How the latencies of a platform's kernels add up to one response time, and the words for it.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
@@ -205,7 +205,7 @@ def _board(vehicle: ModelVehicle, choices: Choices) -> Board:
     if not vehicle.board:
         raise ConfigError(f"vehicle {vehicle.name!r} has none: give --platform or --board",
                           key="board")  # fmt: skip
-    return load_board(vehicle.board)
+    return Board.load(vehicle.board)
 
 
 def _parameters(setting: ModelInputs, sources: dict[str, str], free: str) -> list[dict[str, Any]]:
@@ -256,7 +256,7 @@ def _calibrations(vehicle: ModelVehicle, found: _Calibrated | None) -> list[dict
         return []
     both = [found]
     if found.board.name != OTHER_BOARD:
-        both.append(calibrated(vehicle, load_board(OTHER_BOARD)))
+        both.append(calibrated(vehicle, Board.load(OTHER_BOARD)))
     return [
         {
             "board": each.board.name,
@@ -388,7 +388,7 @@ def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated
     """
     plan = vehicle.calibration
     assert plan is not None
-    board = board or load_board(plan.board)
+    board = board or Board.load(plan.board)
     known = {scheme.name: scheme for scheme in SCHEMES}
 
     def setting(value: float) -> ModelInputs:

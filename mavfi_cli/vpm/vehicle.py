@@ -75,6 +75,16 @@ class ModelVehicle:
         if free == "rotor_pull_n" and self.response_s is None:
             raise ValueError("response_s: is missing, the calibration needs it")
 
+    @classmethod
+    def load(cls, name_or_path: str) -> ModelVehicle:
+        """A shipped vehicle of the model by name, or a user's own by the path of its TOML file.
+
+        Raises:
+            UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
+            ConfigError: the file cannot be used.
+        """
+        return load_toml(shipped_path("vehicle", name_or_path, _VEHICLES), cls)
+
     @property
     def stand_in(self) -> str:
         """The simulated vehicle that flies in place of this one."""
@@ -86,16 +96,6 @@ class ModelVehicle:
     def tilt_rad(self) -> float:
         """Angle between the thrust and the vertical, rad."""
         return math.radians(self.tilt_deg)
-
-
-def load_vehicle(name_or_path: str) -> ModelVehicle:
-    """A shipped vehicle of the model by name, or a user's own by the path of its TOML file.
-
-    Raises:
-        UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
-        ConfigError: the file cannot be used.
-    """
-    return load_toml(shipped_path("vehicle", name_or_path, _VEHICLES), ModelVehicle)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,6 +118,16 @@ class Board:
         return self.mass_kg + self.heatsink_kgpw * self.power_w
 
     @classmethod
+    def load(cls, name_or_path: str) -> Board:
+        """A shipped board by name, or a user's own by the path of its TOML file.
+
+        Raises:
+            UnknownName: no shipped board has this name, and it is not a path to a TOML file.
+            ConfigError: the file cannot be used.
+        """
+        return load_toml(shipped_path("board", name_or_path, _BOARDS), cls)
+
+    @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:
         """The board of a platform; a platform on the ground has neither mass nor power."""
         told = f"platform {platform.name}"
@@ -130,13 +140,3 @@ class Board:
             sources=sources,
             **{key: getattr(platform, key) if platform.carried else 0.0 for key in HARDWARE},
         )
-
-
-def load_board(name_or_path: str) -> Board:
-    """A shipped board by name, or a user's own by the path of its TOML file.
-
-    Raises:
-        UnknownName: no shipped board has this name, and it is not a path to a TOML file.
-        ConfigError: the file cannot be used.
-    """
-    return load_toml(shipped_path("board", name_or_path, _BOARDS), Board)

@@ -13,11 +13,11 @@ from mavfi_cli.autonomy.collision import (
     CollisionState,
     time_to_collision,
 )
-from mavfi_cli.autonomy.occupancy import empty_snapshot, snapshot_of
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.core.types import Trajectory
 
 PARAMS = CollisionParams()
-FREE = empty_snapshot()
+FREE = MapSnapshot.empty()
 
 
 def straight(speed_mps=3.0, count=30, y=0.1, seq=1):
@@ -36,7 +36,7 @@ def straight(speed_mps=3.0, count=30, y=0.1, seq=1):
 def wall(x=20.1, half_width=3.0):
     across = np.arange(-half_width, half_width, 0.2) + 0.1
     y, z = np.meshgrid(across, across + 5.0)
-    return snapshot_of(np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1))
+    return MapSnapshot.of_points(np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1))
 
 
 def inputs(snapshot, trajectory, time_s=0.0):
@@ -61,7 +61,7 @@ def test_what_lies_behind_does_not_matter():
 def test_the_radius_decides_beside_an_obstacle(offset_m, hit):
     # One voxel, [10, 10.2] x [0, 0.2] x [5, 5.2]; the path passes its face at `offset_m`.
     y = 0.2 + offset_m if offset_m > 0 else offset_m
-    voxel = snapshot_of(np.array([[10.1, 0.1, 5.1]]))
+    voxel = MapSnapshot.of_points(np.array([[10.1, 0.1, 5.1]]))
     assert math.isfinite(time_to_collision(voxel, straight(y=y), 0.0, PARAMS)) is hit
 
 
@@ -70,7 +70,7 @@ def test_no_thin_obstacle_is_jumped_over():
     for _ in range(50):
         x = rng.uniform(2.0, 40.0)
         side = rng.uniform(-0.85, 0.85)
-        voxel = snapshot_of(np.array([[x, 0.1 + side, 5.1]]))
+        voxel = MapSnapshot.of_points(np.array([[x, 0.1 + side, 5.1]]))
         speed = rng.uniform(0.5, 9.0)
         trajectory = straight(speed, count=math.ceil(42.0 / speed / 0.5))
         assert math.isfinite(time_to_collision(voxel, trajectory, 0.0, PARAMS))
@@ -79,7 +79,7 @@ def test_no_thin_obstacle_is_jumped_over():
 def test_acceleration_bends_the_path_that_is_checked():
     trajectory = straight(count=4)
     trajectory.waypoints[1, 8] = 16.0  # 2 m sideways within its half second
-    beside = snapshot_of(np.array([[2.9, 2.1, 5.1]]))
+    beside = MapSnapshot.of_points(np.array([[2.9, 2.1, 5.1]]))
     assert math.isfinite(time_to_collision(beside, trajectory, 0.0, PARAMS))
     assert time_to_collision(beside, straight(count=4), 0.0, PARAMS) == math.inf
 

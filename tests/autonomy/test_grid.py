@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavfi_cli.autonomy import grid as grids
-from mavfi_cli.autonomy.occupancy import empty_snapshot, snapshot_of
+from mavfi_cli.autonomy.grid import ObstacleGrid
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 
 BOUNDS = np.array([-10.0, -10.0, 0.0, 10.0, 10.0, 10.0])
 RADIUS_M = 0.7
@@ -29,7 +29,7 @@ def gap_to_voxels(point, points):
 
 def test_free_points_keep_the_radius_and_blocked_ones_are_near():
     points = scattered()
-    grid = grids.build(snapshot_of(points), BOUNDS, RADIUS_M)
+    grid = ObstacleGrid.build(MapSnapshot.of_points(points), BOUNDS, RADIUS_M)
     rng = np.random.default_rng(1)
     diagonal = RESOLUTION_M * math.sqrt(3)
     verdicts = set()
@@ -44,7 +44,7 @@ def test_free_points_keep_the_radius_and_blocked_ones_are_near():
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10_000))
 def test_a_segment_is_free_exactly_where_all_its_points_are(seed):
-    grid = grids.build(snapshot_of(scattered()), BOUNDS, RADIUS_M)
+    grid = ObstacleGrid.build(MapSnapshot.of_points(scattered()), BOUNDS, RADIUS_M)
     rng = np.random.default_rng(seed)
     for _ in range(20):
         start, end = rng.uniform([-9.9, -9.9, 0.1], [9.9, 9.9, 9.9], (2, 3))
@@ -65,7 +65,7 @@ def test_a_segment_is_free_exactly_where_all_its_points_are(seed):
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
 def test_ends_that_are_not_in_the_bounds_are_not_free(bad):
-    grid = grids.build(snapshot_of(scattered()), BOUNDS, RADIUS_M)
+    grid = ObstacleGrid.build(MapSnapshot.of_points(scattered()), BOUNDS, RADIUS_M)
     here = np.array([0.0, 0.0, 5.0])
     for axis in range(3):
         there = here.copy()
@@ -75,19 +75,19 @@ def test_ends_that_are_not_in_the_bounds_are_not_free(bad):
 
 
 def test_without_obstacles_only_the_bounds_matter():
-    grid = grids.build(empty_snapshot(), BOUNDS, RADIUS_M)
+    grid = ObstacleGrid.build(MapSnapshot.empty(), BOUNDS, RADIUS_M)
     assert grid.segment_free(np.array([-10.0, -10, 0]), np.array([10.0, 10, 10]))
     assert not grid.point_free(np.array([0.0, 0.0, 10.1]))
 
 
 def test_obstacles_just_outside_the_bounds_reach_in():
-    grid = grids.build(snapshot_of(np.array([[10.3, 0.1, 5.1]])), BOUNDS, RADIUS_M)
+    grid = ObstacleGrid.build(MapSnapshot.of_points(np.array([[10.3, 0.1, 5.1]])), BOUNDS, RADIUS_M)
     assert not grid.point_free(np.array([9.9, 0.1, 5.1]))
     assert grid.point_free(np.array([9.0, 0.1, 5.1]))
 
 
 def test_a_path_is_free_where_all_its_pieces_are():
-    grid = grids.build(snapshot_of(np.array([[0.1, 0.1, 5.1]])), BOUNDS, RADIUS_M)
+    grid = ObstacleGrid.build(MapSnapshot.of_points(np.array([[0.1, 0.1, 5.1]])), BOUNDS, RADIUS_M)
     around = np.array([[-5.0, 0, 5], [0, 5, 5], [5, 0, 5]])
     through = np.array([[-5.0, 0, 5], [5, 0, 5], [5, 5, 5]])
     assert grid.path_free(around)
@@ -96,9 +96,9 @@ def test_a_path_is_free_where_all_its_pieces_are():
 
 def test_blending_takes_the_inner_grid_near_the_centre_only():
     points = np.array([[0.1, 0.1, 5.1], [5.1, 0.1, 5.1]])
-    wide = grids.build(snapshot_of(points), BOUNDS, 1.0)
-    slim = grids.build(snapshot_of(points), BOUNDS, 0.3)
-    blocked = grids.blend(wide, slim, np.array([0.0, 0.0, 5.0]), 2.0)
+    wide = ObstacleGrid.build(MapSnapshot.of_points(points), BOUNDS, 1.0)
+    slim = ObstacleGrid.build(MapSnapshot.of_points(points), BOUNDS, 0.3)
+    blocked = wide.blended(slim, np.array([0.0, 0.0, 5.0]), 2.0).blocked
     offset = np.rint((wide.origin_enu_m - slim.origin_enu_m) / RESOLUTION_M).astype(int)
     for index in np.ndindex(*blocked.shape):
         centre = wide.origin_enu_m + (np.array(index) + 0.5) * RESOLUTION_M
@@ -114,4 +114,4 @@ def test_a_grid_that_would_not_fit_into_memory_is_refused():
     huge = np.array([-1e4, -1e4, -1e3, 1e4, 1e4, 1e3])
     far_apart = np.array([[-6000.0, -6000, 0], [6000, 6000, 10]])
     with pytest.raises(ValueError, match="too large"):
-        grids.build(snapshot_of(far_apart), huge, RADIUS_M)
+        ObstacleGrid.build(MapSnapshot.of_points(far_apart), huge, RADIUS_M)

@@ -7,10 +7,9 @@ import pyoctomap
 import pytest
 
 from mavfi_cli.autonomy.occupancy import (
+    MapSnapshot,
     OccupancyMap,
     OccupancyParams,
-    empty_snapshot,
-    snapshot_of,
 )
 from mavfi_cli.autonomy.octree import occupied_leaves
 from mavfi_cli.core.types import PointCloud
@@ -122,12 +121,12 @@ def test_corrupted_points_and_origins_are_ignored(bad):
 
 
 def test_an_empty_map_has_no_occupied_voxels():
-    assert voxels(empty_snapshot()) == set()
+    assert voxels(MapSnapshot.empty()) == set()
     assert OccupancyMap(OccupancyParams()).snapshot().payload == b""
 
 
 def test_a_map_can_be_made_of_points():
-    assert voxels(snapshot_of([[0.1, 0.1, 0.1], [0.15, 0.1, 0.1], [1.1, -0.1, 0.1]])) == {
+    assert voxels(MapSnapshot.of_points([[0.1, 0.1, 0.1], [0.15, 0.1, 0.1], [1.1, -0.1, 0.1]])) == {
         (0, 0, 0),
         (5, -1, 0),
     }

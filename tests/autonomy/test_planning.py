@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from mavfi_cli.autonomy import collision, planning, warm
-from mavfi_cli.autonomy.occupancy import snapshot_of
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.planners import find
 from mavfi_cli.core.types import Trajectory
@@ -20,7 +20,7 @@ def blocks():
     block = np.stack(np.meshgrid(cells, cells, np.arange(0.1, 9, 0.2)), axis=-1).reshape(-1, 3)
     corners = [(5, -1), (9, 3), (9, -6), (14, -1), (14, 7)]
     shifts = [np.array([x, y + rng.uniform(-0.5, 0.5), 0.0]) for x, y in corners]
-    return snapshot_of(np.vstack([block + shift for shift in shifts]))
+    return MapSnapshot.of_points(np.vstack([block + shift for shift in shifts]))
 
 
 def request(velocity=(0.0, 0.0, 0.0), goal=(20.0, 0.0, 5.0)):

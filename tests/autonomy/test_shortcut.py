@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mavfi_cli.autonomy import grid as grids
-from mavfi_cli.autonomy.occupancy import snapshot_of
+from mavfi_cli.autonomy.grid import ObstacleGrid
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.planning import shortcut, subdivided
 
 BOUNDS = np.array([-10.0, -10.0, 0.0, 10.0, 10.0, 10.0])
@@ -15,7 +15,9 @@ def length(path):
 
 def test_random_walks_become_shorter_and_stay_free():
     rng = np.random.default_rng(0)
-    grid = grids.build(snapshot_of(rng.uniform([-9, -9, 3], [9, 9, 7], (30, 3))), BOUNDS, 0.5)
+    grid = ObstacleGrid.build(
+        MapSnapshot.of_points(rng.uniform([-9, -9, 3], [9, 9, 7], (30, 3))), BOUNDS, 0.5
+    )
     for _ in range(40):
         path = [np.array([-9.5, -9.5, 5.0])]
         while len(path) < 12:
@@ -31,7 +33,7 @@ def test_random_walks_become_shorter_and_stay_free():
 
 
 def test_in_free_sight_only_the_ends_remain():
-    grid = grids.build(snapshot_of(np.empty((0, 3))), BOUNDS, 0.5)
+    grid = ObstacleGrid.build(MapSnapshot.of_points(np.empty((0, 3))), BOUNDS, 0.5)
     zigzag = np.array([[0.0, 0, 5], [1, 1, 5], [2, -1, 5], [3, 0, 5]])
     assert shortcut(zigzag, grid).tolist() == [[0, 0, 5], [3, 0, 5]]
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy import grid as grids
-from mavfi_cli.autonomy.occupancy import empty_snapshot, snapshot_of
+from mavfi_cli.autonomy.grid import ObstacleGrid
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Departure
 from mavfi_cli.autonomy.smoothing import (
     SmoothingParams,
@@ -17,7 +17,7 @@ from mavfi_cli.autonomy.trajectory import reference_waypoint
 
 PARAMS = SmoothingParams()
 BOUNDS = np.array([-20.0, -20.0, 0.0, 20.0, 20.0, 10.0])
-OPEN = grids.build(empty_snapshot(), BOUNDS, 0.5)
+OPEN = ObstacleGrid.build(MapSnapshot.empty(), BOUNDS, 0.5)
 
 
 def departure(velocity=(0.0, 0.0, 0.0), yaw_rad=0.0):
@@ -71,7 +71,7 @@ def test_where_a_corner_may_not_be_cut_it_is_slowed_down_until_it_is_free():
     # A wall inside the corner, so close that only the legs themselves are free.
     legs = path([-8, 0, 5], [0, 0, 5], [0, 8, 5])
     cells = np.array([[-0.85 - 0.2 * i, 0.85 + 0.2 * j, 5.1] for i in range(20) for j in range(20)])
-    grid = grids.build(snapshot_of(cells), BOUNDS, 0.5)
+    grid = ObstacleGrid.build(MapSnapshot.of_points(cells), BOUNDS, 0.5)
     assert grid.path_free(legs)
     fast = smooth(legs, OPEN, departure(), PARAMS)
     assert not grid.path_free(flown(fast.trajectory)[:, :3])
@@ -107,8 +107,8 @@ def test_a_start_in_motion_goes_on_smoothly():
 
 
 def test_a_start_in_motion_towards_a_wall_is_not_called_free():
-    wall = snapshot_of(np.array([[0.1, 1.1 + 0.0, 5.1]]))
-    grid = grids.build(wall, BOUNDS, 0.5)
+    wall = MapSnapshot.of_points(np.array([[0.1, 1.1 + 0.0, 5.1]]))
+    grid = ObstacleGrid.build(wall, BOUNDS, 0.5)
     made = smooth(path([0, 0, 5], [12, 0, 5]), grid, departure((0, 2.5, 0), 1.5), PARAMS)
     assert not made.free
     assert np.isfinite(made.trajectory.waypoints).all()

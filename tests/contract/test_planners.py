@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.autonomy import planners
-from mavfi_cli.autonomy.occupancy import empty_snapshot
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.core import plug_ins
 from mavfi_cli.core.errors import MavfiError, UnknownName
 from mavfi_cli.testing import PlannerContract
@@ -21,7 +21,7 @@ class TestPlanners(PlannerContract):
 
 def test_a_start_outside_the_bounds_widens_them():
     start = np.array([-9.0, 0.0, 0.5])
-    problem = posed(empty_snapshot(), start)
+    problem = posed(MapSnapshot.empty(), start)
     assert problem.grid.bounds_enu_m.tolist() == [-9, -12, 0.5, 25, 12, 10]
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mavfi_cli.autonomy import collision, grid, tracking
 from mavfi_cli.autonomy.collision import CollisionParams
-from mavfi_cli.autonomy.occupancy import empty_snapshot, snapshot_of
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Departure
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingParams, TrackingState
@@ -16,7 +16,7 @@ from mavfi_cli.autonomy.trajectory import reference_waypoint, without_waypoint
 from mavfi_cli.core.types import Trajectory
 
 PARAMS = SmoothingParams()
-OPEN = grid.build(empty_snapshot(), np.repeat([-math.inf, math.inf], 3), 0.5)
+OPEN = grid.build(MapSnapshot.empty(), np.repeat([-math.inf, math.inf], 3), 0.5)
 
 coordinate = st.floats(-40.0, 40.0, allow_nan=False)
 points = st.tuples(coordinate, coordinate, st.floats(0.0, 12.0))
@@ -90,7 +90,9 @@ def flip(array, flips):
 
 flip_lists = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 63)), min_size=1, max_size=6)
 SOUND = flown_trajectory()
-WALL = snapshot_of(np.array([[8.1, y, z] for y in np.arange(-3, 3, 0.2) for z in (4.9, 5.1, 5.3)]))
+WALL = MapSnapshot.of_points(
+    np.array([[8.1, y, z] for y in np.arange(-3, 3, 0.2) for z in (4.9, 5.1, 5.3)])
+)
 
 
 def corrupted(in_waypoints, in_durations):

@@ -14,7 +14,7 @@ from mavfi_cli.core.frames import quaternion_from_euler
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link import images as images_module
 from mavfi_cli.link.codec import Codec, Message, dialect
-from mavfi_cli.link.images import MAX_PIXELS, ImageFrame, ImageReceiver, depth_frame
+from mavfi_cli.link.images import MAX_PIXELS, ImageFrame, ImageReceiver
 
 ROWS, COLUMNS, PAYLOAD = 48, 64, 253
 
@@ -232,10 +232,10 @@ def test_the_depth_frame_in_metres_and_in_the_world() -> None:
         yaw_rad=math.pi / 2,
     )
     offset = np.array([0.2, 0.05, -0.1])  # forward, left, up
-    frame = depth_frame(image, state, hfov_rad=1.2, mount_offset_flu_m=offset)
+    frame = image.depth_frame(state, hfov_rad=1.2, mount_offset_flu_m=offset)
     assert frame.depth_m == pytest.approx(np.array([[0.0, 0.1], [25.4, np.inf]]))
     assert frame.position_enu_m == pytest.approx([10.0 - 0.05, 20.2, 4.9])
     assert frame.quaternion == pytest.approx(facing_north)
     assert (frame.stamp_s, frame.hfov_rad) == (1.5, 1.2)
     known = ImageFrame(stamp_s=1.5, index=0, pixels=pixels, hfov_rad=0.9)
-    assert depth_frame(known, state, hfov_rad=1.2, mount_offset_flu_m=offset).hfov_rad == 0.9
+    assert known.depth_frame(state, hfov_rad=1.2, mount_offset_flu_m=offset).hfov_rad == 0.9

@@ -22,7 +22,7 @@ from mavfi_cli.core.states import STATES
 from mavfi_cli.core.types import CollisionReport, Command, Reaction, Trajectory, VehicleState
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.record import quality
-from mavfi_cli.mission.record.run_folder import load_run, new_run_folder
+from mavfi_cli.mission.record.run_folder import RunFolder, load_run
 from mavfi_cli.mission.record.tables import Trace
 from mavfi_cli.mission.run import response_times
 from mavfi_cli.spec.mission import ISOLATABLE, OF_THE_WORLD, MissionConfig
@@ -166,12 +166,12 @@ def test_arrays_and_numpy_scalars_become_plain():
 
 
 def test_run_folders_count_up_and_are_never_taken_twice(tmp_path):
-    names = [new_run_folder(tmp_path / "runs", "dense-1").path.name for _ in range(3)]
+    names = [RunFolder.new(tmp_path / "runs", "dense-1").path.name for _ in range(3)]
     assert names == ["dense-1-001", "dense-1-002", "dense-1-003"]
     (tmp_path / "runs/dense-1-1000").mkdir()
     (tmp_path / "runs/dense-1-old").mkdir()
-    assert new_run_folder(tmp_path / "runs", "dense-1").path.name == "dense-1-1001"
-    assert new_run_folder(tmp_path / "runs", "dense-11").path.name == "dense-11-001"
+    assert RunFolder.new(tmp_path / "runs", "dense-1").path.name == "dense-1-1001"
+    assert RunFolder.new(tmp_path / "runs", "dense-11").path.name == "dense-11-001"
 
 
 def test_a_run_that_is_not_there(tmp_path):

@@ -20,7 +20,7 @@ from mavfi_cli.report.drawing import (
 from mavfi_cli.report.model_plots import draw_redundancy_plot
 from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 
 def test_no_two_things_look_alike():
@@ -65,7 +65,7 @@ def test_a_detector_looks_the_same_in_every_picture(evaluated):
     assert {to_hex(bar.get_facecolor()) for bar in shares.patches[:2]} == {
         DETECTORS["gad"], DETECTORS["aad"],
     }  # fmt: skip
-    told = report([load_vehicle("spark")], Choices(), SCHEMES)
+    told = report([ModelVehicle.load("spark")], Choices(), SCHEMES)
     (axes,) = draw_redundancy_plot(told).axes
     named = {
         container.get_label(): to_hex(container.patches[0].get_facecolor())

@@ -18,7 +18,7 @@ from mavfi_cli.studies.beside_model import Beside, side_by_side
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report, setting_of
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 HOVER_SHAFT_W = 20.0  # of the simulated vehicle, with one board
 STRAIGHT_M = 40.0 - 1.0
@@ -64,7 +64,7 @@ def flights_of(records):
 @pytest.fixture
 def spark(tmp_path):
     """The model's report, the plans, and a function that puts flights beside them."""
-    vehicle, x86 = load_vehicle("spark"), load_platform("x86")
+    vehicle, x86 = ModelVehicle.load("spark"), load_platform("x86")
     chain_s = sum(kernel.latency_s for kernel in x86.kernels.values())
     told = report([vehicle], Choices(), SCHEMES)
     setting = setting_of(vehicle, Choices())

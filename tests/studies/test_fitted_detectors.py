@@ -9,15 +9,15 @@ from mavfi_cli.studies import redundancy
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.model import SCHEMES, named
 from mavfi_cli.vpm.report import Choices, setting_of
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 
 @pytest.fixture
 def ask(tmp_path):
     def of(train):
         return redundancy.RedundancyPlan(
-            vehicles=[load_vehicle("spark")], choices=Choices(), worlds=("sparse",), missions=1,
-            first_seed=1, folder=tmp_path, train=train,
+            vehicles=[ModelVehicle.load("spark")], choices=Choices(), worlds=("sparse",),
+            missions=1, first_seed=1, folder=tmp_path, train=train,
         )  # fmt: skip
 
     return of
@@ -25,7 +25,7 @@ def ask(tmp_path):
 
 @pytest.fixture
 def bare(tmp_path):
-    setting = setting_of(load_vehicle("spark"), Choices())
+    setting = setting_of(ModelVehicle.load("spark"), Choices())
     return flight_plan(setting, named(SCHEMES, "none"), load_platform("x86"), 0.39, tmp_path)
 
 
@@ -53,7 +53,7 @@ def test_they_are_fitted_once_to_the_bare_vehicle_s_flights(ask, bare, monkeypat
 
 
 def test_flights_name_the_fitted_models(tmp_path):
-    setting = setting_of(load_vehicle("spark"), Choices())
+    setting = setting_of(ModelVehicle.load("spark"), Choices())
     planned = flight_plan(
         setting, named(SCHEMES, "aad"), load_platform("x86"), 0.39, tmp_path, tmp_path / "models"
     )

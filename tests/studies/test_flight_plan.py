@@ -11,7 +11,7 @@ from mavfi_cli.studies.flight_plan import flight_plan, write_files
 from mavfi_cli.studies.redundancy import RedundancyPlan
 from mavfi_cli.vpm.model import SCHEMES, hover_power_w, named, outcome
 from mavfi_cli.vpm.report import Choices, setting_of
-from mavfi_cli.vpm.vehicle import load_board, load_vehicle
+from mavfi_cli.vpm.vehicle import Board, ModelVehicle
 
 X86 = load_platform("x86")
 SUM_S = sum(kernel.latency_s for kernel in X86.kernels.values())
@@ -20,7 +20,7 @@ SUM_S = sum(kernel.latency_s for kernel in X86.kernels.values())
 @pytest.fixture
 def plan(tmp_path):
     def of(vehicle, scheme, choices=None, platform=X86, chain_s=SUM_S):
-        setting = setting_of(load_vehicle(vehicle), choices or Choices())
+        setting = setting_of(ModelVehicle.load(vehicle), choices or Choices())
         return flight_plan(setting, named(SCHEMES, scheme), platform, chain_s, tmp_path), setting
 
     return of
@@ -51,7 +51,7 @@ def test_mass_pull_and_velocity_are_the_model_s(plan, scheme):
 
 
 def test_the_stack_is_the_mission_s(tmp_path):
-    setting = setting_of(load_vehicle("spark"), Choices())
+    setting = setting_of(ModelVehicle.load("spark"), Choices())
     arguments = (setting, named(SCHEMES, "none"), X86, SUM_S, tmp_path)
     assert flight_plan(*arguments).mission.stack == "mavbench"
     assert flight_plan(*arguments, stack="hardened").mission.stack == "hardened"
@@ -61,7 +61,7 @@ def test_what_a_mission_cannot_take_is_told(plan):
     planned, _ = plan("spark", "none")
     assert planned.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
     assert plan("spark", "tmr")[0].cut == ()
-    fast, _ = plan("cal20", "none", Choices(response_s=0.01, board=load_board("ncs")))
+    fast, _ = plan("cal20", "none", Choices(response_s=0.01, board=Board.load("ncs")))
     assert fast.mission.v_max_mps == 12.0
     assert fast.cut[0].startswith("velocity 12 m/s instead of ")
     assert fast.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
@@ -102,7 +102,7 @@ def test_equal_names_are_equal_flights(plan):
 
 def test_what_cannot_be_lifted_has_no_plan(plan):
     with pytest.raises(CannotLift, match=r"cannot lift its compute: 8\.33 N"):
-        plan("spark", "tmr", Choices(board=load_board("xavier")))
+        plan("spark", "tmr", Choices(board=Board.load("xavier")))
 
 
 def test_the_list_grows_pair_by_pair(plan, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.vehicle import load_vehicle
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -24,7 +24,7 @@ def test_the_example_files_load_and_are_used(tmp_path):
     (tmp_path / "platform.toml").write_text(platform)
     half = load_platform(str(tmp_path / "platform.toml"))
     (one,) = report(
-        [load_vehicle(str(tmp_path / "vehicle.toml"))], Choices(platform=half), SCHEMES
+        [ModelVehicle.load(str(tmp_path / "vehicle.toml"))], Choices(platform=half), SCHEMES
     )["vehicles"]
     assert one["board"] == "half-tx2"
     assert one["schemes"][0]["compute_kg"] == pytest.approx(0.1 + 0.0054 * 20.0)
@@ -36,7 +36,7 @@ def test_the_table_of_calibrations():
                       text, re.M)  # fmt: skip
     assert [row[0] for row in rows] == ["airsim", "spark"]
     for name, value, unit, tmr, dmr in rows:
-        (one,) = report([load_vehicle(name)], Choices(), SCHEMES)["vehicles"]
+        (one,) = report([ModelVehicle.load(name)], Choices(), SCHEMES)["vehicles"]
         found = one["calibrations"][0]
         assert (f"{found['value']:.3g}", found["unit"]) == (value, unit)
         assert f"{found['tmr_ratio']:.2f}" == tmr

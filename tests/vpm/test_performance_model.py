@@ -16,7 +16,7 @@ from mavfi_cli.vpm.model import (
     roof_mps,
     safe_velocity_mps,
 )
-from mavfi_cli.vpm.vehicle import load_board, load_vehicle
+from mavfi_cli.vpm.vehicle import Board, ModelVehicle
 
 ACCELERATIONS = st.floats(0.01, 200.0)
 RESPONSES = st.floats(1e-4, 50.0)
@@ -34,7 +34,7 @@ RANGES = st.floats(0.1, 200.0)
 )
 def test_table_1_of_the_model_s_paper(board, total_g, equation_mps2, published_mps2):
     """The published column is rounded, and 3 % off equation 2 at the worst (Xavier, NCS)."""
-    vehicle, computer = load_vehicle("cal20"), load_board(board)
+    vehicle, computer = ModelVehicle.load("cal20"), Board.load(board)
     assert 1000.0 * computer.total_kg == pytest.approx(total_g, abs=0.05)
     mass_kg = vehicle.mass_kg + computer.total_kg
     found = acceleration_mps2(vehicle.rotor_pull_n, mass_kg)

@@ -11,13 +11,13 @@ from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import GRAVITY_MPS2, SCHEMES, schemes_with
 from mavfi_cli.vpm.report import Choices, calibrated, report
-from mavfi_cli.vpm.vehicle import Board, load_board, load_vehicle
+from mavfi_cli.vpm.vehicle import Board, ModelVehicle
 
 VPM = Path(vpm.__file__).parent
 
 
 def told(vehicle, choices=None, schemes=SCHEMES):
-    (one,) = report([load_vehicle(vehicle)], choices or Choices(), schemes)["vehicles"]
+    (one,) = report([ModelVehicle.load(vehicle)], choices or Choices(), schemes)["vehicles"]
     return one
 
 
@@ -71,7 +71,7 @@ def test_a_ratio_out_of_reach(tmp_path):
     text = (vehicle_file("airsim")).read_text()
     (tmp_path / "mine.toml").write_text(text.replace("= 1.06", "= 1.5"))
     with pytest.raises(ConfigError, match=r"no response_s gives .* it can be 1\.000 to 1\.15"):
-        calibrated(load_vehicle(str(tmp_path / "mine.toml")))
+        calibrated(ModelVehicle.load(str(tmp_path / "mine.toml")))
 
 
 def vehicle_file(name):
@@ -81,7 +81,7 @@ def vehicle_file(name):
 @pytest.mark.parametrize("name", shipped_names(VPM / "vehicles"))
 def test_the_rows_agree_with_each_other(name):
     response = 0.2 if name == "cal20" else None
-    one = told(name, Choices(response_s=response, board=load_board("raspi3b"), distance_m=120.0))
+    one = told(name, Choices(response_s=response, board=Board.load("raspi3b"), distance_m=120.0))
     battery_j = 3600.0 * parameters(one)["battery_wh"]["value"]
     base = rows(one)["aad"]
     for row in one["schemes"]:
@@ -109,7 +109,7 @@ def test_the_rows_agree_with_each_other(name):
 def test_what_binds(tmp_path, response_s, sensor_hz, bound, throughput_hz):
     text = vehicle_file("cal20").read_text().replace("sensor_hz = 60.0", f"sensor_hz = {sensor_hz}")
     (tmp_path / "mine.toml").write_text(text)
-    choices = Choices(response_s=response_s, board=load_board("ncs"))
+    choices = Choices(response_s=response_s, board=Board.load("ncs"))
     row = rows(told(str(tmp_path / "mine.toml"), choices))["none"]
     assert row["bound"] == bound
     assert row["throughput_hz"] == pytest.approx(throughput_hz)
@@ -144,7 +144,7 @@ def test_a_platform_on_the_ground_costs_no_mass():
 
 
 def test_too_heavy_for_copies_is_told_in_its_row():
-    found = rows(told("spark", Choices(board=load_board("xavier"))))
+    found = rows(told("spark", Choices(board=Board.load("xavier"))))
     assert found["none"]["problem"] is None
     assert found["tmr"]["flight_time_ratio"] is None
     assert found["tmr"]["mass_kg"] == pytest.approx(0.3 + 3 * 0.442)
@@ -226,14 +226,14 @@ def test_what_is_wrong_with_a_vehicle_s_file(tmp_path, vehicle, old, new, said):
     path = tmp_path / "mine.toml"
     path.write_text(vehicle_file(vehicle).read_text().replace(old, new, 1))
     with pytest.raises(ConfigError, match=said) as error:
-        load_vehicle(str(path))
+        ModelVehicle.load(str(path))
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
     ("choices", "said"),
     [
-        (Choices(board=load_board("ncs")), "response_s: vehicle 'cal20' has none: give --platform"),
+        (Choices(board=Board.load("ncs")), "response_s: vehicle 'cal20' has none: give --platform"),
         (Choices(response_s=0.1), "board: vehicle 'cal20' has none: give --platform or --board"),
     ],
 )
@@ -244,26 +244,26 @@ def test_a_vehicle_that_needs_more(choices, said):
 
 @pytest.mark.parametrize("name", shipped_names(VPM / "boards"))
 def test_shipped_boards_have_sources(name):
-    board = load_board(name)
+    board = Board.load(name)
     assert board.name == name
     assert all(board.sources[key] for key in ("mass_kg", "power_w", "heatsink_kgpw"))
 
 
 def test_names_and_boards_that_do_not_exist(tmp_path):
     with pytest.raises(UnknownName, match="did you mean 'xavier'"):
-        load_board("xaver")
+        Board.load("xaver")
     with pytest.raises(UnknownName, match="did you mean 'spark'"):
-        load_vehicle("sparc")
+        ModelVehicle.load("sparc")
     (tmp_path / "b.toml").write_text(
         'name = "b"\nmass_kg = 0.1\npower_w = -2.0\nheatsink_kgpw = 0.0\n'
     )
     with pytest.raises(ConfigError, match=r"b\.toml.*power_w: must not be negative, is -2"):
-        load_board(str(tmp_path / "b.toml"))
+        Board.load(str(tmp_path / "b.toml"))
 
 
 def test_only_one_measured_overhead_is_said():
     """Rows from two sources are not to be ranked; the paper's two, or two measured ones, may be."""
-    chosen, vehicle = Choices(), [load_vehicle("spark")]
+    chosen, vehicle = Choices(), [ModelVehicle.load("spark")]
     assert report(vehicle, chosen, SCHEMES)["notes"] == []
     assert (
         report(
@@ -304,7 +304,7 @@ SPARK_TIME = "paper, section VII-D: 289 ms + 83 ms + 0.46 ms, one after the othe
     ],
 )  # fmt: skip
 def test_what_another_computer_leaves_as_it_was_is_said(vehicle, choices, notes):
-    loads = {"board": load_board, "platform": load_platform, "response_s": float}
+    loads = {"board": Board.load, "platform": load_platform, "response_s": float}
     chosen = Choices(**{key: loads[key](value) for key, value in choices.items()})
     assert told(vehicle, chosen)["notes"] == notes
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from mavfi_cli.autonomy import grid as grids
 from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.core.types import FloatArray
@@ -84,7 +83,7 @@ def pose_problem(
     if np.isfinite(start_enu_m).all():
         bounds[:3] = np.minimum(bounds[:3], start_enu_m)
         bounds[3:] = np.maximum(bounds[3:], start_enu_m)
-    grid = grids.build(snapshot, bounds, params.radius_m)
+    grid = ObstacleGrid.build(snapshot, bounds, params.radius_m)
     if not grid.point_free(start_enu_m) and np.isfinite(start_enu_m).all():
         grid = _escape(snapshot, grid, start_enu_m, params)
     return PlanningProblem(
@@ -99,10 +98,9 @@ def _escape(
 ) -> ObstacleGrid:
     """Reduce the radius around the start. Return the grid unchanged if even radius 0 is blocked."""
     for share in (0.75, 0.5, 0.25, 0.0):
-        smaller = grids.build(snapshot, grid.bounds_enu_m, share * params.radius_m)
+        smaller = ObstacleGrid.build(snapshot, grid.bounds_enu_m, share * params.radius_m)
         if smaller.point_free(start):
-            blocked = grids.blend(grid, smaller, start, params.escape_radius_m)
-            return replace(grid, blocked=blocked)
+            return grid.blended(smaller, start, params.escape_radius_m)
     return grid
 
 

@@ -15,7 +15,7 @@ from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.processes import receive, send
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.spec.mission import MissionConfig, stack_of
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 
 
@@ -39,7 +39,7 @@ def main() -> None:
     config = setup.config
     companion = Companion(
         config,
-        stack_of(config),
+        config.loaded_stack(),
         load_platform(config.platform),
         planners.find(config.planner),
         setup.briefing,

@@ -35,31 +35,31 @@ class RunFolder:
         self.fault = path / FAULT  # fault record, on disk before the fault strikes
         self.crash = path / "crash.txt"  # tracebacks of the companion and of nodes
 
+    @classmethod
+    def new(cls, parent: Path, stem: str) -> RunFolder:
+        """Create an empty folder `<stem>-<number>` below `parent`; safe for parallel missions.
+
+        Raises:
+            RecordError: The folder cannot be created.
+        """
+        with writing(parent):
+            parent.mkdir(parents=True, exist_ok=True)
+            ends = (path.name.rpartition("-")[2] for path in parent.glob(f"{stem}-[0-9]*"))
+            number = max((int(end) for end in ends if end.isdigit()), default=0) + 1
+            while True:
+                path = parent / f"{stem}-{number:03d}"
+                try:
+                    path.mkdir()
+                    return cls(path)
+                except FileExistsError:
+                    number += 1
+        raise AssertionError("unreachable")
+
 
 def stem_of(world: str) -> str:
     """Return the prefix of a world's run folders: its name without characters unfit for paths."""
     name = world.removesuffix(".toml").rpartition("/")[2]
     return "".join(c if c.isalnum() or c in "-_." else "-" for c in name) or "world"
-
-
-def new_run_folder(parent: Path, stem: str) -> RunFolder:
-    """Create an empty folder `<stem>-<number>` below `parent`; safe for parallel missions.
-
-    Raises:
-        RecordError: The folder cannot be created.
-    """
-    with writing(parent):
-        parent.mkdir(parents=True, exist_ok=True)
-        ends = (path.name.rpartition("-")[2] for path in parent.glob(f"{stem}-[0-9]*"))
-        number = max((int(end) for end in ends if end.isdigit()), default=0) + 1
-        while True:
-            path = parent / f"{stem}-{number:03d}"
-            try:
-                path.mkdir()
-                return RunFolder(path)
-            except FileExistsError:
-                number += 1
-    raise AssertionError("unreachable")
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import pytest
 
 from mavfi_cli.attack.kernels.outputs import checks, maps, numbers, pack, paths, unpack
 from mavfi_cli.attack.kernels.tree import read_tree
-from mavfi_cli.autonomy.occupancy import OccupancyMap, OccupancyParams, snapshot_of
+from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
 from mavfi_cli.core.types import PointCloud
 
 
@@ -115,7 +115,7 @@ def test_maps_differ_by_nodes_and_by_what_a_planner_sees(mapped):
 
 def test_the_planners_map_may_differ_where_the_tree_does_not(mapped):
     golden = unpack(mapped)
-    payload = np.frombuffer(snapshot_of(np.array([[3.1, 0.1, 1.1]])).payload, np.uint8)
+    payload = np.frombuffer(MapSnapshot.of_points(np.array([[3.1, 0.1, 1.1]])).payload, np.uint8)
     found = maps(golden, golden | {"payload": payload})
     assert (found.parts["nodes"], found.parts["missing_for_planner"]) == (0, 2)
     assert (found.unit, found.absolute, found.noticeable) == ("voxels", 2.0, True)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.occupancy import snapshot_of
+from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.repetition import watch_again
@@ -84,7 +84,7 @@ def test_a_map_is_drawn_voxel_by_voxel(pair):
     """Of one voxel and of a full cube of eight, which is one leaf."""
     cube = np.array([[x, y, z] for x in (4.1, 4.3) for y in (8.1, 8.3) for z in (0.1, 0.3)])
     recorder = Recorder()
-    snapshot = snapshot_of(np.array([[-3.1, 2.5, 1.1], *cube]), 0.2)
+    snapshot = MapSnapshot.of_points(np.array([[-3.1, 2.5, 1.1], *cube]), 0.2)
     recorder.on_start("planner", (None, snapshot), 1.0)
     watched = ViewedFlight(name="flight", run=pair[0].run, recorder=recorder)
     (found,) = at(entries_of([watched]), "flight/map")
