@@ -7,7 +7,7 @@ import pytest
 
 from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.occupancy import MapSnapshot
-from mavfi_cli.core import plug_ins
+from mavfi_cli.core import installed
 from mavfi_cli.core.errors import MavfiError, UnknownName
 from mavfi_cli.testing import PlannerContract
 from mavfi_cli.testing.planners import PARAMS, posed, wall_with_gap
@@ -66,10 +66,10 @@ def plugged_in(monkeypatch):
         EntryPoint(name, value, "mavfi.planners")
         for name, value in (("straight", f"{__name__}:Straight"), ("gone", "nowhere_at_all:Gone"))
     )
-    monkeypatch.setattr(plug_ins, "entry_points", lambda group: entries)
-    plug_ins.installed.cache_clear()
+    monkeypatch.setattr(installed, "entry_points", lambda group: entries)
+    installed.installed.cache_clear()
     yield
-    plug_ins.installed.cache_clear()
+    installed.installed.cache_clear()
 
 
 def test_other_packages_plug_in_by_entry_point(plugged_in):
