@@ -11,15 +11,14 @@ from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.states import Message
-from mavfi_cli.core.types import Briefing, Trajectory
+from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.bits import told_apart
 from mavfi_cli.fi.source.injector import (
-    Follower,
     Injector,
     Listener,
     MemoryInjector,
     Moment,
+    NoInjector,
     Reader,
     SourceInjector,
     Strike,
@@ -32,31 +31,17 @@ SCHEMA = 1
 
 
 class NoInjection:
-    """Null object that leaves every message unchanged.
+    """Null object: a mission without a fault.
 
     Attributes:
-        follower: Tracks which node reads which message.
+        injector: Strikes messages, memories and processes.
         in_queue: True if the injection site is control's copy of the plan.
     """
 
     in_queue = False
 
     def __init__(self) -> None:
-        self.follower = Follower()
-
-    def watch(self, moment: Moment) -> None:
-        """Observe the mission once per control tick and before every report."""
-
-    def pass_on(self, message: M, moment: Moment) -> M:
-        """Return a message as its receiver gets it."""
-        return message
-
-    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active trajectory as it is from this tick on."""
-        return trajectory
-
-    def strike_memory(self, moment: Moment) -> None:
-        """Strike the memory of the detector or of a node, once per control tick."""
+        self.injector = NoInjector()
 
     def begin(self, path: Path) -> None:
         """Write the planned fault before the flight."""
@@ -83,11 +68,9 @@ class _Killer(Injector):
         trigger, corruption = config.trigger(), config.corruption()
         super().__init__(rng, trigger, corruption, shortest_flight_s, listener)
 
-    def strike(self, moment: Moment) -> bool:
-        if not self._schedule.due(moment):
-            return False
-        self._tell(moment, moment.tick, ())
-        return True
+    def strike(self, moment: Moment) -> None:
+        if self._schedule.due(moment):
+            self._tell(moment, moment.tick, ())
 
 
 class SourceInjection(NoInjection):
@@ -111,13 +94,12 @@ class SourceInjection(NoInjection):
         self._path: Path | None = None
         self._state = "planned"
         self._news: list[str] = []
-        self._strike: Strike | None = None  # the newest
         self._executor: Executor | None = None
         self.in_queue = config.strikes_queue
         self._reader = ""  # who reads at once what is corrupted; empty: the follower finds out
-        self._injector: Injector
+        self.injector: Injector
         if config.killed_node is not None:
-            self._injector = _Killer(config, shortest_flight_s, self._on_strike)
+            self.injector = _Killer(config, shortest_flight_s, self._on_strike)
             self._reader = config.killed_node
             self._stage, self._units = PROCESS, {config.target: ""}
         elif config.attacks_detector:
@@ -133,11 +115,11 @@ class SourceInjection(NoInjection):
                 shortest_flight_s=shortest_flight_s,
                 listener=self._on_strike,
             )
-            self._injector, self._stage, self._reader = memory, DETECTOR, DETECTOR
+            self.injector, self._stage, self._reader = memory, DETECTOR, DETECTOR
             self._units = {memory.array: "1"}
         else:
             fault = config.draw()
-            self._injector = SourceInjector(
+            self.injector = SourceInjector(
                 fault,
                 seed=config.seed,
                 shortest_flight_s=shortest_flight_s,
@@ -145,29 +127,6 @@ class SourceInjection(NoInjection):
             )
             self._stage = fault.states[0].stage.value
             self._units = {state.name: state.unit for state in fault.states}
-
-    def watch(self, moment: Moment) -> None:
-        """Update the trigger."""
-        self._injector.watch(moment)
-
-    def pass_on(self, message: M, moment: Moment) -> M:
-        """Return the message as its receiver gets it, corrupted if the fault strikes."""
-        return self._followed(message, self._injector.pass_on(message, moment))
-
-    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active trajectory from this tick on, corrupted if the fault strikes."""
-        struck = self._injector.strike_latched(trajectory, moment, index)
-        return self._followed(trajectory, struck)
-
-    def _followed(self, message: M, sent: M) -> M:
-        if sent is not message and self._strike is not None and isinstance(sent, Message):
-            self.follower.struck(sent, self._strike)
-        return sent
-
-    def strike_memory(self, moment: Moment) -> None:
-        """Strike the detector's memory, or kill the node's process, if the fault is due."""
-        if self._injector.strike(moment) and self._executor is not None:
-            self._executor.kill(self._reader)
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
         """Have a node that is killed work in a process of its own."""
@@ -186,13 +145,14 @@ class SourceInjection(NoInjection):
         return news
 
     def _on_strike(self, strike: Strike) -> None:
-        """Write the first strike to disk before its message is passed on."""
-        self._strike = strike
+        """Write the first strike to disk before its message is passed on, or kill the process."""
         if self._state == "planned":
             self._news.append(_strike_text(strike))
             self._state = "applied"
             if self._path is not None:
                 write_json(self._path, self.record())
+        if self._executor is not None:
+            self._executor.kill(self._reader)
 
     def finish(self) -> dict[str, Any] | None:
         """Write and return the record."""
@@ -205,7 +165,7 @@ class SourceInjection(NoInjection):
     def record(self) -> dict[str, Any]:
         """Return the requested fault, the drawn values and the strikes."""
         activation, reader = self._activation()
-        trigger, injector = self._config.trigger(), self._injector
+        trigger, injector = self._config.trigger(), self.injector
         return {
             "schema": SCHEMA,
             "level": "source",
@@ -231,10 +191,10 @@ class SourceInjection(NoInjection):
 
     def _activation(self) -> tuple[str, Reader | None]:
         if not self._reader:
-            return self.follower.activation.value, self.follower.reader
-        if not self._injector.strikes:
+            return self.injector.follower.activation.value, self.injector.follower.reader
+        if not self.injector.strikes:
             return "not_injected", None
-        stamp_s = self._injector.strikes[0].stamp_s
+        stamp_s = self.injector.strikes[0].stamp_s
         return "read", Reader(name=self._reader, stamp_s=stamp_s, state=next(iter(self._units)))
 
 

@@ -102,7 +102,8 @@ class Companion:
         protection: NoProtection,
     ) -> None:
         self._config, self._stack = config, stack
-        self._injection, self._follower = injection, injection.follower
+        self._injection, self._injector = injection, injection.injector
+        self._follower = injection.injector.follower
         self.protection = protection
         self.pilot = Pilot(_pilot_params(config, stack), briefing.goal_enu_m)
         self._recovery = Recovery(protection, self.pilot, self._follower, self._see_again)
@@ -214,7 +215,7 @@ class Companion:
         self._state = self._recovery.state = state
         copy = self._strike_memory()
         directive = self.pilot.update(self._now_s, state)
-        self._injection.watch(self._moment())
+        self._injector.watch(self._moment())
         if directive.plan is not None:
             self.executor.start(self._plan(directive.plan))
         inputs = directive.tracking
@@ -321,8 +322,8 @@ class Companion:
         """
         moment = self._moment(foresees=isinstance(message, CollisionReport) and message.collision)
         if isinstance(message, CollisionReport):
-            self._injection.watch(moment)
-        message = self._injection.pass_on(message, moment)
+            self._injector.watch(moment)
+        message = self._injector.pass_on(message, moment)
         if isinstance(message, Message):  # clouds and maps contain no monitored state
             decision = self._judge(message, setpoint)
             if decision.withheld:
@@ -350,10 +351,10 @@ class Companion:
         it to the other nodes. Otherwise the copy lasts for this tick, and is returned.
         """
         active, moment, copy = self.pilot.active, self._moment(), None
-        self._injection.strike_memory(moment)
+        self._injector.strike(moment)
         flown = active.trajectory
         if flown is not None:
-            struck = self._injection.strike_latched(flown, moment, active.waypoint)
+            struck = self._injector.strike_latched(flown, moment, active.waypoint)
             if self._injection.in_queue and not self._stack.control_owns_queue:
                 copy = None if struck is flown else struck
             else:

@@ -189,7 +189,32 @@ class Strike:
 Listener = Callable[[Strike], None]
 
 
-class Injector:
+class NoInjector:
+    """Null object that leaves everything as it is.
+
+    Attributes:
+        follower: finds out who reads what was struck.
+    """
+
+    def __init__(self) -> None:
+        self.follower = Follower()
+
+    def watch(self, moment: Moment) -> None:
+        """Note the mission's present state, once a control tick and for every report."""
+
+    def pass_on(self, message: M, moment: Moment) -> M:
+        """Return a published message as its receiver gets it."""
+        return message
+
+    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
+        """Return the active plan as it is from this tick on; `index` is its present waypoint."""
+        return trajectory
+
+    def strike(self, moment: Moment) -> None:
+        """Strike a memory or a process if the fault is due, once a control tick."""
+
+
+class Injector(NoInjector):
     """The schedule and the strikes of one fault. A subclass strikes messages or a memory.
 
     Args:
@@ -209,6 +234,7 @@ class Injector:
         shortest_flight_s: float,
         listener: Listener,
     ) -> None:
+        super().__init__()
         self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
         self._schedule = _Schedule(trigger, corruption, self.drawn_time_s)
         self._listener = listener
@@ -216,27 +242,15 @@ class Injector:
         self.count = 0
 
     def watch(self, moment: Moment) -> None:
-        """Note the mission's present state, once a control tick and for every report."""
+        """See `NoInjector`."""
         self._schedule.watch(moment)
-
-    def pass_on(self, message: M, moment: Moment) -> M:
-        """Return a published message as its receiver gets it."""
-        return message
-
-    def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active plan as it is from this tick on; `index` is its present waypoint."""
-        return trajectory
-
-    def strike(self, moment: Moment) -> bool:
-        """Strike a memory if the fault is due, once a control tick; True if it did."""
-        return False
 
     @property
     def missed(self) -> str:
         """The reason if the fault never struck."""
         return self._schedule.missed(self._awaits)
 
-    def _tell(self, moment: Moment, invocation: int, changes: Sequence[Change]) -> None:
+    def _tell(self, moment: Moment, invocation: int, changes: Sequence[Change]) -> Strike:
         self._schedule.acted(moment)
         strike = Strike(
             stamp_s=moment.stamp_s,
@@ -249,6 +263,7 @@ class Injector:
         if len(self.strikes) < _MAX_LISTED_STRIKES:
             self.strikes.append(strike)
         self._listener(strike)
+        return strike
 
 
 class SourceInjector(Injector):
@@ -271,7 +286,7 @@ class SourceInjector(Injector):
         self._struck: Message | None = None
 
     def pass_on(self, message: M, moment: Moment) -> M:
-        """See `Injector`."""
+        """See `NoInjector`."""
         if type(message) is not self._kind:
             return message
         self._invocations += 1
@@ -282,7 +297,7 @@ class SourceInjector(Injector):
         return self._strike(message, moment, 0)
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """See `Injector`."""
+        """See `NoInjector`."""
         if self._kind is not Trajectory or not self._strikes_latched():
             return trajectory
         if trajectory is self._struck and self.fault.corruption.persistence is not (
@@ -309,7 +324,7 @@ class SourceInjector(Injector):
             change = self._change(place, state, changed)
             changed = state.write(changed, self._index, change.after)
             changes.append(change)
-        self._tell(moment, self._invocations, changes)
+        self.follower.struck(changed, self._tell(moment, self._invocations, changes))
         result: M = changed
         return result
 
@@ -394,16 +409,15 @@ class MemoryInjector(Injector):
         chosen = None if bits is None else tuple(sorted(bits))
         self._pattern = _Pattern(corruption, rng, chosen)
 
-    def strike(self, moment: Moment) -> bool:
-        """See `Injector`."""
+    def strike(self, moment: Moment) -> None:
+        """See `NoInjector`."""
         if not self._schedule.due(moment, moment.tick):
-            return False
+            return
         place = self._memory[self.array]
         before = place.flat[self.element].item()
         change = _change_of(self.array, self.element, before, self._kind, self._pattern)
         place.flat[self.element] = change.after
         self._tell(moment, moment.tick, [change])
-        return True
 
 
 class Activation(Enum):
