@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sitl.control.cascade import control_step
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile import PROFILES, load_profile
 from sitl.vehicle.vehicle import Quadrotor
 
 STEPS = 500
@@ -30,7 +30,7 @@ def median_us(work: Callable[[], object]) -> float:
 def main() -> None:
     """Time every shipped profile in forward flight."""
     setpoint = np.array([np.nan] * 3 + [1.0, 0.5, -0.2] + [np.nan] * 3 + [0.3, np.nan])
-    for name in profile_names():
+    for name in PROFILES.names:
         vehicle = Quadrotor(load_profile(name), position_enu_m=(0.0, 0.0, 5.0), yaw_enu_rad=0.0)
         for _ in range(STEPS):
             vehicle.step(setpoint, armed=True)

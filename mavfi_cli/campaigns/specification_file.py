@@ -15,15 +15,14 @@ from typing import Any
 from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Spec
 from mavfi_cli.core.config import (
+    Shipped,
     read_text,
-    shipped_names,
-    shipped_path,
     structure,
     syntax_error,
 )
 from mavfi_cli.core.errors import ConfigError, UnknownKey, named_member
 
-_PRESETS = Path(__file__).parent / "presets"
+_PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
 _FACTORS = ("mission", "factors", "setting")  # tables of factors
 _TOP = (*(each.name for each in fields(Spec) if each.name not in ("fixed", "axes", "settings")),
         *_FACTORS)  # fmt: skip
@@ -32,7 +31,7 @@ _SETTING = ("name", "repetitions")
 
 def presets() -> tuple[str, ...]:
     """The names of the campaigns that come with mavfi."""
-    return tuple(shipped_names(_PRESETS))
+    return tuple(_PRESETS.names)
 
 
 def load_spec(name: str) -> Spec:
@@ -42,7 +41,7 @@ def load_spec(name: str) -> Spec:
         UnknownName: neither a preset nor a file.
         ConfigError: the file cannot be used; says where and why.
     """
-    path = shipped_path("campaign", name, _PRESETS)
+    path = _PRESETS.path(name)
     return parse_spec(read_text(path), path if path == Path(name) else Path(path.name))
 
 

@@ -18,9 +18,9 @@ _P95 = 1.6449  # standard normal: 90 % lie within
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def platforms(names: tuple[str, ...], as_json: bool) -> None:
     """List the compute platforms, or show the named ones kernel by kernel."""
-    from mavfi_cli.spec.platform import load_platform, platform_names
+    from mavfi_cli.spec.platform import PLATFORMS, load_platform
 
-    profiles = [load_platform(name) for name in names or platform_names()]
+    profiles = [load_platform(name) for name in names or PLATFORMS.names]
     if as_json:
         click.echo(json.dumps([asdict(profile) for profile in profiles], indent=2))
     elif names:

@@ -42,9 +42,9 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
     NAME:KEY=VALUE,KEY=VALUE names a variant: that stack with other values of some keys, such as
     mavbench:guards_tracking=true. FILE:KEY=VALUE works in the same way.
     """
-    from mavfi_cli.spec.stack import load_stack, stack_names
+    from mavfi_cli.spec.stack import STACKS, load_stack
 
-    found = [load_stack(name) for name in names or stack_names()]
+    found = [load_stack(name) for name in names or STACKS.names]
     if as_json:
         click.echo(json.dumps([asdict(stack) for stack in found], indent=2))
     elif not names:

@@ -45,39 +45,44 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
         raise syntax_error(error, path) from None
 
 
-def shipped_names(folder: Path) -> list[str]:
-    """Return the names of the TOML files in a folder, in alphabetical order."""
-    return sorted(path.stem for path in folder.glob("*.toml"))
+@dataclasses.dataclass(frozen=True, slots=True)
+class Shipped:
+    """The TOML files of one kind that are part of the program, in one folder."""
 
+    kind: str
+    folder: Path
 
-def shipped_path(kind: str, name_or_path: str, folder: Path) -> Path:
-    """Find the TOML file of a shipped `kind` by its name, or a user's own file by its path.
+    @property
+    def names(self) -> list[str]:
+        """Names of the files in alphabetical order."""
+        return sorted(path.stem for path in self.folder.glob("*.toml"))
 
-    Raises:
-        UnknownName: Nothing shipped has this name, and it is not a path to a TOML file.
-        ConfigError: It is a path to a TOML file that does not exist.
-    """
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        if name_or_path not in shipped_names(folder):
-            raise UnknownName(kind, name_or_path, shipped_names(folder))
-        return folder / f"{name_or_path}.toml"
-    if not path.is_file():
-        raise ConfigError("no such file", path=path)
-    return path
+    def path(self, name_or_path: str) -> Path:
+        """Find a shipped file by its name, or a user's own by its path.
 
+        Raises:
+            UnknownName: Nothing shipped has this name, and it is not a path to a TOML file.
+            ConfigError: It is a path to a TOML file that does not exist.
+        """
+        path = Path(name_or_path)
+        if path.suffix != ".toml":
+            if name_or_path not in self.names:
+                raise UnknownName(self.kind, name_or_path, self.names)
+            return self.folder / f"{name_or_path}.toml"
+        if not path.is_file():
+            raise ConfigError("no such file", path=path)
+        return path
 
-def shipped_base(kind: str, name: object, path: Path, folder: Path) -> str:
-    """Return the `base` of a file if it names another shipped file.
+    def base(self, name: object, path: Path) -> str:
+        """Return the `base` of a file if it names another shipped file.
 
-    Raises:
-        ConfigError: It does not. Suggests the nearest name.
-    """
-    known = shipped_names(folder)
-    if name not in known or path == folder / f"{name}.toml":
-        error = UnknownName(kind, str(name), set(known) - {path.stem})
-        raise ConfigError(str(error), path=path, key="base")
-    return str(name)
+        Raises:
+            ConfigError: It does not. Suggests the nearest name.
+        """
+        if name not in self.names or path == self.folder / f"{name}.toml":
+            error = UnknownName(self.kind, str(name), set(self.names) - {path.stem})
+            raise ConfigError(str(error), path=path, key="base")
+        return str(name)
 
 
 def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:

@@ -47,33 +47,6 @@ def _float32(value: float) -> float:
     return math.copysign(math.inf, number) if abs(number) > _LARGEST_FLOAT32 else number
 
 
-class _Replies:
-    """Collects replies until `take` returns them at the next tick."""
-
-    def __init__(self) -> None:
-        self._answers: list[Message] = []
-        self._next_heartbeat_s = -math.inf
-        self._texts = 0
-
-    def add(self, answer: Message) -> None:
-        """Add a reply, unless too many wait already."""
-        if len(self._answers) < _MAX_ANSWERS:
-            self._answers.append(answer)
-
-    def announce(self, severity: int, text: str) -> None:
-        """Broadcast a STATUSTEXT, mainly for ground stations."""
-        self._texts = self._texts % 0xFFFF + 1
-        self._answers += text_messages(severity, text.encode("ascii", "replace"), self._texts)
-
-    def take(self, stamp_s: float) -> list[Message]:
-        """Return the collected replies and texts, and our own HEARTBEAT once a second."""
-        out, self._answers = self._answers, []
-        if not self._next_heartbeat_s - _HEARTBEAT_INTERVAL_S <= stamp_s < self._next_heartbeat_s:
-            self._next_heartbeat_s = stamp_s + _HEARTBEAT_INTERVAL_S
-            out.append(_heartbeat())
-        return out
-
-
 def _heartbeat() -> Message:
     return dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0,
@@ -146,7 +119,9 @@ class OffboardSession:
         self._origin_asked: Ticket | None = None
         self._requests = Requests(self._commands, self.telemetry)
         self.hold()
-        self._replies = _Replies()
+        self._answers: list[Message] = []  # sent at the next tick
+        self._next_heartbeat_s = -math.inf
+        self._texts = 0
         self._now_s = 0.0
         self._phase_since_s: float | None = None
         self._ground_m: float | None = None
@@ -199,7 +174,9 @@ class OffboardSession:
 
     def announce(self, text: str) -> None:
         """Send a STATUSTEXT with severity WARNING to ground stations."""
-        self._replies.announce(dialect.MAV_SEVERITY_WARNING, text)
+        self._texts = self._texts % 0xFFFF + 1
+        data = text.encode("ascii", "replace")
+        self._answers += text_messages(dialect.MAV_SEVERITY_WARNING, data, self._texts)
 
     def start_camera(self, interval_s: float) -> None:
         """Request a frame of the camera every `interval_s` without end."""
@@ -263,13 +240,18 @@ class OffboardSession:
         """Reply to a request; the reply to one of our own needs none."""
         if message.tc1 == 0:
             own_ns = round(self._now_s * 1e9)
-            self._replies.add(dialect.MAVLink_timesync_message(own_ns, message.ts1))
+            self._answer(dialect.MAVLink_timesync_message(own_ns, message.ts1))
 
     def _ping(self, message: Message) -> None:
         """Reply to a request; the reply to one of our own needs none."""
         if message.target_system == message.target_component == 0:
             asker = (message.get_srcSystem(), message.get_srcComponent())
-            self._replies.add(dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker))
+            self._answer(dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker))
+
+    def _answer(self, answer: Message) -> None:
+        """Send a reply at the next tick, unless too many wait already."""
+        if len(self._answers) < _MAX_ANSWERS:
+            self._answers.append(answer)
 
     # Sent messages ------------------------------------------------------------------------------
 
@@ -289,7 +271,10 @@ class OffboardSession:
         except LinkError as failure:
             self._enter(Phase.FAILED)
             self.failure = failure
-        out = self._replies.take(stamp_s)
+        out, self._answers = self._answers, []
+        if not self._next_heartbeat_s - _HEARTBEAT_INTERVAL_S <= stamp_s < self._next_heartbeat_s:
+            self._next_heartbeat_s = stamp_s + _HEARTBEAT_INTERVAL_S
+            out.append(_heartbeat())
         system = self.telemetry.system
         if system:
             out += self._commands.poll(stamp_s, system)

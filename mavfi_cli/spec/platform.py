@@ -14,7 +14,7 @@ import os
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from mavfi_cli.core.config import load_toml, shipped_base, shipped_names, shipped_path
+from mavfi_cli.core.config import Shipped, load_toml
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 
 MEASURED = "measured"
@@ -23,7 +23,7 @@ KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
 _LONGEST_S = 3600.0
 LARGEST = 1.0e6  # maximum mass or power; a larger value has the wrong unit
 HARDWARE = ("mass_kg", "power_w", "heatsink_kgpw")
-_FOLDER = Path(__file__).parent / "platforms"
+PLATFORMS = Shipped("platform", Path(__file__).parent / "platforms")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,11 +138,6 @@ def check_hardware(board: object) -> None:
             raise ValueError(f"{key}: must be at most {LARGEST:g}, is {value:g}")
 
 
-def platform_names() -> list[str]:
-    """Return the shipped platforms in alphabetical order."""
-    return shipped_names(_FOLDER)
-
-
 def load_platform(name_or_path: str) -> PlatformProfile:
     """Load a shipped platform by name, a TOML file by path, or `measured:FACTOR`.
 
@@ -152,11 +147,11 @@ def load_platform(name_or_path: str) -> PlatformProfile:
     """
     if (factor := measured_factor(name_or_path)) is not None:
         return _measured(factor)
-    if not name_or_path.endswith(".toml") and name_or_path not in platform_names():
-        raise UnknownName("platform", name_or_path, [*platform_names(), f"{MEASURED}:FACTOR"])
-    path = shipped_path("platform", name_or_path, _FOLDER)
+    if not name_or_path.endswith(".toml") and name_or_path not in PLATFORMS.names:
+        raise UnknownName("platform", name_or_path, [*PLATFORMS.names, f"{MEASURED}:FACTOR"])
+    path = PLATFORMS.path(name_or_path)
     file = load_toml(path, _PlatformFile)
-    base = load_platform(shipped_base("platform", file.base, path, _FOLDER)) if file.base else None
+    base = load_platform(PLATFORMS.base(file.base, path)) if file.base else None
     about = {
         "kernels": _kernels(file, base, path),
         "sources": {**_given(file, path), **file.sources},
@@ -207,7 +202,7 @@ def _measured(factor: float) -> PlatformProfile:
 def _given(file: _PlatformFile, path: Path) -> dict[str, str]:
     """Return a source for each number that a file gives without one."""
     named = [key for key in ("cores", *HARDWARE) if getattr(file, key) is not None]
-    if path.parent == _FOLDER:
+    if path.parent == PLATFORMS.folder:
         return {}
     return dict.fromkeys(named, f"set in {path.name}")
 

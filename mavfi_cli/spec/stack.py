@@ -16,14 +16,14 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.config import read_toml, shipped_base, shipped_names, shipped_path, structure
+from mavfi_cli.core.config import Shipped, read_toml, structure
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 from mavfi_cli.core.types import StackMark
 from mavfi_cli.spec.platform import KERNELS
 
 DEFAULT = "mavbench"
 FIRST = "hardened"  # stack of records without a stack
-_FOLDER = Path(__file__).parent / "stacks"
+STACKS = Shipped("stack", Path(__file__).parent / "stacks")
 _ABOUT = ("name", "description", "base", "sources")
 _PAIR = re.compile(r",(?=\s*\w+\s*=)")  # separator of KEY=VALUE pairs; arrays have commas, too
 _LIMITS = {  # minimum and maximum of each number
@@ -161,11 +161,6 @@ class Stack:
 KEYS: tuple[str, ...] = tuple(each.name for each in fields(Stack) if each.name not in _ABOUT)
 
 
-def stack_names() -> list[str]:
-    """Return the shipped stacks in alphabetical order."""
-    return shipped_names(_FOLDER)
-
-
 def load_stack(text: str) -> Stack:
     """Load a stack by `NAME`, `FILE.toml`, or either with `:KEY=VALUE,KEY=VALUE`.
 
@@ -178,7 +173,7 @@ def load_stack(text: str) -> Stack:
             inconsistent.
     """
     name, colon, changes = text.partition(":")
-    path = shipped_path("stack", name, _FOLDER)
+    path = STACKS.path(name)
     values, source = _values(path)
     stack = structure(values, Stack, path=path, text=source)
     if not colon:
@@ -193,16 +188,16 @@ def _values(path: Path) -> tuple[dict[str, Any], str]:
     """Return the values of a file and its base, and the file's text."""
     values, text = read_toml(path)
     _require_known(values, path)
-    own = {} if path.parent == _FOLDER else dict.fromkeys(KEYS, f"set in {path.name}")
+    own = {} if path.parent == STACKS.folder else dict.fromkeys(KEYS, f"set in {path.name}")
     about = {"name": path.stem, "description": ""}
     inherited: dict[str, Any] = {}
     if values.get("base", ""):
-        base = shipped_base("stack", values["base"], path, _FOLDER)
-        inherited, _ = _values(_FOLDER / f"{base}.toml")
+        base = STACKS.base(values["base"], path)
+        inherited, _ = _values(STACKS.folder / f"{base}.toml")
     elif missing := [key for key in KEYS if key not in values]:
         raise ConfigError(
             f"{', '.join(missing[:3])}{', ...' if missing[3:] else ''}: missing; "
-            f"base = NAME takes missing values from a stack: {', '.join(stack_names())}",
+            f"base = NAME takes missing values from a stack: {', '.join(STACKS.names)}",
             path=path,
         )
     kept = {key: why for key, why in inherited.pop("sources", {}).items() if key not in values}

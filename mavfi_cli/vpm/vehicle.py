@@ -9,13 +9,14 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.core.config import load_toml, shipped_path
+from mavfi_cli.core.config import Shipped, load_toml
 from mavfi_cli.spec.platform import HARDWARE, LARGEST, PlatformProfile, check_hardware
 
 CALIBRATED = ("rotor_pull_n", "response_s")  # the parameters that a calibration may set
 SMALLEST = 1.0e-6  # in any unit; a smaller value is probably in the wrong unit
 SMALL_KG = 0.67  # geometric mean of the simulated vehicles, 0.3 kg and 1.5 kg
-_VEHICLES, _BOARDS = (Path(__file__).parent / name for name in ("vehicles", "boards"))
+_VEHICLES = Shipped("vehicle", Path(__file__).parent / "vehicles")
+_BOARDS = Shipped("board", Path(__file__).parent / "boards")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +84,7 @@ class ModelVehicle:
             UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
             ConfigError: the file cannot be used.
         """
-        return load_toml(shipped_path("vehicle", name_or_path, _VEHICLES), cls)
+        return load_toml(_VEHICLES.path(name_or_path), cls)
 
     @property
     def stand_in(self) -> str:
@@ -125,7 +126,7 @@ class Board:
             UnknownName: no shipped board has this name, and it is not a path to a TOML file.
             ConfigError: the file cannot be used.
         """
-        return load_toml(shipped_path("board", name_or_path, _BOARDS), cls)
+        return load_toml(_BOARDS.path(name_or_path), cls)
 
     @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:

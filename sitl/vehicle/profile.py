@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.config import read_toml, shipped_names, shipped_path, structure
-from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.config import Shipped, read_toml, structure
+from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.frames import Vector
 
 AIR_DENSITY_KGPM3 = 1.225  # ISA at sea level
@@ -366,12 +366,7 @@ def _with_pull(base: VehicleProfile, pull_n: float) -> _Rotor:
     )
 
 
-_PROFILES = Path(__file__).parent / "profiles"
-
-
-def profile_names() -> list[str]:
-    """Return the names of the shipped profiles."""
-    return shipped_names(_PROFILES)
+PROFILES = Shipped("vehicle", Path(__file__).parent / "profiles")
 
 
 def load_profile(name_or_path: str) -> VehicleProfile:
@@ -383,15 +378,13 @@ def load_profile(name_or_path: str) -> VehicleProfile:
         UnknownName: It is neither a shipped profile nor a TOML path.
         ConfigError: The file cannot be read, or its vehicle cannot fly.
     """
-    path = shipped_path("vehicle", name_or_path, _PROFILES)
+    path = PROFILES.path(name_or_path)
     data, text = read_toml(path)
     if "base" not in data:
         return structure(data, VehicleProfile, path=path, text=text)
     stand_in = structure(data, _StandIn, path=path, text=text)
-    if stand_in.base not in profile_names():
-        error = UnknownName("vehicle", stand_in.base, profile_names())
-        raise ConfigError(str(error), path=path, key="base")
+    base = PROFILES.base(stand_in.base, path)
     try:
-        return stand_in.profile(load_profile(stand_in.base))
+        return stand_in.profile(load_profile(base))
     except (ConfigError, ValueError) as problem:
         raise ConfigError(str(problem), path=path) from None

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mavfi_cli.cli.stacks import _GROUPS
-from mavfi_cli.spec.stack import KEYS, load_stack, stack_names
+from mavfi_cli.spec.stack import KEYS, STACKS, load_stack
 
 
 def test_every_key_is_told_once():
@@ -16,12 +16,12 @@ def test_the_list_has_a_line_a_stack(command_line):
     code, out, _ = command_line("stacks")
     assert code == 0
     lines = out.splitlines()
-    assert [line.split()[0] for line in lines[: len(stack_names())]] == stack_names()
+    assert [line.split()[0] for line in lines[: len(STACKS.names)]] == STACKS.names
     assert "NAME:KEY=VALUE" in out
     assert max(map(len, lines)) <= 100
 
 
-@pytest.mark.parametrize("name", [*stack_names(), "mavbench:guards_tracking=true"])
+@pytest.mark.parametrize("name", [*STACKS.names, "mavbench:guards_tracking=true"])
 def test_one_stack_is_explained_key_by_key_with_sources(command_line, name):
     code, out, _ = command_line("stacks", name)
     assert code == 0

@@ -4,10 +4,10 @@ import pytest
 from missions import SOUND_PLATFORM
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
-from mavfi_cli.spec.platform import KERNELS, load_platform, platform_names
+from mavfi_cli.spec.platform import KERNELS, PLATFORMS, load_platform
 
 
-@pytest.mark.parametrize("name", platform_names())
+@pytest.mark.parametrize("name", PLATFORMS.names)
 def test_shipped_platforms_have_every_kernel_with_its_source(name):
     platform = load_platform(name)
     assert platform.name == name

@@ -3,11 +3,11 @@
 import pytest
 
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
-from mavfi_cli.spec.stack import KEYS, load_stack, stack_names
+from mavfi_cli.spec.stack import KEYS, STACKS, load_stack
 
 
 def test_the_shipped_stacks_say_every_key_and_where_it_is_from():
-    assert stack_names() == ["hardened", "mavbench", "mavbench-protected", "mavbench-release"]
+    assert STACKS.names == ["hardened", "mavbench", "mavbench-protected", "mavbench-release"]
     mavbench = load_stack("mavbench")
     unused = {"tracking_guard_m", "farthest_waypoint_m"}
     assert set(mavbench.sources) == set(KEYS) - unused

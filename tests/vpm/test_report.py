@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli import vpm
-from mavfi_cli.core.config import shipped_names
+from mavfi_cli.core.config import Shipped
 from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import GRAVITY_MPS2, SCHEMES, schemes_with
@@ -78,7 +78,7 @@ def vehicle_file(name):
     return VPM / "vehicles" / f"{name}.toml"
 
 
-@pytest.mark.parametrize("name", shipped_names(VPM / "vehicles"))
+@pytest.mark.parametrize("name", Shipped("vehicle", VPM / "vehicles").names)
 def test_the_rows_agree_with_each_other(name):
     response = 0.2 if name == "cal20" else None
     one = told(name, Choices(response_s=response, board=Board.load("raspi3b"), distance_m=120.0))
@@ -242,7 +242,7 @@ def test_a_vehicle_that_needs_more(choices, said):
         told("cal20", choices)
 
 
-@pytest.mark.parametrize("name", shipped_names(VPM / "boards"))
+@pytest.mark.parametrize("name", Shipped("board", VPM / "boards").names)
 def test_shipped_boards_have_sources(name):
     board = Board.load(name)
     assert board.name == name

@@ -11,9 +11,9 @@ from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
 from sitl.control import cascade
 from sitl.control.cascade import rotation, specific_force, tilt_rates
 from sitl.control.gains import gains_for
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile import PROFILES, load_profile
 
-GAINS = {name: gains_for(load_profile(name), 0.004) for name in profile_names()}
+GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}
 angles = st.floats(-3.0, 3.0)
 accelerations = st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3).map(np.array)
 
@@ -34,7 +34,7 @@ def test_rotation_is_the_one_of_the_frames_module(roll, pitch, yaw):
 
 
 @settings(deadline=None)  # the first call may compile
-@given(st.sampled_from(profile_names()), accelerations)
+@given(st.sampled_from(PROFILES.names), accelerations)
 def test_force_keeps_tilt_and_thrust_limits_and_the_height(name, acceleration):
     gains = GAINS[name]
     force = specific_force(acceleration, gains)

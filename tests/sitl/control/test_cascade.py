@@ -10,10 +10,10 @@ from mavfi_cli.core.frames import quaternion_from_euler
 from sitl.control import cascade
 from sitl.control.cascade import control_step
 from sitl.control.gains import gains_for
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile import PROFILES, load_profile
 
-GAINS = {name: gains_for(load_profile(name), 0.004) for name in profile_names()}
-names = st.sampled_from(profile_names())
+GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}
+names = st.sampled_from(PROFILES.names)
 anything = st.lists(st.floats(), min_size=11, max_size=11).map(np.array)
 small = st.floats(-1.0, 1.0)
 

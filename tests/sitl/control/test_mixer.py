@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from sitl.control import cascade
 from sitl.control.cascade import LEAST_SHARE, mix, throttle, thrust_shares
 from sitl.control.gains import gains_for
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile import PROFILES, load_profile
 
-PROFILES = {name: load_profile(name) for name in profile_names()}
+PROFILES = {name: load_profile(name) for name in PROFILES.names}
 GAINS = {name: gains_for(profile, 0.004) for name, profile in PROFILES.items()}
-names = st.sampled_from(profile_names())
+names = st.sampled_from(PROFILES.names)
 # Signs (forward, right) and sense (+1: counter-clockwise from above) of the rotors in the model.
 ROTOR_LAYOUT = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0))
 torques = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=3).map(np.array)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.vehicle.profile import load_profile, profile_names
+from sitl.vehicle.profile import PROFILES, load_profile
 from sitl.vehicle.vehicle import (
     battery_current,
     open_circuit_voltage,
@@ -27,7 +27,7 @@ def twin(velocity, acceleration, energy, payload_kg):
 
 
 @settings(deadline=None)  # the first call may compile
-@given(components, components, st.floats(0.0, 1.0), st.sampled_from(profile_names()))
+@given(components, components, st.floats(0.0, 1.0), st.sampled_from(PROFILES.names))
 def test_regression_is_its_twin(velocity, acceleration, payload_kg, name):
     energy = load_profile(name).energy
     power = regression_power(velocity, acceleration, energy.coefficients(payload_kg))
@@ -49,7 +49,7 @@ def test_hovering_solo_takes_the_constant(airborne, setpoint):
     assert flight.truth.energy_regression_j - before == pytest.approx(4439.0, rel=0.01)
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", PROFILES.names)
 def test_open_circuit_voltage_rises_with_charge(name):
     battery = load_profile(name).battery
     parameters = battery.parameters()

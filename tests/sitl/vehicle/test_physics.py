@@ -21,7 +21,7 @@ from sitl.vehicle.physics import (
     thrust_share,
     write_model,
 )
-from sitl.vehicle.profile import GRAVITY_MPS2, load_profile, profile_names
+from sitl.vehicle.profile import GRAVITY_MPS2, PROFILES, load_profile
 
 DT_S = 0.004
 
@@ -43,7 +43,7 @@ def read(physics):
     return raw
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", PROFILES.names)
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.3])
 def test_throttle_gives_the_rotor_speed_of_its_thrust_share(name, share):
     profile, physics = bench(name, load_profile(name).rest_height_m)
@@ -54,7 +54,7 @@ def test_throttle_gives_the_rotor_speed_of_its_thrust_share(name, share):
     np.testing.assert_allclose(rpm, math.sqrt(share) * profile.rotor.max_rpm, rtol=2e-3)
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", PROFILES.names)
 def test_motor_lag_is_the_predicted_one(name):
     profile, physics = bench(name, load_profile(name).rest_height_m)
     gains = gains_for(profile, DT_S)
@@ -72,7 +72,7 @@ def test_motor_lag_is_the_predicted_one(name):
     assert measured_s == pytest.approx(expected_s, abs=1.5 * DT_S)
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", PROFILES.names)
 def test_fall_with_drag(name):
     profile, physics = bench(name, 100.0)
     speed, fallen, fine = 0.0, 0.0, DT_S / 100

@@ -8,7 +8,7 @@ import pytest
 
 from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
 from sitl.vehicle import profile as profile_module
-from sitl.vehicle.profile import GRAVITY_MPS2, load_profile, profile_names
+from sitl.vehicle.profile import GRAVITY_MPS2, PROFILES, load_profile
 
 SHIPPED = Path(profile_module.__file__).parent / "profiles"
 
@@ -22,10 +22,10 @@ def variant(tmp_path, old, new, name="solo"):
 
 
 def test_shipped_names():
-    assert profile_names() == ["solo", "spark"]
+    assert PROFILES.names == ["solo", "spark"]
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", PROFILES.names)
 def test_name_in_the_file_is_the_name(name):
     assert load_profile(name).name == name
 
@@ -44,14 +44,14 @@ def test_spark_is_in_its_class():
     assert 1.8 <= spark.max_thrust_n / (spark.mass_kg * GRAVITY_MPS2) <= 2.2
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", PROFILES.names)
 def test_motor_lag_is_tens_of_milliseconds(name):
     profile = load_profile(name)
     hover_n = profile.total_mass_kg * GRAVITY_MPS2 / 4.0
     assert 0.02 < profile.rotor.time_constant_s(hover_n) < 0.08
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", PROFILES.names)
 def test_box_holds_rotors_and_stands_clear_of_the_ground(name):
     profile = load_profile(name)
     reach = profile.rotor.arm_m / math.sqrt(2.0) + profile.rotor.diameter_m / 2.0
