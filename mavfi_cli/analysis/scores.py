@@ -22,7 +22,7 @@ from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.states import BY_NAME
 from mavfi_cli.core.types import Stage, Trajectory
-from mavfi_cli.detect.model import read as read_model
+from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.fi import bits
 from mavfi_cli.mission.record.run_folder import load_run
@@ -148,7 +148,7 @@ class Scores:
         from_s = -math.inf if struck_s is None else struck_s - 1e-9
         highest = 0.0
         judgements = replay(
-            flight.columns, fresh, None if path is None else read_model(path).preprocess,
+            flight.columns, fresh, None if path is None else Model.read(path).preprocess,
             protect=frozenset(map(Stage, detector.protect)),
             plans=flight.plans, strikes=flight.strikes,
         )  # fmt: skip

@@ -81,7 +81,7 @@ class FittedDetector:
         """
         path = model_file.shipped(cls.name) if model is None else model
         positive = (next(iter(cls.shapes)), *cls.divisors)
-        loaded = model_file.load(path, cls.name, cls.shapes, positive)
+        loaded = model_file.Model.load(path, cls.name, cls.shapes, positive)
         detector = cls(loaded.arrays)
         detector.stack, detector.extended = loaded.stack, loaded.extended
         if threshold is not None:

@@ -45,6 +45,83 @@ class Model:
         if not self.preprocess_digest:
             object.__setattr__(self, "preprocess_digest", self.preprocess.digest())
 
+    def save(self, path: Path) -> None:
+        """Write the model atomically.
+
+        Raises:
+            ModelError: A number is not finite. Nothing is written.
+            RecordError: The file could not be written.
+        """
+        for name, array in self.arrays.items():
+            _require_finite(path, name, array)
+        write_json(path, asdict(self))
+
+    @classmethod
+    def read(cls, path: Path) -> Model:
+        """Read a model file of any kind, made by any version with this schema.
+
+        Raises:
+            ModelError: The file cannot be read, is corrupt, or has another schema.
+        """
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ModelError(error.strerror or str(error), path=path) from None
+        except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
+            raise ModelError("corrupt model file: not JSON", path=path) from None
+        if not isinstance(data, dict):
+            raise ModelError("corrupt model file: no JSON object", path=path)
+        _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
+        if set(data) != _KEYS:
+            odd = sorted(set(data) ^ _KEYS)
+            raise ModelError(f"corrupt model file: keys {', '.join(odd)}", path=path)
+        try:
+            model = structure(data, cls)
+        except ConfigError as error:
+            raise ModelError(f"corrupt model file: {error}", path=path) from None
+        if asdict(model.preprocess) != data["preprocess"]:
+            raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
+        return model
+
+    @classmethod
+    def load(
+        cls,
+        path: Path,
+        detector: str,
+        shapes: Mapping[str, tuple[int, ...]],
+        positive: Collection[str] = (),
+    ) -> Model:
+        """Read a model of a kind with arrays of the given shapes, for any stack.
+
+        Args:
+            positive: Names of arrays whose numbers must all be above 0.
+
+        Raises:
+            ModelError: As `read`; or the file has another mavfi version, state table,
+                preprocessing or kind; an array is missing, unknown, of another shape, not finite,
+                or out of range.
+        """
+        model = cls.read(path)
+        _refuse_other(path, "mavfi", model.mavfi, version("mavfi"))
+        _refuse_other(path, "detector", model.detector, detector)
+        if model.states != states_digest():
+            raise ModelError("made for another table of states; train it anew", path=path)
+        if model.preprocess_digest != model.preprocess.digest():
+            raise ModelError("made with another preprocessing; train it anew", path=path)
+        names = [state.name for state in EXTENDED]
+        if set(model.extended) != set(names):
+            raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
+        for name, (low, high) in model.extended.items():
+            if not -LIMIT <= low <= 0 <= high <= LIMIT:
+                raise ModelError(f"corrupt model file: extended: {name} is no range", path=path)
+        if set(model.arrays) != set(shapes):
+            raise ModelError(f"corrupt model file: arrays must be {', '.join(shapes)}", path=path)
+        arrays = {name: _array(path, name, model.arrays[name], shapes[name]) for name in shapes}
+        for name in positive:
+            if not (arrays[name] > 0.0).all():
+                raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
+        return replace(model, arrays=arrays)
+
 
 _KEYS = frozenset(each.name for each in fields(Model))
 
@@ -57,79 +134,6 @@ def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
 def shipped_stacks() -> list[str]:
     """Return the stacks with shipped models, in alphabetical order."""
     return sorted(folder.name for folder in SHIPPED.iterdir() if folder.is_dir())
-
-
-def save(path: Path, model: Model) -> None:
-    """Write a model atomically.
-
-    Raises:
-        ModelError: A number is not finite. Nothing is written.
-        RecordError: The file could not be written.
-    """
-    for name, array in model.arrays.items():
-        _require_finite(path, name, array)
-    write_json(path, asdict(model))
-
-
-def read(path: Path) -> Model:
-    """Read a model file of any kind, made by any version with this schema.
-
-    Raises:
-        ModelError: The file cannot be read, is corrupt, or has another schema.
-    """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ModelError(error.strerror or str(error), path=path) from None
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
-        raise ModelError("corrupt model file: not JSON", path=path) from None
-    if not isinstance(data, dict):
-        raise ModelError("corrupt model file: no JSON object", path=path)
-    _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
-    if set(data) != _KEYS:
-        odd = sorted(set(data) ^ _KEYS)
-        raise ModelError(f"corrupt model file: keys {', '.join(odd)}", path=path)
-    try:
-        model = structure(data, Model)
-    except ConfigError as error:
-        raise ModelError(f"corrupt model file: {error}", path=path) from None
-    if asdict(model.preprocess) != data["preprocess"]:
-        raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
-    return model
-
-
-def load(
-    path: Path, detector: str, shapes: Mapping[str, tuple[int, ...]], positive: Collection[str] = ()
-) -> Model:
-    """Read a model of a kind with arrays of the given shapes, for any stack.
-
-    Args:
-        positive: Names of arrays whose numbers must all be above 0.
-
-    Raises:
-        ModelError: As `read`; or the file has another mavfi version, state table, preprocessing or
-            kind; an array is missing, unknown, of another shape, not finite, or out of range.
-    """
-    model = read(path)
-    _refuse_other(path, "mavfi", model.mavfi, version("mavfi"))
-    _refuse_other(path, "detector", model.detector, detector)
-    if model.states != states_digest():
-        raise ModelError("made for another table of states; train it anew", path=path)
-    if model.preprocess_digest != model.preprocess.digest():
-        raise ModelError("made with another preprocessing; train it anew", path=path)
-    names = [state.name for state in EXTENDED]
-    if set(model.extended) != set(names):
-        raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
-    for name, (low, high) in model.extended.items():
-        if not -LIMIT <= low <= 0 <= high <= LIMIT:
-            raise ModelError(f"corrupt model file: extended: {name} is no range", path=path)
-    if set(model.arrays) != set(shapes):
-        raise ModelError(f"corrupt model file: arrays must be {', '.join(shapes)}", path=path)
-    arrays = {name: _array(path, name, model.arrays[name], shapes[name]) for name in shapes}
-    for name in positive:
-        if not (arrays[name] > 0.0).all():
-            raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
-    return replace(model, arrays=arrays)
 
 
 def checked_threshold(value: float, key: str = "threshold") -> float:
@@ -198,7 +202,7 @@ def _row(name: str, path: Path | None) -> dict[str, Any]:
         row["threshold"] = find_detector(name, model=path).threshold
         if path is None:
             return {**row, "told": "needs no training"}
-        model = read(path)
+        model = Model.read(path)
     except ModelError as error:
         return {**row, "told": f"cannot be used: {error}"}
     row["provenance"] = {"mavfi": model.mavfi, "detector": model.detector, **model.provenance}

@@ -177,11 +177,7 @@ UNIFORM = "instruction-uniform"  # the one rule whose draws can be repeated
 _NODES = {
     "perception": ("point_cloud", "octomap", "collision_check"),
     "planning": ("planner",),
-    "point_cloud": ("point_cloud",),
-    "octomap": ("octomap",),
-    "collision_check": ("collision_check",),
-    "planner": ("planner",),
-    "control": ("control",),
+    **{node: (node,) for node in KERNELS},
 }
 
 

@@ -10,10 +10,9 @@ from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
-from mavfi_cli.spec.platform import measured_factor
+from mavfi_cli.spec.platform import KERNELS, measured_factor
 from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack
 
-ISOLATABLE = ("point_cloud", "octomap", "collision_check", "planner", "control")
 FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}
 """Real autopilots, and the environment variables that name their SITL binaries."""
 
@@ -135,8 +134,8 @@ class MissionConfig:
         self._check_platform()
         self._check_autopilot()
         for node in self.isolate:
-            if node not in ISOLATABLE:
-                raise UnknownName("node", node, ISOLATABLE)
+            if node not in KERNELS:
+                raise UnknownName("node", node, KERNELS)
         self._check_seeds()
         for name, size in (
             ("camera_columns", self.camera_columns),

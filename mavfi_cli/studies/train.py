@@ -176,7 +176,7 @@ def train(
     models = {}
     for kind, model in fitted.items():  # all of them, or none
         path = folder / f"{kind}.json"
-        model_file.save(path, model)
+        model.save(path)
         models[kind] = (model, path)
     return _TrainedDetectors(dataset=dataset, models=models, failed=failed)
 

@@ -6,7 +6,7 @@ from detect_builders import STACK
 
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect import base, fit, model
+from mavfi_cli.detect import base, fit
 from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import COUNT, NAMES, PreprocessParams
 from mavfi_cli.detect.watch import EXTENDED
@@ -92,7 +92,7 @@ def test_a_threshold_is_the_largest_score_of_flights_that_training_did_not_see(
     dataset, kind, quick, tmp_path
 ):
     fitted = fit.fit(kind, dataset)
-    model.save(tmp_path / "m.json", fitted)
+    fitted.save(tmp_path / "m.json")
     detector = base.find_detector(kind, model=tmp_path / "m.json")
     held_out = parts_of(dataset, fit.split(dataset, 1)["threshold"])
     images = fit.mirrored(np.concatenate([each.deltas for each in held_out])).astype(np.int16)

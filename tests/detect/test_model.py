@@ -19,7 +19,7 @@ def path(tmp_path):
     arrays = {name: np.array(array) for name, array in GaussianDetector.cold(6.0).memory.items()}
     arrays["mean"][3] = 1 / 3
     made = Model(detector="gad", arrays=arrays, stack=STACK, extended=RANGES, provenance={"a": 1})
-    model.save(tmp_path / "gad.json", made)
+    made.save(tmp_path / "gad.json")
     return tmp_path / "gad.json"
 
 
@@ -34,13 +34,13 @@ def changed(path, **values):
 
 
 def test_what_is_saved_is_loaded_exactly(path):
-    loaded = model.load(path, "gad", SHAPES)
+    loaded = Model.load(path, "gad", SHAPES)
     assert loaded.arrays["mean"][3] == 1 / 3
     assert loaded.provenance == {"a": 1}
     assert (loaded.stack, loaded.extended) == (STACK, RANGES)
-    assert model.read(path).preprocess == PreprocessParams()
+    assert Model.read(path).preprocess == PreprocessParams()
     again = path.with_name("again.json")
-    model.save(again, loaded)
+    loaded.save(again)
     assert again.read_bytes() == path.read_bytes()
 
 
@@ -75,7 +75,7 @@ def test_what_is_saved_is_loaded_exactly(path):
 def test_a_file_that_does_not_fit_is_refused_in_one_line(path, values, problem):
     changed(path, **values)
     with pytest.raises(ModelError, match=problem) as caught:
-        model.load(path, "gad", SHAPES)
+        Model.load(path, "gad", SHAPES)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
@@ -95,7 +95,7 @@ def test_arrays_are_checked(path, value, problem):
     data["arrays"]["n_sigma"] = value
     path.write_text(json.dumps(data))
     with pytest.raises(ModelError, match=problem):
-        model.load(path, "gad", SHAPES)
+        Model.load(path, "gad", SHAPES)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_thresholds_and_divisors_out_of_range_are_refused(tmp_path, name, array,
 def test_a_corrupt_file_is_refused(tmp_path, content):
     path = tmp_path / "broken.json"
     path.write_bytes(content)
-    for load in (lambda: model.load(path, "gad", SHAPES), lambda: model.read(path)):
+    for load in (lambda: Model.load(path, "gad", SHAPES), lambda: Model.read(path)):
         with pytest.raises(ModelError, match="corrupt model file") as caught:
             load()
         assert "\n" not in str(caught.value)
@@ -125,10 +125,10 @@ def test_a_corrupt_file_is_refused(tmp_path, content):
 
 def test_a_number_that_is_not_finite_overwrites_nothing(path):
     before = path.read_bytes()
-    loaded = model.load(path, "gad", SHAPES)
+    loaded = Model.load(path, "gad", SHAPES)
     loaded.arrays["mean"][0] = np.nan
     with pytest.raises(ModelError, match="array 'mean' holds a number that is not finite"):
-        model.save(path, loaded)
+        loaded.save(path)
     assert path.read_bytes() == before
 
 
@@ -141,7 +141,7 @@ def test_thresholds_out_of_range(value):
 def test_a_model_of_version_0_1_is_refused_by_its_schema(path):
     changed(path, schema=1, mavfi="0.1.0", stack=None, extended=None)
     with pytest.raises(ModelError, match="made for model schema 1, this is 2"):
-        model.load(path, "gad", SHAPES)
+        Model.load(path, "gad", SHAPES)
 
 
 def test_models_are_shipped_for_these_stacks():
@@ -155,10 +155,10 @@ def test_models_are_shipped_for_these_stacks():
 def test_the_shipped_models_tell_where_they_come_from(name, stack):
     path = model.shipped(name, stack)
     detector = base.find_detector(name, model=path)
-    loaded = model.load(path, name, type(detector).shapes)
+    loaded = Model.load(path, name, type(detector).shapes)
     assert loaded.stack.name == stack
     assert (detector.stack, detector.extended) == (loaded.stack, loaded.extended)
-    assert model.read(path).preprocess == PreprocessParams()
+    assert Model.read(path).preprocess == PreprocessParams()
     told = loaded.provenance
     assert told["worlds"] == ["train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5"]
     parts = [set(told["split"][part]) for part in ("train", "validation", "threshold")]

@@ -25,7 +25,8 @@ from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.run_folder import RunFolder, load_run
 from mavfi_cli.mission.record.tables import Trace
 from mavfi_cli.mission.run import response_times
-from mavfi_cli.spec.mission import ISOLATABLE, OF_THE_WORLD, MissionConfig
+from mavfi_cli.spec.mission import OF_THE_WORLD, MissionConfig
+from mavfi_cli.spec.platform import KERNELS
 
 # Configuration -------------------------------------------------------------------------------
 
@@ -89,7 +90,7 @@ def test_seeds_that_sitl_could_not_take(seed):
 
 
 def test_nodes_that_can_be_isolated():
-    assert MissionConfig(isolate=ISOLATABLE).isolate == ISOLATABLE
+    assert MissionConfig(isolate=KERNELS).isolate == KERNELS
     with pytest.raises(UnknownName, match="did you mean 'planner'"):
         MissionConfig(isolate=("plannner",))
 

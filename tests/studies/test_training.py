@@ -8,6 +8,7 @@ import pytest
 
 from mavfi_cli.detect import base, fit, model
 from mavfi_cli.detect.dataset import Dataset
+from mavfi_cli.detect.model import Model
 
 WORLD, FIRST_SEED, FLIGHTS = "train-0.2-5", 10_075, 10
 FLOWN = {f"{WORLD}/{seed}" for seed in range(FIRST_SEED, FIRST_SEED + FLIGHTS)}
@@ -60,7 +61,7 @@ def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_mad
 @pytest.mark.parametrize("kind", [*KINDS, "aad"])
 def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
     detector = base.find_detector(kind)
-    setting = set(model.read(model.shipped(kind)).provenance["split"]["threshold"]) & FLOWN
+    setting = set(Model.read(model.shipped(kind)).provenance["split"]["threshold"]) & FLOWN
     flights = Dataset.load(folder / "dataset.parquet").flights
     scores = [
         fit.scores(detector, flight)
