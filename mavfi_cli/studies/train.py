@@ -16,7 +16,6 @@ from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Outcome, StackMark
-from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.dataset import Dataset, FlightSamples
 from mavfi_cli.detect.fit import KINDS, check, fit
 from mavfi_cli.detect.model import Model

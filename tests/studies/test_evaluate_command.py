@@ -35,7 +35,7 @@ def test_bad_input_gets_one_line(mavfi, tmp_path, option, given, told):
 
 
 def test_seeds_of_the_training_are_refused_by_name(mavfi, tmp_path):
-    flight = model_file.read(model_file.shipped("gad")).provenance["split"]["train"][0]
+    flight = model_file.Model.read(model_file.shipped("gad")).provenance["split"]["train"][0]
     line = refused(mavfi, tmp_path, "--detector", "gad", "--first-seed", flight.split("/")[1])
     assert "gad was made with the flight train-" in line
 
@@ -53,7 +53,9 @@ def test_the_list_names_model_threshold_and_training(mavfi):
     assert {(n, s) for n in ("gad", "aad", "range", "l2") for s in stacks} <= set(rows)
     aad = rows["aad", "mavbench"]
     assert aad["model"] == str(model_file.shipped("aad"))
-    assert aad["threshold"] == model_file.read(model_file.shipped("aad")).provenance["threshold"]
+    assert (
+        aad["threshold"] == model_file.Model.read(model_file.shipped("aad")).provenance["threshold"]
+    )
     text = mavfi("detect", "list").stdout
     assert f"threshold {aad['threshold']:.6g}" in text
     assert f"{aad['provenance']['flights']} flights in train-0.05-3" in text

@@ -34,7 +34,7 @@ def models(tmp_path):
         extended=dict.fromkeys((state.name for state in EXTENDED), (0, 1)),
         provenance={"split": split, "flights": 2},
     )  # fmt: skip
-    model_file.save(tmp_path / "gad.json", model)
+    model.save(tmp_path / "gad.json")
     return tmp_path
 
 
@@ -131,7 +131,7 @@ def test_a_model_that_is_missing_or_damaged_is_refused(models):
 
 
 def test_all_parts_of_the_split_are_seen(models):
-    flights = training_flights(model_file.read(models / "gad.json").provenance)
+    flights = training_flights(model_file.Model.read(models / "gad.json").provenance)
     assert sorted(flights) == ["train-0.05-3/40", "train-0.2-5/41"]
 
 

@@ -117,7 +117,7 @@ def test_a_detector_is_fitted_to_the_error_free_flights_of_a_folder(mavfi, flown
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("Data set    10 flights of hardened, ")
     assert "; left out: 3\n" in done.stdout
-    told = model.read(tmp_path / "new" / "gad.json")
+    told = Model.read(tmp_path / "new" / "gad.json")
     assert told.stack.name == "hardened"
     assert {"farm/5", "link-5-009/5"} <= flights_of(told.provenance)
 
