@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _STATE_COLUMNS = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps", "yaw_rad")
-_SOURCE_COLUMNS = {
-    "report_stamp_s": "float64", "trajectory_stamp_s": "float64", "waypoint_index": "int32",
-}  # fmt: skip
 _TRUTH_COLUMNS = {
     "position_enu_m": ("truth_x_m", "truth_y_m", "truth_z_m"),
     "velocity_enu_mps": ("truth_vx_mps", "truth_vy_mps", "truth_vz_mps"),
@@ -51,7 +48,6 @@ class Trace:
         self._stamps: list[float] = []
         self._phases: list[str] = []
         self._vehicle: list[tuple[float, ...]] = []
-        self._sources: list[tuple[float | None, float | None, int | None]] = []
         self._messages: dict[type, list[tuple[Message, int] | None]] = {k: [] for k in _GROUPS}
 
     def add(
@@ -72,13 +68,6 @@ class Trace:
         self._messages[CollisionReport].append(None if report is None else (report, 0))
         self._messages[Trajectory].append(trajectory)
         self._messages[Command].append(None if command is None else (command, 0))
-        self._sources.append(
-            (
-                None if report is None else report.stamp_s,
-                None if trajectory is None else trajectory[0].stamp_s,
-                None if trajectory is None else trajectory[1],
-            )
-        )
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -111,8 +100,11 @@ class Trace:
                 for entry in self._messages[state.message]
             ]
             columns[name] = pa.array(values, kinds[state.dtype])
-        for place, (name, kind) in enumerate(_SOURCE_COLUMNS.items()):
-            columns[name] = pa.array([row[place] for row in self._sources], getattr(pa, kind)())
+        for name, kind in (("report", CollisionReport), ("trajectory", Trajectory)):
+            stamps = [entry and entry[0].stamp_s for entry in self._messages[kind]]
+            columns[f"{name}_stamp_s"] = pa.array(stamps, pa.float64())
+        places = [entry and entry[1] for entry in self._messages[Trajectory]]
+        columns["waypoint_index"] = pa.array(places, pa.int32())
         if truth is not None:
             columns.update(self._truth_columns(truth))
         return pa.table(columns)
