@@ -252,6 +252,8 @@ def _reader(
 
 def _writer(fields: Sequence[_Field]) -> Callable[[Message], Sequence[Any]]:
     """Return a function that converts a message to the values of its wire layout."""
+    if fields[0].message == _PACKET:
+        return lambda message: (message.seqnr, bytes(message.data))
     names = [f"_{each.name}_raw" if each.type == "char" else each.name for each in fields]
     if len(names) > 1 and all(field.length == 1 for field in fields):
         getter: Callable[[Message], Sequence[Any]] = attrgetter(*names)
