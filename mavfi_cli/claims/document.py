@@ -22,7 +22,7 @@ from mavfi_cli.claims.effects import Finding, Protected, count, lost_share, stru
 from mavfi_cli.claims.findings import Kernels, instruction_faults
 from mavfi_cli.claims.flights import FlownMission, GoldenFlights, where
 from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
-from mavfi_cli.core.versions import __version__
+from mavfi_cli.core.installed import __version__
 from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT
 from mavfi_cli.stats.effects import ClaimVerdict, judge
 from mavfi_cli.stats.shares import wilson

@@ -20,7 +20,7 @@ from mavfi_cli.campaigns.world_search import SEARCH
 from mavfi_cli.claims.flights import FlownMission, flights_of
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
-from mavfi_cli.core.versions import installed_versions, version_differences
+from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.mission.record.measures import record_of
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours

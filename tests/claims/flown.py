@@ -8,8 +8,7 @@ import pyarrow as pa
 from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.claims.flights import flights_of
 from mavfi_cli.spec.detector import DetectorConfig
-from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.spec.instruction import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 SOURCE = Path("campaign")

@@ -11,7 +11,7 @@ from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.claims.items import pooled, shown_items
 from mavfi_cli.claims.sources import gather
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.versions import installed_versions
+from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.spec.mission import MissionConfig
 
 
