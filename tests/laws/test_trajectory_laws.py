@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavfi_cli.autonomy import collision, grid, tracking
+from mavfi_cli.autonomy import collision, tracking
 from mavfi_cli.autonomy.collision import CollisionParams
+from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Departure
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
@@ -16,7 +17,7 @@ from mavfi_cli.autonomy.trajectory import reference_waypoint, without_waypoint
 from mavfi_cli.core.types import Trajectory
 
 PARAMS = SmoothingParams()
-OPEN = grid.build(MapSnapshot.empty(), np.repeat([-math.inf, math.inf], 3), 0.5)
+OPEN = ObstacleGrid.build(MapSnapshot.empty(), np.repeat([-math.inf, math.inf], 3), 0.5)
 
 coordinate = st.floats(-40.0, 40.0, allow_nan=False)
 points = st.tuples(coordinate, coordinate, st.floats(0.0, 12.0))

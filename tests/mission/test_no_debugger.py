@@ -30,7 +30,7 @@ def test_a_source_level_flight_loads_no_debugger(tmp_path):
 
 
 def test_what_a_user_asks_for_loads_no_debugger_and_no_planner():
-    names = ("mission", "detector", "fault", "instruction", "platform", "stack")
+    names = ("mission", "detector", "fault", "platform", "stack")
     load = ";".join(f"import mavfi_cli.spec.{name}" for name in names)
     heavy = ("capstone", "mavfi_cli.fi.tracer", "mavfi_cli.link", "ompl")
     code = f"import sys;{load};print([n for n in sys.modules if n.startswith({heavy})])"
