@@ -64,7 +64,7 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
         click.echo(as_text(table) if len(plan.items) == 1 else one_line, nl=False)
     if any(item.preset for item in plan.items):
         click.echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
-        click.echo(f"The page            mavfi report {plan.folder} -o report.html")
+        click.echo(f"The page            mavfi report {plan.out} -o report.html")
 
 
 def forecast_line(forecast: Forecast) -> str:

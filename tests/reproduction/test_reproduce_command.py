@@ -44,7 +44,7 @@ def test_a_reproduction_ends_with_a_line_an_item(folder, mavfi):
         == "  flight time with TMR: x airsim 1.060 (paper 1.060), x spark 1.910 (paper 1.910)"
     )
     assert f"mavfi campaign report {folder} --item ITEM" in run.stdout
-    assert f"mavfi report {folder}" in run.stdout
+    assert f"mavfi report {folder.parent} -o report.html" in run.stdout
 
 
 def test_one_item_is_shown_whole(tmp_path, mavfi):
