@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -174,9 +175,8 @@ def test_what_makes_no_sense_is_refused(fly_short, short_config):
         InstructionConfig(target="octomap", sites=("vektor",)).strategy()
     with pytest.raises(FaultSpecError, match="cannot be repeated"):
         InstructionConfig(target="octomap", sampling="wall-clock").strategy()
-    config = replace(
-        short_config, instruction=InstructionConfig(target="control"), link="udpin:127.0.0.1:1"
-    )
+    link = MissionConfig(link="udpin:127.0.0.1:1", goal=(20.0, 0.0, 5.0))
+    config = replace(link, instruction=InstructionConfig(target="control"))
     with pytest.raises(FaultError, match="leave out --link"):
         fly_mission(config, Path("."), Watcher())
 
@@ -226,7 +226,8 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
 
 def test_a_node_that_has_filled_a_cache_is_started_again(short_config):
     """A program that compiles its modules has another memory than one that finds bytecode."""
-    setup = Setup(config=short_config, briefing=of_config(short_config), node="control")
+    briefing = of_config(replace(short_config, goal=(20.0, 0.0, 5.0)), np.zeros(3))
+    setup = Setup(config=short_config, briefing=briefing, node="control")
     restarted = []
     for compiles in (True, False, False, False):
         spawned = ServedProcess(PROGRAM)
