@@ -114,7 +114,7 @@ def fly(seed: int, conditions: Conditions, world: str, out: str) -> dict[str, ob
     with subprocess.Popen(line, stderr=subprocess.DEVNULL) as process:
         try:
             config = MissionConfig(
-                world=world, seed=seed, goal=tuple(goal.tolist()), land=True,
+                seed=seed, goal=tuple(goal.tolist()), land=True,
                 link=f"udpin:127.0.0.1:{ports[1]}",
             )  # fmt: skip
             result = mavfi.fly(config, out=out).result
