@@ -28,6 +28,7 @@ from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.spec.fault import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
