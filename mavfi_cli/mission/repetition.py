@@ -6,11 +6,12 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.fi.tracer.record import read
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record.run_folder import Run, load_run
-from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.replay import config_of, interrupted
 from mavfi_cli.mission.run import fly_mission
 
 
@@ -49,10 +50,13 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
 
     Raises:
         RecordError: The run is not repeatable.
+        Interrupted: The user ended the repetition.
         MavfiError: As for `fly_mission`.
     """
     recorder = Recorder()
     with tempfile.TemporaryDirectory(prefix="mavfi-again-") as scratch:
         again = fly_again(run, Path(scratch), recorder=recorder)
+        if interrupted(again):
+            raise Interrupted("interrupted: the repetition was not flown to its end")
         same = file_digest(again.folder.trace) == file_digest(run.folder.trace)
     return recorder, same

@@ -78,7 +78,7 @@ def test_an_interrupted_golden_pair_of_an_older_version_is_flown_anew(sideways):
 def test_an_interrupted_repetition_is_neither_equal_nor_different(
     command_line, sideways, cut_once, tmp_path, options
 ):
-    cut_once("mavfi_cli.mission.run")
+    cut_once("mavfi_cli.mission.repetition")
     code, out, err = command_line("replay", sideways.path, "--out", "again", *options)
     assert (code, out) == (130, "")
     again = "without its fault" if "--without-fault" in options else "again"
@@ -87,6 +87,15 @@ def test_an_interrupted_repetition_is_neither_equal_nor_different(
         "interrupted: the repetition was not flown to its end",
     ]
     assert not list((tmp_path / "again").iterdir())
+
+
+def test_an_interrupted_repetition_is_not_looked_at(command_line, short_flight, cut_once, tmp_path):
+    pytest.importorskip("mcap_protobuf")
+    cut_once("mavfi_cli.mission.repetition")
+    code, out, err = command_line("view", short_flight.path, "--save", "flight.mcap")
+    assert (code, out) == (130, "")
+    assert err.splitlines()[-1] == "interrupted: the repetition was not flown to its end"
+    assert not list(tmp_path.glob("*.mcap"))
 
 
 @pytest.mark.parametrize("command", [["show", "--pair"], ["replay"]])
