@@ -7,16 +7,19 @@ import pty
 import select
 import socket
 import threading
+import time
 import tty
 from collections.abc import Callable, Iterator
 
 import pytest
 
 from mavfi_cli.core.errors import EndpointError, LinkLost
-from mavfi_cli.link.codec import Codec, begins_with_frame
+from mavfi_cli.link.codec import Codec, Signing, begins_with_frame, dialect, key_from_passphrase
 from mavfi_cli.link.transport import Transport, memory_pair, open_listener, open_transport
 from mavfi_cli.testing import StreamTransportContract, TransportContract
 from mavfi_cli.testing.transports import WAIT_S, Pair, introduce, message, receive, send
+
+HEARTBEAT = dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3)
 
 
 def _socket_pair() -> Iterator[Pair]:
@@ -339,3 +342,46 @@ def test_one_peer_endpoints_serve_as_listeners_too() -> None:
     assert receive(peer, 1) == [0]
     far.close()
     listener.close()
+
+
+def test_a_udp_port_keeps_its_first_valid_sender_until_that_is_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Commands would go to whoever spoke last, and be heard from anybody, otherwise."""
+    frame = [Codec(system, 1).encode(HEARTBEAT) for system in (1, 2)]
+    near = open_transport("udpin:127.0.0.1:0")
+    url = f"udpout:127.0.0.1:{near.port}"  # type: ignore[attr-defined]
+    stranger, first, second = (open_transport(url) for _ in range(3))
+    try:
+        stranger.send(b"\xfd no frame")
+        near.send(b"to nobody")
+        first.send(frame[0])
+        assert near.receive(1.0) == frame[0]
+        second.send(frame[1])
+        assert near.receive(0.2) == b""
+        near.send(b"answer")
+        assert first.receive(1.0) == b"answer"
+        assert second.receive(0.0) == stranger.receive(0.0) == b""
+        monkeypatch.setattr(near, "_silent_from_s", 0.0)
+        second.send(frame[1])
+        assert near.receive(1.0) == frame[1]
+        near.send(b"answer")
+        assert second.receive(1.0) == b"answer"
+    finally:
+        for each in (near, stranger, first, second):
+            each.close()
+
+
+def test_a_signed_udp_port_takes_no_unsigned_sender() -> None:
+    signing = [Signing(key_from_passphrase("horse"), time.time) for _ in range(2)]
+    near = open_transport("udpin:127.0.0.1:0", signed=True, admits=signing[0].vouches)
+    far = open_transport(f"udpout:127.0.0.1:{near.port}")  # type: ignore[attr-defined]
+    try:
+        far.send(Codec(1, 1).encode(HEARTBEAT))
+        assert near.receive(0.2) == b""
+        frame = Codec(1, 1, signing=signing[1]).encode(HEARTBEAT)
+        far.send(frame)
+        assert near.receive(1.0) == frame
+    finally:
+        near.close()
+        far.close()
