@@ -98,9 +98,11 @@ def _log_entries(recording: Any, entries: Iterable[Entry]) -> None:
     for path, ticks in numbers.items():
         for name in ticks[0].values:
             told = [(tick.stamp_s, tick.values[name]) for tick in ticks]
-            stamps, values = zip(*((s, float(v)) for s, v in told if v is not None), strict=True)
-            time = rr.TimeColumn(_TIME, duration=stamps)
-            recording.send_columns(f"{path}/{name}", [time], rr.Scalars.columns(scalars=values))
+            known = [(stamp_s, float(value)) for stamp_s, value in told if value is not None]
+            if known:
+                stamps, values = zip(*known, strict=True)
+                time = rr.TimeColumn(_TIME, duration=stamps)
+                recording.send_columns(f"{path}/{name}", [time], rr.Scalars.columns(scalars=values))
 
 
 def _archetypes(entry: Entry) -> list[tuple[str, Any]]:

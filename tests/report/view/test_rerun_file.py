@@ -1,6 +1,9 @@
 """Files of rerun, read back by rerun."""
 
+from dataclasses import replace
+
 import numpy as np
+import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
@@ -67,6 +70,17 @@ def test_depth_frames_are_in_metres_and_what_is_out_of_range_has_no_depth(column
     depth_m = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0)
     np.testing.assert_array_equal(last, depth_m.astype(np.float32).ravel())
     assert path["DepthImage:meter"][-1] == [1.0]
+
+
+def test_a_flight_without_a_plan_has_no_waypoints(pair, tmp_path):
+    run = pair[0].run
+    place = run.trace.column_names.index("waypoint_x")
+    none = pa.nulls(run.trace.num_rows, pa.float64())
+    odd = replace(run, trace=run.trace.set_column(place, "waypoint_x", none))
+    write_rrd([replace(pair[0], run=odd, recorder=None)], tmp_path / "odd.rrd")
+    paths = {chunk.entity_path for chunk in RrdReader(tmp_path / "odd.rrd").stream()}
+    assert "/golden/states/x_m" in paths
+    assert "/golden/states/waypoint_x" not in paths
 
 
 def test_a_layout_comes_with_it(file):
