@@ -59,7 +59,7 @@ def test_quiet_says_nothing(capsys):
 def test_an_autopilot_may_say_anything(capsys, terminal):
     """Square brackets are markup to rich; here they are an autopilot's words."""
     said = "[/bold] PreArm [red]: [link=x"
-    tell(MissionConfig(link="tcp:h:1"), [("autopilot", said)])
+    tell(MissionConfig(link="tcp:h:1", goal=(9.0, 0.0, 5.0)), [("autopilot", said)])
     _, err = capsys.readouterr()
     assert said in err
     assert "Flying tcp:h:1" in err

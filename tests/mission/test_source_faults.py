@@ -137,7 +137,7 @@ def test_a_time_to_a_collision_that_is_foreseen_is_read(troubled, tmp_path):
 
 
 def test_the_document_lists_the_phases():
-    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "faults.md").read_text()
     (listed,) = re.findall(r"`phase=slowing` \|.*?: (.*?) \(", text)
     assert listed.split(", ") == [mode.value for mode in PilotMode]
 

@@ -12,8 +12,8 @@ from sitl.control.cascade import LEAST_SHARE, mix, throttle, thrust_shares
 from sitl.control.gains import gains_for
 from sitl.vehicle.profile import PROFILES, load_profile
 
-PROFILES = {name: load_profile(name) for name in PROFILES.names}
-GAINS = {name: gains_for(profile, 0.004) for name, profile in PROFILES.items()}
+VEHICLES = {name: load_profile(name) for name in PROFILES.names}
+GAINS = {name: gains_for(profile, 0.004) for name, profile in VEHICLES.items()}
 names = st.sampled_from(PROFILES.names)
 # Signs (forward, right) and sense (+1: counter-clockwise from above) of the rotors in the model.
 ROTOR_LAYOUT = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0))
@@ -22,7 +22,7 @@ torques = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=3).map(np.array)
 
 def wrench(shares, name):
     """Collective and torque that rotor thrusts make, by the cross product of arm and force."""
-    rotor = PROFILES[name].rotor
+    rotor = VEHICLES[name].rotor
     offset = rotor.arm_m / math.sqrt(2.0)
     collective, torque = 0.0, np.zeros(3)
     for share, (forward, right, sense) in zip(shares, ROTOR_LAYOUT, strict=True):
@@ -78,7 +78,7 @@ def test_roll_and_pitch_keep_their_direction_and_come_before_the_rest(name, leve
 @given(names, st.floats(0.0, 1.0))
 def test_throttle_is_the_motor_equation(name, share):
     # V = rpm / Kv + R (Q / Kt + I0), Drela's first-order motor
-    rotor = PROFILES[name].rotor
+    rotor = VEHICLES[name].rotor
     current = share * rotor.max_thrust_n * rotor.torque_per_thrust_m / rotor.torque_constant_nmpa
     volts = math.sqrt(share) * rotor.max_rpm / rotor.motor_kv_rpmpv
     volts += rotor.motor_resistance_ohm * (current + rotor.motor_no_load_current_a)
