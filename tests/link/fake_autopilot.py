@@ -237,7 +237,8 @@ class FakePX4(FakeAutopilot):
             self.climb_to_m = message.param7 - HOME_AMSL_M
 
     def _arrived(self) -> None:
-        self.mode = "AUTO.LOITER"
+        if self.mode == "AUTO.TAKEOFF":  # a client may have asked for another mode on the way up
+            self.mode = "AUTO.LOITER"
 
 
 class FakeArduCopter(FakeAutopilot):
