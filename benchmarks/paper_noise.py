@@ -10,23 +10,36 @@ from __future__ import annotations
 
 import argparse
 
+from mavfi_cli.reproduction.paper import printed
 from mavfi_cli.stats.effects import fisher, recovered_share
 
 GOLDEN, FAULTY = 100, 300  # missions a world
-TABLE_IV = {  # world: successes golden, with faults, with the Gaussian, with the autoencoder, %
-    "Factory": (100.0, 91.7, 98.7, 99.3),
-    "Farm": (100.0, 97.3, 99.3, 100.0),
-    "Sparse": (95.0, 88.3, 94.3, 95.0),
-    "Dense": (85.0, 75.3, 83.0, 84.7),
-}
-TABLE_III = {0: 100, 1: 92, 3: 91, 5: 89}  # bits: successes of 100
+WORLDS = ("factory", "farm", "sparse", "dense")
+SETTINGS = (
+    "golden",
+    "none",
+    "gad",
+    "aad",
+)  # without a fault; with one, without and with a detector
+
+
+def share(*keys: object) -> float:
+    """A success rate that the paper prints."""
+    percent = printed(*map(str, keys))
+    assert isinstance(percent, float)
+    return percent / 100.0
 
 
 def counts(world: str) -> tuple[int, int, int, int]:
     """Successes of golden, faulty, Gaussian and autoencoder missions."""
-    golden, faulty, gaussian, autoencoder = TABLE_IV[world]
-    wins = [round(FAULTY * rate / 100.0) for rate in (faulty, gaussian, autoencoder)]
-    return round(GOLDEN * golden / 100.0), wins[0], wins[1], wins[2]
+    golden, *others = (share("table4", "success_percent", each, world) for each in SETTINGS)
+    faulty, gaussian, autoencoder = (round(FAULTY * each) for each in others)
+    return round(GOLDEN * golden), faulty, gaussian, autoencoder
+
+
+def of_bits(bits: int) -> tuple[int, int]:
+    """Successes and missions of a row of Table III."""
+    return round(100 * share("table3", "success_percent", bits)), 100
 
 
 def table_iv(draws: int, seed: int) -> None:
@@ -35,7 +48,7 @@ def table_iv(draws: int, seed: int) -> None:
         f"{'Table IV':<9} {'golden':<8} {'faults':<10} {'p':<7} {'recovered by GAD':<21} "
         f"{'by AAD':<21} GAD against AAD, p"
     )
-    for world in TABLE_IV:
+    for world in WORLDS:
         golden, faulty, gaussian, autoencoder = counts(world)
         cells = []
         for wins in (gaussian, autoencoder):
@@ -45,23 +58,23 @@ def table_iv(draws: int, seed: int) -> None:
             ends = (100.0 * each for each in (told.value, told.low, told.high))
             cells.append("{:4.0f} % ({:.0f} to {:.0f})".format(*ends))
         print(
-            f"{world:<9} {golden:>3}/{GOLDEN}  {faulty:>4}/{FAULTY}   "
+            f"{world.capitalize():<9} {golden:>3}/{GOLDEN}  {faulty:>4}/{FAULTY}   "
             f"{fisher((golden, GOLDEN), (faulty, FAULTY)):<7.2g} {cells[0]:<21} {cells[1]:<21} "
             f"{fisher((gaussian, FAULTY), (autoencoder, FAULTY)):.2f}"
         )
-    golden, faulty = (sum(counts(world)[kind] for world in TABLE_IV) for kind in (0, 1))
-    missions = len(TABLE_IV) * GOLDEN, len(TABLE_IV) * FAULTY
+    golden, faulty = (sum(counts(world)[kind] for world in WORLDS) for kind in (0, 1))
+    missions = len(WORLDS) * GOLDEN, len(WORLDS) * FAULTY
     p = fisher((golden, missions[0]), (faulty, missions[1]))
     print(f"{'pooled':<9} {golden}/{missions[0]}  {faulty}/{missions[1]}  {p:.2g}")
 
 
 def table_iii() -> None:
     """Print what its success rates differ by, beyond chance."""
-    sparse = counts("Sparse")[0]
-    one, five = (TABLE_III[1], 100), (TABLE_III[5], 100)
+    sparse = counts("sparse")[0]
+    one, five = of_bits(1), of_bits(5)
     print(f"\nTable III: 1 bit, {one[0]}/100, against")
     for name, other in (
-        ("golden", (TABLE_III[0], 100)),
+        ("golden", of_bits(0)),
         ("Table IV's golden in Sparse", (sparse, GOLDEN)),
         ("5 bits", five),
     ):
