@@ -8,6 +8,7 @@ import math
 import select
 import socket
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Protocol
@@ -212,7 +213,7 @@ def _wait_for(descriptor: int, event: int, timeout_s: float) -> bool:
     return bool(poller.poll(None if math.isinf(timeout_s) else timeout_s * 1e3))
 
 
-class _Receiver:
+class _Receiver(ABC):
     """An end that waits on its descriptor while nothing can be pulled."""
 
     url: str
@@ -230,13 +231,13 @@ class _Receiver:
             data = self._pull()
         return data
 
+    @abstractmethod
     def fileno(self) -> int:
         """See `Transport`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _pull(self) -> bytes:
         """Return waiting bytes, or b"" if there are none. Raises LinkLost."""
-        raise NotImplementedError
 
     def _lost(self, why: object) -> NoReturn:
         raise LinkLost(f"{self.url}: {why}") from None
