@@ -324,7 +324,7 @@ class OffboardSession:
 
         Raises:
             NoCamera: No camera has answered for some seconds.
-            CommandRefused: No state has arrived within the time to get ready.
+            CommandRefused: One of them did not arrive within the time to get ready.
         """
         settings, asked = self._settings, self._origin_asked
         if not settings.needs_camera or asked is None:
@@ -363,6 +363,8 @@ class OffboardSession:
     def _missing(self) -> str:
         if self.telemetry.state is None:
             return "no position and attitude"
+        if self.phase is Phase.CONNECTING:
+            return "no origin from the camera"
         if self.telemetry.autopilot.takeoff_amsl and self.telemetry.home_amsl_m is None:
             return "no home position"
         return "not ready to arm"

@@ -52,6 +52,11 @@ class PoseTracker:
         """True once ATTITUDE_QUATERNION has arrived, which is preferred to ATTITUDE."""
         return self._has_quaternions
 
+    @property
+    def attitude_stamp_s(self) -> float | None:
+        """Autopilot's time of the newest attitude, s; None before the first."""
+        return None if self._attitude is None else self._attitude[0]
+
     def take(self, message: Any) -> bool:
         """Handle a message with finite values. Return True if there is a new pose."""
         kind = message.get_type()
@@ -132,7 +137,7 @@ class Station:
         self._clock = clock
         self._autopilot: int | None = None  # system id; None before its first heartbeat
         self._placed = False
-        self._placed_at_s = math.inf
+        self._unplaced_since_s: float | None = None  # by the autopilot's clock
         self._held: dict[tuple[int, int, int], Any] = {}
         if origin_given:
             self._place_at(tracker.origin_enu_m)
@@ -208,7 +213,6 @@ class Station:
                 return False
             self._autopilot = self.camera.system = message.get_srcSystem()
             self._router.system = self.camera.system
-            self._placed_at_s = self._clock() + _PLACE_S
         return bool(message.get_srcSystem() == self._autopilot)
 
     def _announce(self) -> None:
@@ -221,8 +225,16 @@ class Station:
         return self._tracker.has_position and self._tracker.has_attitude
 
     def _place(self) -> None:
-        """Take the given origin if nobody has told a better one within a second."""
-        if not self._placed and self._clock() >= self._placed_at_s:
+        """Take the given origin if nobody has told a better one within a second.
+
+        The autopilot's clock counts it, because it may run much faster than the wall clock.
+        """
+        stamp_s = self._tracker.attitude_stamp_s
+        if self._placed or stamp_s is None:
+            return
+        if self._unplaced_since_s is None or stamp_s < self._unplaced_since_s:
+            self._unplaced_since_s = stamp_s
+        if stamp_s >= self._unplaced_since_s + _PLACE_S:
             self._place_at(self._tracker.origin_enu_m)
 
     def _place_at(self, origin_enu_m: Vector) -> None:

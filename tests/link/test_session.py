@@ -414,6 +414,20 @@ def test_the_camera_is_asked_who_it_is_and_started() -> None:
     assert {m.command for m in repeated if m.target_component == 100} == {512}  # unanswered
 
 
+def test_a_camera_that_does_not_tell_the_origin_is_named() -> None:
+    """It answers that it is working on it, as a camera does that waits for an origin."""
+    flight = Flight(FakePX4(), needs_camera=True, ready_timeout_s=7.0)
+
+    def refused() -> bool:
+        progress = dialect.MAV_RESULT_IN_PROGRESS
+        answer = dialect.MAVLink_command_ack_message(512, progress, 0, 0, 1, 191)
+        flight.session.handle(_from(1, 100, answer))
+        return flight.session.failure is not None
+
+    flight.until(refused, limit_s=10.0)
+    assert "arming: no origin from the camera within 7 s" in str(flight.session.failure)
+
+
 def test_states_are_found_again_by_stamp() -> None:
     flight = Flight(FakePX4())
     flight.until_phase(Phase.OFFBOARD)

@@ -242,15 +242,18 @@ def unplaced(scene: Any) -> Any:
 
 
 def test_the_origin_is_the_start_if_nobody_knows_a_better_one(unplaced: Any) -> None:
-    station, autopilot, client, now = unplaced
-    autopilot.send(heartbeat())
+    station, autopilot, client, _ = unplaced
+    autopilot.send(heartbeat(), *pose(0))
     station.serve()
     assert 89 in [round(m.param1) for m in autopilot.received() if m.get_type() == "COMMAND_LONG"]
     client.send(offset_answer(7))
     station.serve()
     told = client.received()
     assert [m.result for m in told if m.get_type() == "COMMAND_ACK"] == [5]  # in progress
-    now[0] = 2.0
+    autopilot.send(*pose(980))
+    station.serve()
+    assert told_offsets(client) == []
+    autopilot.send(*pose(1000))
     station.serve()
     assert told_offsets(client) == [(4.0, 3.0, 0.0)]
 
