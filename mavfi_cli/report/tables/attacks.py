@@ -276,7 +276,8 @@ def program_table(summary: Mapping[str, Any]) -> str:
 def _how(summary: Mapping[str, Any]) -> str:
     if not summary["counted"]:
         return f"windows stepped: {summary['windows']}"
-    return f"counted by callgrind; {100 * summary['not_reached']:.2g} % more are not reached"
+    missed = 100 * summary["not_reached"]
+    return f"counted by callgrind; {missed:.2g} % of the executions are not reached"
 
 
 # -- both
