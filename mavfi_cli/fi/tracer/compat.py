@@ -2,7 +2,8 @@
 
 A rule draws the corruption of one instruction, or None if that injector leaves it alone. The
 released sources are the reference: ROSFI as in MAVBench/MAV_apps, branch mavfi, and PINFI as in
-DependableSystemsLab/pinfi, e14c129. docs/injection.md says what they do and where we differ.
+DependableSystemsLab/pinfi, e14c129. docs/reference/instructions.md says what they do and where we
+differ.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 
 Code outside this package works with register *names*, Python integers and the types of
 `arch.interface`, and imports from here only; import-linter enforces that. A package for another
-processor supplies the names below with the same meaning. docs/injection.md says what is known about
-aarch64. On an unsupported processor everything can be imported, because missions without
-instruction-level faults need none of it; each name raises `TracingForbidden` when it is used.
+processor supplies the names below with the same meaning. docs/explanation/injection.md says what
+is known about aarch64. On an unsupported processor everything can be imported, because missions
+without instruction-level faults need none of it; each name raises `TracingForbidden` when it is
+used.
 """
 
 from __future__ import annotations
