@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 from mavfi_cli.claims.effects import harm_share, lost_share, struck
-from mavfi_cli.claims.flights import FlownMission, GoldenFlights
+from mavfi_cli.claims.flights import FlownMission, GoldenFlights, comparable, where
 from mavfi_cli.core.states import BY_NAME, DType
 from mavfi_cli.stats.shares import Share, cross_layer, failures_per_hour
 
@@ -168,7 +169,7 @@ class HourlyFailures:
     """Failures of missions a flight hour, for one kind of fault in one world.
 
     Attributes:
-        where: what is struck, and in which world.
+        where: what is struck, how, and in which world.
         lost: share of faults that lose a mission whose golden flight succeeds, by detector; the
             empty name is no detector.
         per_hour: point, low and high, by detector.
@@ -189,14 +190,28 @@ def hourly_failures(
     """
     golden = GoldenFlights(flights)
     kinds: dict[str, dict[str, list[FlownMission]]] = {}
-    for each in golden.paired(flights):
-        if each.struck and not each.process_killed:
-            level = "instruction" if each.level == "instruction" else "state"
-            place = f"{level}: {each.fault_target}, {each.world}"
-            kinds.setdefault(place, {}).setdefault(each.detector or "", []).append(each)
+    for each in golden.paired(where(comparable(flights), struck=True)):
+        kinds.setdefault(_kind(each), {}).setdefault(each.detector or "", []).append(each)
     found = []
     for place, by_detector in sorted(kinds.items()):
         lost = {name: lost_share(those) for name, those in sorted(by_detector.items())}
         hourly = {name: failures_per_hour(upsets_per_hour, each) for name, each in lost.items()}
         found.append(HourlyFailures(where=place, lost=lost, per_hour=hourly))
     return found
+
+
+_COMPONENTS = Counter(state.group for state in BY_NAME.values())
+
+
+def _kind(flight: FlownMission) -> str:
+    """What is struck, how unless it is one bit of any field, and where it flies."""
+    level = "instruction" if flight.level == "instruction" else "state"
+    components = _COMPONENTS[str(flight.fault_target).rpartition(".")[2]]
+    how = [
+        None if flight.fault_field == "any" else flight.fault_field,
+        None if flight.fault_bits == 1 else f"{flight.fault_bits} bits",
+        "all components" if flight.together and components > 1 else None,
+    ]
+    computer = None if flight.platform == "x86" else flight.platform
+    parts = (flight.fault_target, *how, flight.world, computer)
+    return f"{level}: {', '.join(part for part in parts if part)}"

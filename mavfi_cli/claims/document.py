@@ -20,7 +20,7 @@ from mavfi_cli.claims.beyond import (
 from mavfi_cli.claims.catalogue import CLAIMS, Claim
 from mavfi_cli.claims.effects import Finding, Protected, count, lost_share, struck, worst_flights
 from mavfi_cli.claims.findings import Kernels, instruction_faults
-from mavfi_cli.claims.flights import FlownMission, GoldenFlights, where
+from mavfi_cli.claims.flights import FlownMission, GoldenFlights, comparable, where
 from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT
@@ -69,7 +69,7 @@ def document(
         "arms": [
             {"campaign": each.name, "arms": found}
             for each in evidence.campaigns
-            if (found := arms(each.flights))
+            if (found := arms(comparable(each.flights)))
         ],
         "sources": [*map(_source, evidence.campaigns)],
         "kernel_sources": [
@@ -244,7 +244,7 @@ def _rate(share: Any) -> str:
 def _worst(stack: str, flights: Sequence[FlownMission]) -> list[dict[str, Any]]:
     rows = []
     golden = GoldenFlights(flights)
-    faulty = [each for each in flights if each.struck and not each.process_killed]
+    faulty = where(comparable(flights), struck=True)
     kinds = sorted({(str(each.level), each.world, str(each.platform)) for each in faulty})
     for level, world, platform in kinds:
         for detector in _DETECTORS:
@@ -261,9 +261,8 @@ def _spreads(stack: str, flights: Sequence[FlownMission]) -> list[dict[str, Any]
     """Every flight with a fault in a state over its own golden one, by world and detector."""
     golden = GoldenFlights(flights)
     found: dict[tuple[str, str | None], list[FlownMission]] = {}
-    for each in where(flights, level="source", platform="x86"):
-        if each.struck and not each.process_killed:
-            found.setdefault((each.world, each.detector), []).append(each)
+    for each in where(comparable(flights), level="source", platform="x86", struck=True):
+        found.setdefault((each.world, each.detector), []).append(each)
     return [
         {"stack": stack, "world": world, "detector": detector, "ratios": golden.ratios(those)}
         for (world, detector), those in sorted(found.items(), key=str)

@@ -6,8 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from mavfi_cli.claims.flights import LONGER, FlownMission, GoldenFlights
-from mavfi_cli.core.types import Stage
+from mavfi_cli.claims.flights import EVERY_STAGE, LONGER, FlownMission, GoldenFlights, where
 from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.effects import (
     as_interval,
@@ -33,17 +32,12 @@ class Finding:
     told: str
 
 
-EVERY_STAGE = "+".join(stage.value for stage in Stage)
 NOTHING = Finding(effect=None, told="")
 
 
 def struck(flights: Iterable[FlownMission], *, detector: str | None = None) -> list[FlownMission]:
     """The flights with a flipped bit, without a detector or with this one."""
-    return [
-        each
-        for each in flights
-        if each.struck and each.detector == detector and not each.process_killed
-    ]
+    return where(flights, struck=True, detector=detector)
 
 
 def lost_share(flights: Sequence[FlownMission]) -> Share:

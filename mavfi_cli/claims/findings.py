@@ -7,7 +7,6 @@ from typing import Any
 
 from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.claims.effects import (
-    EVERY_STAGE,
     NOTHING,
     Finding,
     Protected,
@@ -20,7 +19,7 @@ from mavfi_cli.claims.effects import (
     success_lost,
     worst_as_long,
 )
-from mavfi_cli.claims.flights import FlownMission, GoldenFlights, where
+from mavfi_cli.claims.flights import EVERY_STAGE, FlownMission, GoldenFlights, where
 from mavfi_cli.core.types import Stage
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.effects import (

@@ -11,9 +11,10 @@ from typing import Any
 import pyarrow as pa
 
 from mavfi_cli.campaigns.missions import Injected, ResultState, canonical
-from mavfi_cli.core.types import Outcome
+from mavfi_cli.core.types import Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
 
+EVERY_STAGE = "+".join(stage.value for stage in Stage)
 LONGER = 1.05  # a flight is longer if it takes more than this times its own golden flight
 _STRUCK = frozenset(
     each.value
@@ -100,8 +101,8 @@ class FlownMission:
 
     @property
     def struck(self) -> bool:
-        """Whether its fault was injected, read or not, as the paper counts."""
-        return self.injected in _STRUCK
+        """Whether its fault flipped a bit, read or not, as the paper counts."""
+        return self.injected in _STRUCK and not self.kills_process
 
     @property
     def lost(self) -> bool:
@@ -109,8 +110,8 @@ class FlownMission:
         return self.outcome != Outcome.SUCCESS.value
 
     @property
-    def process_killed(self) -> bool:
-        """Whether its fault kills a process, where others flip bits."""
+    def kills_process(self) -> bool:
+        """Whether its fault kills a process instead of flipping bits."""
         return (self.fault_target or "").startswith("process.")
 
     @property
@@ -161,6 +162,11 @@ def where(flights: Iterable[FlownMission], **values: Any) -> list[FlownMission]:
         for flight in flights
         if all(getattr(flight, name) in allowed for name, allowed in asked.items())
     ]
+
+
+def comparable(flights: Iterable[FlownMission]) -> list[FlownMission]:
+    """The flights without a detector, or with one that watches all stages."""
+    return where(flights, protect=(None, EVERY_STAGE))
 
 
 class GoldenFlights:

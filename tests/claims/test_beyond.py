@@ -68,6 +68,29 @@ def test_failures_an_hour_follow_the_rate_and_the_detector():
     assert found.per_hour["aad"][0] == 0.0
 
 
+def test_faults_of_other_kinds_are_counted_apart():
+    rows = [row(seed=1), row("time_to_collision", seed=1, fault={"together": True})]
+    rows += [
+        row("waypoint_position", seed=1, fault=how, **LOST)
+        for how in ({}, {"field": "exponent", "together": True}, {"bits": 5})
+    ]
+    found = {each.where: each.lost[""].total for each in hourly_failures(flights(rows), 1.0)}
+    assert found == {
+        "state: waypoint_position, sparse": 1,
+        "state: waypoint_position, exponent, all components, sparse": 1,
+        "state: waypoint_position, 5 bits, sparse": 1,
+        "state: time_to_collision, sparse": 1,
+    }
+
+
+def test_a_detector_of_one_stage_is_not_counted_as_one_of_all_stages():
+    rows = [row(seed=1), row("planning", seed=1, **LOST)]
+    rows.append(row("planning", seed=1, detector="gad"))
+    rows += [row("planning", seed=1, detector="gad", protect=("control",), **LOST)]
+    (found,) = hourly_failures(flights(rows), 1.0)
+    assert (found.lost["gad"].count, found.lost["gad"].total) == (0, 1)
+
+
 def test_arms_are_counted_on_the_faults_that_the_unprotected_flight_read():
     guard = {"config": {"stack": "mavbench:guards_tracking=true"}}
     rows = []
