@@ -150,13 +150,14 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
     """
     from mavfi_cli.campaigns.begin import folder_of
     from mavfi_cli.campaigns.ledger import Ledger
-    from mavfi_cli.report.paper_figures import require_picture, write_figure
+    from mavfi_cli.core.files import require_output
+    from mavfi_cli.report.drawing import PICTURES, write_figure
     from mavfi_cli.report.tables.paper_table import FORMATS
     from mavfi_cli.reproduction.figures import draw
     from mavfi_cli.reproduction.status import asked_item, table_of
 
     if output is not None:
-        require_picture(output)
+        require_output(output, PICTURES)
     with Ledger(folder_of(what)) as ledger:
         shown = asked_item(ledger, item)
         table = table_of(ledger, shown)
@@ -188,7 +189,7 @@ def export(what: str, path: Path) -> None:
                    "folder's name  [the pair in which a fault costs most flight "
                    "time].")  # fmt: skip
 @click.option("--output", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
-              required=True, help="SVG file to write.")  # fmt: skip
+              required=True, help="The .svg, .pdf or .png file to write.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
 def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     """Draw the golden, faulty and protected flights of one pair from above.
@@ -200,7 +201,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     from mavfi_cli.campaigns.ledger import Ledger
     from mavfi_cli.core.files import plain
     from mavfi_cli.mission.record.run_folder import load_run
-    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.top_view import Panel, draw_trajectories, lines
 
     with Ledger(folder_of(what)) as ledger:
@@ -212,7 +213,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         )
         for panel in chosen["panels"]
     ]
-    write_svg(draw_trajectories(panels), output)
+    write_figure(draw_trajectories(panels), output)
     if as_json:
         told = {**chosen, "picture": output}
         click.echo(json.dumps(plain(told), indent=2, default=str))

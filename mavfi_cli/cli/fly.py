@@ -190,7 +190,7 @@ def fly(
     from mavfi_cli.cli.progress import progress_view
     from mavfi_cli.mission.progress import Recorder
     from mavfi_cli.report import view as viewers
-    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.summary import folder_lines, outcome_line, summary_lines
     from mavfi_cli.report.top_view import draw_top_view
     from mavfi_cli.report.view.entries import ViewedFlight
@@ -208,7 +208,7 @@ def fly(
             folder.path / f"flight.{record}",
         )
     if picture:
-        write_svg(draw_top_view(run), folder.picture)
+        write_figure(draw_top_view(run), folder.picture)
     if as_json:
         click.echo(json.dumps(run.result, indent=2, sort_keys=True))
     else:

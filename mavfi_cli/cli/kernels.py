@@ -150,7 +150,7 @@ def _attacked(
 
 def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.kernels.catalogue import select
-    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.kernel_plot import draw_kernel_plot
     from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise, table
     from mavfi_cli.studies.kernels import kernel_flight, kernel_targets
@@ -164,7 +164,7 @@ def _attack_kernels(options: dict[str, Any]) -> None:
         summary = summarise(plan, campaign)
         if out is not None:
             save_runs(out, summary, campaign, KERNEL_COLUMNS)
-            write_svg(draw_kernel_plot(summary), out / "kernels.svg")
+            write_figure(draw_kernel_plot(summary), out / "kernels.svg")
     _tell(summary, table(summary), "kernels.json, kernels.csv, kernels.svg, runs.jsonl", options)
 
 

@@ -16,7 +16,7 @@ import click
                    "changed.")  # fmt: skip
 @click.option("--events", is_flag=True, help="Add a list of all events of the flight.")
 @click.option("--picture", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
-              help="SVG file for a drawing of the flight from above.")  # fmt: skip
+              help="Draw the flight from above into this .svg, .pdf or .png file.")  # fmt: skip
 def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
     """Summarise RUN, a run folder."""
     from mavfi_cli.mission.golden import kept_golden, paired_golden
@@ -25,10 +25,10 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
 
     record = load_run(run)
     if picture is not None:
-        from mavfi_cli.report.drawing import write_svg
+        from mavfi_cli.report.drawing import write_figure
         from mavfi_cli.report.top_view import draw_top_view
 
-        write_svg(draw_top_view(record), picture)
+        write_figure(draw_top_view(record), picture)
     if as_json:
         click.echo(json.dumps(record.result, indent=2, sort_keys=True))
         return

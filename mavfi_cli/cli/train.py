@@ -69,7 +69,7 @@ def train(
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.detect.fit import KINDS
     from mavfi_cli.report.detector_plots import draw_loss_curve
-    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
     from mavfi_cli.studies.train import WORLDS, TrainingPlan
     from mavfi_cli.studies.train import train as run
@@ -92,7 +92,7 @@ def train(
         trained = run(plan, out, Options(jobs=jobs or 0), view)
     if "aad" in trained.models:
         model, _ = trained.models["aad"]
-        write_svg(draw_loss_curve(model.provenance["loss_curve"]["rows"]), out / "loss.svg")
+        write_figure(draw_loss_curve(model.provenance["loss_curve"]["rows"]), out / "loss.svg")
     if as_json:
         told = {kind: dict(model.provenance) for kind, (model, _) in trained.models.items()}
         click.echo(json.dumps(told, indent=2))

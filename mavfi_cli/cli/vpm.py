@@ -212,7 +212,7 @@ def _choices(options: dict[str, Any]) -> Any:
 def _save(told: dict[str, Any], out: Path) -> list[str]:
     """Write all files; return their names."""
     from mavfi_cli.core.files import write_json, write_text, writing
-    from mavfi_cli.report.drawing import write_svg
+    from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.model_plots import (
         draw_flight_plot,
         draw_redundancy_plot,
@@ -225,11 +225,11 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
         out.mkdir(parents=True, exist_ok=True)
     write_json(out / "vpm.json", told)
     write_text(out / "vpm.csv", model_csv(told))
-    write_svg(draw_roofline_plot(told), out / "roofline.svg")
-    write_svg(draw_redundancy_plot(told), out / "redundancy.svg")
+    write_figure(draw_roofline_plot(told), out / "roofline.svg")
+    write_figure(draw_redundancy_plot(told), out / "redundancy.svg")
     names = ["vpm.json", "vpm.csv", "roofline.svg", "redundancy.svg"]
     if "flights" in told:
         write_text(out / "flights.csv", redundancy_csv(told["flights"]))
-        write_svg(draw_flight_plot(told), out / "flights.svg")
+        write_figure(draw_flight_plot(told), out / "flights.svg")
         names += ["flights.csv", "flights.svg"]
     return names

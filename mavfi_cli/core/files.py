@@ -9,7 +9,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -61,14 +61,19 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def require_svg(path: Path) -> None:
-    """Reject a picture file name with another suffix than .svg.
+def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
+    """Reject the name of a file that could not be written, before its contents are computed.
 
     Raises:
-        RecordError: The name does not end in .svg.
+        RecordError: The name has none of the suffixes, if any are given, or the folder does not
+            exist.
     """
-    if path.suffix.lower() != ".svg":
-        raise RecordError(f"{path}: pictures are SVG: name a file that ends in .svg")
+    if suffixes and path.suffix.lower() not in suffixes:
+        *others, last = suffixes
+        known = f"{', '.join(others)} or {last}" if others else last
+        raise RecordError(f"{path}: name a file that ends in {known}")
+    if not path.absolute().parent.is_dir():
+        raise RecordError(f"{path}: its folder does not exist")
 
 
 def write_text(path: Path, text: str) -> None:

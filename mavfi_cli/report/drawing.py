@@ -7,11 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mavfi_cli.core.files import require_svg, write_atomically
+from mavfi_cli.core.files import require_output, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+PICTURES = (".svg", ".pdf", ".png")
+_STAMPS: dict[str, dict[str, str | None]] = {  # metadata that is the same at any time
+    "svg": {"Date": None, "Creator": "mavfi"},
+    "pdf": {"CreationDate": None, "Creator": "mavfi", "Producer": "mavfi"},
+    "png": {"Software": "mavfi"},
+}
+_DPI = 300
 
 INK = "#1d232b"
 NOTE = "#5b6573"
@@ -68,23 +76,29 @@ def open_frame(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def write_svg(figure: Figure, path: Path) -> None:
-    """Write a figure as SVG, atomically. Equal figures give equal bytes.
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as SVG, PDF or PNG, atomically. Equal figures give equal bytes.
 
     Raises:
-        ConfigError: Its name does not end in .svg.
-        RecordError: The file could not be written.
+        RecordError: Its name has none of the suffixes PICTURES, or it could not be written.
     """
-    require_svg(path)
-    text = svg(figure)
-    write_atomically(path, lambda file: file.write(text.encode()))
+    require_output(path, PICTURES)
+    data = _drawn(figure, path.suffix.lower()[1:])
+    write_atomically(path, lambda file: file.write(data))
 
 
 def svg(figure: Figure) -> str:
     """Return a figure as SVG. Equal figures give equal texts."""
+    return _drawn(figure, "svg").decode()
+
+
+def _drawn(figure: Figure, form: str) -> bytes:
     import matplotlib as mpl
 
-    with mpl.rc_context({"svg.hashsalt": "mavfi", "svg.fonttype": "none"}):
+    with mpl.rc_context(
+        {"svg.hashsalt": "mavfi", "svg.fonttype": "none", "pdf.fonttype": 42}  # text stays text
+    ):
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "mavfi"})
-    return buffer.getvalue().decode()
+        dpi = None if form == "svg" else _DPI
+        figure.savefig(buffer, format=form, dpi=dpi, metadata=_STAMPS[form])
+    return buffer.getvalue()

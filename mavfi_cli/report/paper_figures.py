@@ -6,17 +6,13 @@ lightness, so they stay apart without colour; markers and hatches differ as well
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.drawing import GRID, INK, NOTE, new_figure, open_frame
 from mavfi_cli.report.tables.paper_table import PaperTable
@@ -27,49 +23,12 @@ if TYPE_CHECKING:
 
 WIDTHS_IN = {"one": 3.5, "two": 7.16}  # columns of an IEEE page
 SMALLEST = 7.0  # points
-PICTURES = (".svg", ".pdf", ".png")
 PALETTE = ("#16213e", "#b3402a", "#4f93c8", "#f0b95a")  # dark to light; no two alike in grey
 MARKERS = ("o", "s", "^", "D")
 _PAPER = {"marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
           "markeredgewidth": 0.9, "linestyle": "none"}  # fmt: skip
 _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
 _LINE_IN = 0.19  # height of a row
-_DPI = 300
-
-
-def require_picture(path: Path) -> None:
-    """Reject a figure's file name with another suffix than one of PICTURES.
-
-    Raises:
-        RecordError: the name has another suffix, or its folder does not exist.
-    """
-    if path.suffix.lower() not in PICTURES:
-        raise RecordError(f"{path}: figures are {', '.join(PICTURES)}: name such a file")
-    if not path.absolute().parent.is_dir():
-        raise RecordError(f"{path}: no such folder")
-
-
-def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as SVG, PDF or PNG, atomically. Equal figures give equal bytes.
-
-    Raises:
-        RecordError: as `require_picture`, or the file could not be written.
-    """
-    import matplotlib as mpl
-
-    require_picture(path)
-    form = path.suffix.lower()[1:]
-    stamps: dict[str, Any] = {
-        "svg": {"Date": None, "Creator": "mavfi"},
-        "pdf": {"CreationDate": None, "Creator": "mavfi", "Producer": "mavfi"},
-        "png": {"Software": "mavfi"},
-    }
-    with mpl.rc_context(
-        {"svg.hashsalt": "mavfi", "svg.fonttype": "none", "pdf.fonttype": 42}  # text stays text
-    ):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=form, dpi=_DPI, metadata=stamps[form])
-    write_atomically(path, lambda file: file.write(buffer.getvalue()))
 
 
 def print_figure(columns: str, height_in: float) -> Figure:

@@ -10,7 +10,7 @@ from pathlib import Path
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
 from mavfi_cli.campaigns.progress import Spectator, duration
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
 from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise
 from mavfi_cli.reproduction.kernel_folder import FOLDER, SUMMARY, kernel_summary
@@ -97,4 +97,4 @@ class KernelRuns:
         )
         summary = summarise(plan, campaign)
         save_runs(self.folder, summary, campaign, KERNEL_COLUMNS)
-        write_svg(draw_kernel_plot(summary), self.folder / "kernels.svg")
+        write_figure(draw_kernel_plot(summary), self.folder / "kernels.svg")

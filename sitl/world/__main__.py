@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from mavfi_cli.core.files import require_svg, write_atomically, write_text
+from mavfi_cli.core.files import require_output, write_atomically, write_text
 from sitl.command_line import CONTEXT, Place, Triple, exit_code
 from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
 from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, read_scene, scene_toml, world_names
@@ -155,7 +155,7 @@ def _draw(
     from sitl.world.draw import world_svg
 
     file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
-    require_svg(file)
+    require_output(file, [".svg"])
     path = check_world(made).path_enu_m if with_path else None
     picture = world_svg(made, path)
     write_atomically(file, lambda opened: opened.write(picture))

@@ -79,11 +79,11 @@ def test_show_draws_a_run_that_has_no_picture(command_line, short_flight, tmp_pa
     assert out.endswith(f"Run folder  {short_flight.path}\nPicture     {path}\n")
 
 
-def test_show_refuses_a_picture_that_is_no_svg(command_line, short_flight, tmp_path):
-    code, out, err = command_line("show", short_flight.path, "--picture", "above.png")
-    said = "error: above.png: pictures are SVG: name a file that ends in .svg\n"
+def test_show_refuses_a_picture_of_no_known_format(command_line, short_flight, tmp_path):
+    code, out, err = command_line("show", short_flight.path, "--picture", "above.jpg")
+    said = "error: above.jpg: name a file that ends in .svg, .pdf or .png\n"
     assert (code, out, err) == (1, "", said)
-    assert not (tmp_path / "above.png").exists()
+    assert not (tmp_path / "above.jpg").exists()
 
 
 def test_show_events_and_json(command_line, troubled_flight):

@@ -9,7 +9,7 @@ from flown_twice import PLAN, figures_of
 from matplotlib.patches import Rectangle
 
 from mavfi_cli.report.compare_plot import draw_compare_plot
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.timeline import draw_timeline
 from mavfi_cli.studies.compare import ComparePlan
 
@@ -31,15 +31,15 @@ def bars(axes, colour=None):
 
 @pytest.mark.parametrize("draw", [draw_compare_plot, draw_timeline])
 def test_equal_comparisons_give_equal_bytes_whatever_the_settings(whole, tmp_path, draw):
-    write_svg(draw(whole), tmp_path / "a.svg")
+    write_figure(draw(whole), tmp_path / "a.svg")
     with mpl.rc_context({"svg.hashsalt": "another", "svg.fonttype": "path"}):
-        write_svg(draw(whole), tmp_path / "b.svg")
+        write_figure(draw(whole), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     assert {p.name for p in tmp_path.iterdir()} == {"a.svg", "b.svg"}
 
 
 def test_compare_names_platforms_settings_and_what_is_measured(whole, tmp_path):
-    write_svg(draw_compare_plot(whole), tmp_path / "compare.svg")
+    write_figure(draw_compare_plot(whole), tmp_path / "compare.svg")
     said = texts(tmp_path / "compare.svg")
     assert "x86: Intel i9-9940X, the paper's host computer" in said
     assert any(text.startswith("tx2: Jetson TX2") for text in said)
@@ -83,14 +83,14 @@ def test_the_response_bar_is_the_kernels_and_the_waiting(whole):
 def test_nothing_flown_and_other_numbers_of_platforms_are_drawn_all_the_same(plan, tmp_path):
     told = {"plan": plan.told(), "errors": [], **figures_of(plan, []),
             "timeline": {"seed": 1, "platforms": []}}  # fmt: skip
-    write_svg(draw_compare_plot(told), tmp_path / "compare.svg")
-    write_svg(draw_timeline(told), tmp_path / "timeline.svg")
+    write_figure(draw_compare_plot(told), tmp_path / "compare.svg")
+    write_figure(draw_timeline(told), tmp_path / "timeline.svg")
     assert "Success" in texts(tmp_path / "compare.svg")
     assert texts(tmp_path / "timeline.svg") == ["no flight answered a depth frame"]
 
 
 def test_the_timeline_has_both_platforms_all_kernels_and_the_response(whole, tmp_path):
-    write_svg(draw_timeline(whole), tmp_path / "timeline.svg")
+    write_figure(draw_timeline(whole), tmp_path / "timeline.svg")
     said = texts(tmp_path / "timeline.svg")
     for kernel in (*KERNELS, "setpoint"):
         assert said.count(kernel) == 2, kernel

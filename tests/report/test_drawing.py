@@ -15,7 +15,7 @@ from mavfi_cli.report.drawing import (
     PLATFORMS,
     REDUNDANCY,
     detector_colours,
-    write_svg,
+    write_figure,
 )
 from mavfi_cli.report.model_plots import draw_redundancy_plot
 from mavfi_cli.vpm.model import SCHEMES
@@ -90,10 +90,10 @@ def test_a_group_of_nothing_is_empty_and_says_so_once(evaluated):
     assert [text.get_text() for text in times.texts] == ["no success"]
 
 
-@pytest.mark.parametrize("name", ["picture.png", "picture", "picture.svg.pdf"])
-def test_a_picture_is_svg_and_its_name_says_so(tmp_path, name):
-    with pytest.raises(RecordError, match=f"{name}: pictures are SVG: name a file that ends in"):
-        write_svg(Figure(), tmp_path / name)
+@pytest.mark.parametrize("name", ["picture.jpg", "picture", "picture.svg.txt"])
+def test_the_name_of_a_picture_says_its_format(tmp_path, name):
+    with pytest.raises(RecordError, match=rf"{name}: name a file that ends in \.svg, \.pdf or"):
+        write_figure(Figure(), tmp_path / name)
     assert list(tmp_path.iterdir()) == []
-    write_svg(Figure(), tmp_path / "picture.SVG")
+    write_figure(Figure(), tmp_path / "picture.SVG")
     assert (tmp_path / "picture.SVG").read_bytes().startswith(b"<?xml")

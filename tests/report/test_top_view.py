@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Rectangle
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.top_view import draw_top_view
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -40,15 +40,15 @@ def changed(run, **changes):
 
 
 def test_equal_runs_give_equal_bytes_whatever_the_settings(run, tmp_path):
-    write_svg(draw_top_view(run), tmp_path / "a.svg")
+    write_figure(draw_top_view(run), tmp_path / "a.svg")
     with mpl.rc_context({"svg.hashsalt": "another", "svg.fonttype": "path"}):
-        write_svg(draw_top_view(run), tmp_path / "b.svg")
+        write_figure(draw_top_view(run), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     assert {p.name for p in tmp_path.iterdir()} == {"a.svg", "b.svg"}
 
 
 def test_it_says_what_one_needs_to_know(run, tmp_path):
-    write_svg(draw_top_view(run), tmp_path / "flight.svg")
+    write_figure(draw_top_view(run), tmp_path / "flight.svg")
     said = texts(tmp_path / "flight.svg")
     quality = run.result["quality_of_flight"]
     title = f"posts, seed 2: success, {quality['flight_time_s']:.1f} s, "
@@ -137,13 +137,13 @@ def test_without_referee_world_or_trace_there_is_a_picture_all_the_same(run, tmp
     lost = replace(changed(run, world=None, goal_enu_m=None), trace=None)
     unknown = changed(run, quality_of_flight=dict.fromkeys(run.result["quality_of_flight"]))
     for number, odd in enumerate((foreign, empty, lost, unknown)):
-        write_svg(draw_top_view(odd), tmp_path / f"{number}.svg")
+        write_figure(draw_top_view(odd), tmp_path / f"{number}.svg")
         assert "east, m" in texts(tmp_path / f"{number}.svg")
 
 
 def test_a_picture_that_cannot_be_written_is_one_line(run, tmp_path):
-    with pytest.raises(RecordError, match="No such file"):
-        write_svg(draw_top_view(run), tmp_path / "none" / "flight.svg")
+    with pytest.raises(RecordError, match="its folder does not exist"):
+        write_figure(draw_top_view(run), tmp_path / "none" / "flight.svg")
 
 
 def test_no_more_plans_than_one_can_tell_apart_older_ones_paler(run):

@@ -1,7 +1,7 @@
 """The picture of the autoencoder's training."""
 
 from mavfi_cli.report.detector_plots import draw_loss_curve
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import write_figure
 
 CURVE = [[0, 0.2, 0.4], [20, 0.1, 0.3], [40, 0.05, 0.25]]
 
@@ -15,5 +15,5 @@ def test_the_curves_are_called_what_they_are(tmp_path):
         "validation, largest": [[0, 0.4], [20, 0.3], [40, 0.25]],
     }
     for name in ("a.svg", "b.svg"):
-        write_svg(draw_loss_curve(CURVE), tmp_path / name)
+        write_figure(draw_loss_curve(CURVE), tmp_path / name)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()

@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.report.drawing import DETECTORS, write_svg
+from mavfi_cli.report.drawing import DETECTORS, write_figure
 from mavfi_cli.report.top_view import Panel, draw_trajectories, lines
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -52,7 +52,7 @@ def figure(panels):
 
 def test_the_svg_has_every_flight_and_says_what_became_of_it(panels, golden, tmp_path):
     path = tmp_path / "pair.svg"
-    write_svg(draw_trajectories(panels), path)
+    write_figure(draw_trajectories(panels), path)
     root = ET.parse(path).getroot()
     groups = {e.get("id"): e for e in root.iter(f"{SVG}g") if "flight-" in (e.get("id") or "")}
     assert set(groups) == {"flight-0-0", "flight-0-1", "flight-1-0", "flight-1-1", "flight-1-2"}
@@ -77,7 +77,7 @@ def test_the_svg_has_every_flight_and_says_what_became_of_it(panels, golden, tmp
 
 def test_equal_flights_give_equal_bytes(panels, tmp_path):
     for name in ("a.svg", "b.svg"):
-        write_svg(draw_trajectories(panels), tmp_path / name)
+        write_figure(draw_trajectories(panels), tmp_path / name)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 
 
@@ -143,7 +143,7 @@ def test_flights_without_a_trace_or_a_fault_are_drawn_all_the_same(golden, tmp_p
         Panel(title="x", flights=[("fault", replace(cut, trace=None))]),
         *[Panel(title="y", flights=[("golden", golden)])] * 2,
     ]
-    write_svg(draw_trajectories(panels), tmp_path / "odd.svg")
+    write_figure(draw_trajectories(panels), tmp_path / "odd.svg")
     assert "fault: crash<" in (tmp_path / "odd.svg").read_text()
     assert [axes.get_visible() and axes.axison for axes in draw_trajectories(panels).axes] == [
         *[True] * 4, False, False,
@@ -151,5 +151,5 @@ def test_flights_without_a_trace_or_a_fault_are_drawn_all_the_same(golden, tmp_p
 
 
 def test_a_picture_that_cannot_be_written_is_one_line(panels, tmp_path):
-    with pytest.raises(RecordError, match="No such file"):
-        write_svg(draw_trajectories(panels), tmp_path / "none" / "pair.svg")
+    with pytest.raises(RecordError, match="its folder does not exist"):
+        write_figure(draw_trajectories(panels), tmp_path / "none" / "pair.svg")

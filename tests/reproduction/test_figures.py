@@ -8,7 +8,7 @@ import pytest
 from made_flights import flight, struck, table
 from matplotlib.text import Text
 
-from mavfi_cli.core.errors import RecordError
+from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.paper_figures import (
     MARKERS,
     PALETTE,
@@ -16,8 +16,6 @@ from mavfi_cli.report.paper_figures import (
     WIDTHS_IN,
     draw_dots,
     draw_stack,
-    require_picture,
-    write_figure,
 )
 from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.reproduction.figures import DRAWN
@@ -95,13 +93,6 @@ def test_a_figure_is_written_the_same_each_time(tmp_path, suffix):
     first, second = (path.read_bytes() for path in paths)
     assert first == second
     assert first[:4] in (b"<?xm", b"%PDF", b"\x89PNG")
-
-
-def test_other_files_are_refused(tmp_path):
-    with pytest.raises(RecordError, match=r"figures are \.svg, \.pdf, \.png"):
-        require_picture(tmp_path / "x.jpg")
-    with pytest.raises(RecordError, match="no such folder"):
-        require_picture(tmp_path / "nowhere" / "x.png")
 
 
 def test_what_is_drawn_is_what_the_table_says():

@@ -124,8 +124,8 @@ def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
     for arguments, told in (
         (("--item", "fig99"), "unknown item 'fig99'"),
         (("--item", "fig2"), "is no experiment"),
-        (("--item", "fig9", "--output", "x.jpg"), "figures are .svg, .pdf, .png"),
-        (("--item", "fig9", "--output", tmp_path / "no/x.png"), "no such folder"),
+        (("--item", "fig9", "--output", "x.jpg"), "name a file that ends in .svg, .pdf or .png"),
+        (("--item", "fig9", "--output", tmp_path / "no/x.png"), "its folder does not exist"),
         (("--item", "fig6"), "no runs of kernels"),
     ):
         run = mavfi("campaign", "report", folder, *arguments)

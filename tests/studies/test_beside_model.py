@@ -10,7 +10,7 @@ import pytest
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.record.measures import measures_of
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model_plots import draw_flight_plot
 from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
 from mavfi_cli.spec.platform import load_platform
@@ -177,8 +177,8 @@ def test_a_detector_that_does_not_know_these_flights(spark):
 
 def test_the_picture(spark, tmp_path):
     told = spark({"dmr": {"outcome": "collision"}}, refused=("tmr",), count=1)
-    write_svg(draw_flight_plot(told), tmp_path / "a.svg")
-    write_svg(draw_flight_plot(told), tmp_path / "b.svg")
+    write_figure(draw_flight_plot(told), tmp_path / "a.svg")
+    write_figure(draw_flight_plot(told), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     left, right = draw_flight_plot(spark()).axes
     diamonds = [y for line in left.lines if line.get_marker() == "D" for y in line.get_ydata()]

@@ -10,7 +10,7 @@ from evaluation_flights import error_free, flown, pair, struck, table
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.detector_plots import draw_recovery_plot, draw_roc_plot
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.tables.detectors import detector_csv, detector_lines
 from mavfi_cli.studies.evaluate import told
 from mavfi_cli.studies.evaluation_plan import EvaluationPlan
@@ -105,9 +105,9 @@ def test_pictures_show_the_numbers(evaluation, tmp_path):
     assert [bar.get_height() for bar in shares.patches[:2]] == [50.0, 50.0]  # all, control
     assert len(times.patches) == 4  # none and gad in two worlds
     for draw, name in ((draw_roc_plot, "roc.svg"), (draw_recovery_plot, "recovery.svg")):
-        write_svg(draw(evaluation), tmp_path / name)
+        write_figure(draw(evaluation), tmp_path / name)
         first = (tmp_path / name).read_bytes()
-        write_svg(draw(evaluation), tmp_path / name)
+        write_figure(draw(evaluation), tmp_path / name)
         assert (tmp_path / name).read_bytes() == first
         assert first.startswith(b"<?xml")
 

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import require_output
 from mavfi_cli.report.page.charts import (
     Chart,
     arm_chart,
@@ -38,8 +39,7 @@ def require_page(path: Path) -> None:
         raise MavfiError(
             f"the report needs {' and '.join(lacking)}; install with: pip install 'mavfi[report]'"
         )
-    if not path.absolute().parent.is_dir():
-        raise RecordError(f"{path}: its folder does not exist")
+    require_output(path)
 
 
 def render(told: Mapping[str, Any]) -> str:

@@ -7,7 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError
+from mavfi_cli.core.errors import ConfigError, MavfiError
+from mavfi_cli.core.files import require_output
 
 if TYPE_CHECKING:
     from mavfi_cli.report.view.entries import ViewedFlight
@@ -35,8 +36,8 @@ def require_viewer(path: Path | None) -> None:
     if find_spec(package) is None:
         what = "rerun's window" if path is None else f"a {suffix} file"
         raise MavfiError(f"{what} needs more packages: pip install 'mavfi[{extra}]'")
-    if path is not None and not path.parent.is_dir():
-        raise RecordError(f"{path}: No such file or directory")
+    if path is not None:
+        require_output(path)
 
 
 def save(flights: Sequence[ViewedFlight], path: Path) -> None:

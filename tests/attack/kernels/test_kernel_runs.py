@@ -16,7 +16,7 @@ from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.target import digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
-from mavfi_cli.report.drawing import write_svg
+from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
 from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, runs_csv, summarise, table
 
@@ -226,7 +226,7 @@ def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
     assert rows[0] == KERNEL_COLUMNS
     assert len(rows) == 31
     for name in ("one.svg", "two.svg"):
-        write_svg(draw_kernel_plot(summary), tmp_path / name)
+        write_figure(draw_kernel_plot(summary), tmp_path / name)
     assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
     assert "PID" in (tmp_path / "one.svg").read_text()
 
