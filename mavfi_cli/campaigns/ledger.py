@@ -18,6 +18,7 @@ import json
 import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -170,12 +171,23 @@ class Ledger:
                 with contextlib.suppress(sqlite3.Error):
                     self._db.execute("ROLLBACK")
 
+    def _rows(self, query: str, *values: object) -> Iterator[Any]:
+        """The rows of a query, one after the other.
+
+        Raises:
+            RecordError: the ledger is damaged.
+        """
+        try:
+            yield from self._db.execute(query, values)
+        except sqlite3.Error as error:
+            raise RecordError(f"{self._path}: {error}") from None
+
     # The campaign ---------------------------------------------------------------------------------
 
     def meta(self, key: str) -> str | None:
         """An entry about the campaign; None if it was never stored."""
-        row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
-        return None if row is None else str(row[0])
+        found = [str(value) for (value,) in self._rows("SELECT value FROM meta WHERE key = ?", key)]
+        return found[0] if found else None
 
     def set_meta(self, values: Mapping[str, str]) -> None:
         """Store entries about the campaign, all or none."""
@@ -189,7 +201,7 @@ class Ledger:
             RecordError: the ledger cannot be written, for example because the disk is full.
         """
         first = self.planned()
-        known = {labels: cell for cell, labels in self._db.execute("SELECT * FROM cells")}
+        known = {labels: cell for cell, labels in self._rows("SELECT * FROM cells")}
         count = 0
         with self._transaction():
             for count, mission in enumerate(missions, start=1):
@@ -204,16 +216,17 @@ class Ledger:
 
     def planned(self) -> int:
         """Number of missions in the list."""
-        return int(self._db.execute("SELECT count(*) FROM missions").fetchone()[0])
+        ((count,),) = self._rows("SELECT count(*) FROM missions")
+        return int(count)
 
     def cells(self) -> list[dict[str, Any]]:
         """The settings, by number."""
-        rows = self._db.execute("SELECT labels FROM cells ORDER BY cell")
+        rows = self._rows("SELECT labels FROM cells ORDER BY cell")
         return [json.loads(labels) for (labels,) in rows]
 
     def rows(self) -> Iterator[tuple[int, str, str, str]]:
         """Number, labels, pair and changes of every mission, as they are stored."""
-        yield from self._db.execute(
+        yield from self._rows(
             "SELECT number, labels, pair, changes FROM missions JOIN cells USING (cell) "
             "ORDER BY number"
         )
@@ -232,11 +245,13 @@ class Ledger:
         over += " AND state <> 'error'" if errors else ""
         last = -1
         while True:
-            rows = self._db.execute(
-                "SELECT number, cell, changes FROM missions WHERE number > ? "
-                f"AND NOT EXISTS ({over}) ORDER BY number LIMIT 1000",
-                (last,),
-            ).fetchall()
+            rows = list(
+                self._rows(
+                    "SELECT number, cell, changes FROM missions WHERE number > ? "
+                    f"AND NOT EXISTS ({over}) ORDER BY number LIMIT 1000",
+                    last,
+                )
+            )
             for number, cell, changes in rows:
                 yield number, cell, json.loads(changes)
                 last = number
@@ -245,16 +260,17 @@ class Ledger:
 
     def cell_of_each(self) -> list[int]:
         """The setting of each mission, in the order of the list."""
-        return [cell for (cell,) in self._db.execute("SELECT cell FROM missions ORDER BY number")]
+        return [cell for (cell,) in self._rows("SELECT cell FROM missions ORDER BY number")]
 
     def fates(self) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
         """Number, outcome and fate of the fault of every mission that is over."""
-        for number, *fate in self._db.execute("SELECT number, outcome, injected FROM results"):
+        for number, *fate in self._rows("SELECT number, outcome, injected FROM results"):
             yield number, (fate[0], fate[1])
 
     def over(self) -> int:
         """Number of missions with a row."""
-        return int(self._db.execute("SELECT count(*) FROM results").fetchone()[0])
+        ((count,),) = self._rows("SELECT count(*) FROM results")
+        return int(count)
 
     def add(
         self,
@@ -300,11 +316,11 @@ class Ledger:
             numbers: only these missions.
         """
         chosen = "" if numbers is None else "WHERE number IN (SELECT value FROM json_each(?)) "
-        rows = self._db.execute(
+        rows = self._rows(
             "SELECT number, labels, pair, changes, state, outcome, reason, injected, wall_s, "
             "attempts, path, result FROM results JOIN missions USING (number) "
             f"JOIN cells USING (cell) JOIN records USING (number) {chosen}ORDER BY number",
-            () if numbers is None else (json.dumps(list(numbers)),),
+            *([] if numbers is None else [json.dumps(list(numbers))]),
         )
         for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
             wall_s, attempts, path, blob = rest
@@ -318,12 +334,19 @@ class Ledger:
                 state=ResultState(state),
                 outcome=outcome,
                 reason=reason,
-                result=json.loads(zlib.decompress(blob)),
+                result=self._unpacked(blob),
                 injected=None if injected is None else Injected(injected),
                 wall_s=wall_s,
                 attempts=attempts,
                 path=None if path is None else self.folder.absolute() / path,
             )
+
+    def _unpacked(self, blob: bytes) -> dict[str, Any]:
+        try:
+            result: dict[str, Any] = json.loads(zlib.decompress(blob))
+        except (zlib.error, ValueError) as error:
+            raise RecordError(f"{self._path}: {error}") from None
+        return result
 
     def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
         """Columns of every flown mission, in the order of the list and in portions.
@@ -331,17 +354,17 @@ class Ledger:
         Args:
             names: of the tables `missions` and `results`.
         """
-        rows = self._db.execute(
+        rows = self._rows(
             f"SELECT {', '.join(names)} FROM results JOIN missions USING (number) "
             "WHERE state = 'flown' ORDER BY number"
         )
-        while portion := rows.fetchmany(_PORTION):
+        while portion := list(islice(rows, _PORTION)):
             yield list(zip(*portion, strict=True))
 
     def errors_by_cell(self) -> dict[int, int]:
         """Number of missions that could not begin, by cell that has any."""
         return dict(
-            self._db.execute(
+            self._rows(
                 "SELECT cell, count(*) FROM results JOIN missions USING (number) "
                 "WHERE state = 'error' GROUP BY cell"
             )
@@ -349,5 +372,5 @@ class Ledger:
 
     def planned_by_cell(self) -> list[int]:
         """Number of missions of each cell."""
-        rows = self._db.execute("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
+        rows = self._rows("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
         return [count for (count,) in rows]

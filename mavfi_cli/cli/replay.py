@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import click
@@ -37,17 +36,11 @@ def replay(
             raise click.UsageError("--gdb needs a run folder, which --mission does not")
         _replay_mission(run, number, out, without_fault=without_fault, as_json=as_json)
         return
-    from mavfi_cli.core.errors import Interrupted
     from mavfi_cli.core.files import file_digest
     from mavfi_cli.core.installed import installed_versions, version_differences
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.repetition import fly_again
-    from mavfi_cli.mission.replay import (
-        config_of,
-        differing_results,
-        first_difference,
-        interrupted,
-    )
+    from mavfi_cli.mission.replay import config_of, differing_results, first_difference
     from mavfi_cli.report.summary import difference_lines, outcome_line
 
     recorded = load_run(run)
@@ -59,9 +52,6 @@ def replay(
     again = fly_again(
         recorded, out, with_fault=not without_fault, for_debugger=_say_where if gdb else None
     )
-    if interrupted(again):
-        shutil.rmtree(again.folder.path)
-        raise Interrupted("interrupted: the repetition was not flown to its end")
     differing = [
         section
         for section in differing_results(recorded.result, again.result)
@@ -100,16 +90,14 @@ def replay(
 def _replay_mission(
     campaign: Path, number: int, out: Path, *, without_fault: bool, as_json: bool
 ) -> None:
-    from mavfi_cli.mission.progress import Watcher
-    from mavfi_cli.mission.record.run_folder import load_run
-    from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.mission.repetition import fly_to_end
     from mavfi_cli.report.summary import outcome_line
     from mavfi_cli.studies.again import mission_of
 
     mission = mission_of(campaign, number)
     config = mission.golden if without_fault else mission.config
     click.echo(f"flying mission {number}: {config.world}, seed {config.seed}", err=True)
-    again = load_run(fly_mission(config, out, Watcher()).path)
+    again = fly_to_end(config, out)
     differing = mission.differing(again.result)
     if as_json:
         comparison = {

@@ -7,12 +7,10 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import writing
-from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import Run, load_run
+from mavfi_cli.mission.repetition import fly_to_end
 from mavfi_cli.mission.replay import config_of, interrupted
-from mavfi_cli.mission.run import fly_mission
 
 FOLDER = "golden"
 
@@ -44,10 +42,8 @@ def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run
         writing(kept),
         tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent,
     ):
-        flown = fly_mission(config, Path(parent), Watcher())
-        if interrupted(load_run(flown.path)):
-            raise Interrupted("interrupted: the golden pair was not flown to its end")
+        flown = fly_to_end(config, Path(parent))
         if kept.is_dir():
             shutil.rmtree(kept)
-        shutil.move(flown.path, kept)
+        shutil.move(flown.folder.path, kept)
     return load_run(kept)

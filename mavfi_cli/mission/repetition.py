@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import file_digest
@@ -13,6 +15,7 @@ from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record.run_folder import Run, load_run
 from mavfi_cli.mission.replay import config_of, interrupted
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def fly_again(
@@ -31,14 +34,28 @@ def fly_again(
 
     Raises:
         RecordError: The run is not repeatable.
-        MavfiError: As for `fly_mission`.
+        Interrupted, MavfiError: As for `fly_to_end`.
     """
     config = config_of(run, with_fault=with_fault)
     repeat = read(run.folder.fault) if config.instruction is not None else None
-    flown = fly_mission(
-        config, out, Watcher(), recorder=recorder, repeat=repeat, for_debugger=for_debugger
-    )
-    return load_run(flown.path)
+    return fly_to_end(config, out, recorder=recorder, repeat=repeat, for_debugger=for_debugger)
+
+
+def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
+    """Fly a mission that is of no use unless it is flown to its end.
+
+    Args:
+        options: As for `fly_mission`.
+
+    Raises:
+        Interrupted: The user ended it. Nothing of it is kept.
+        MavfiError: As for `fly_mission`.
+    """
+    flown = load_run(fly_mission(config, out, Watcher(), **options).path)
+    if interrupted(flown):
+        shutil.rmtree(flown.folder.path)
+        raise Interrupted("interrupted: the mission was not flown to its end")
+    return flown
 
 
 def watch_again(run: Run) -> tuple[Recorder, bool]:
@@ -49,14 +66,10 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
         software or the machine differs.
 
     Raises:
-        RecordError: The run is not repeatable.
-        Interrupted: The user ended the repetition.
-        MavfiError: As for `fly_mission`.
+        RecordError, Interrupted, MavfiError: As for `fly_again`.
     """
     recorder = Recorder()
     with tempfile.TemporaryDirectory(prefix="mavfi-again-") as scratch:
         again = fly_again(run, Path(scratch), recorder=recorder)
-        if interrupted(again):
-            raise Interrupted("interrupted: the repetition was not flown to its end")
         same = file_digest(again.folder.trace) == file_digest(run.folder.trace)
     return recorder, same

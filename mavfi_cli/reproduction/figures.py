@@ -11,6 +11,7 @@ import pyarrow as pa
 from mavfi_cli.analysis.flights import flown
 from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.report.paper_figures import (
@@ -67,6 +68,9 @@ def draw_flights(name: str, table: PaperTable, flights: pa.Table, columns: str) 
 
     Args:
         flights: as `analysis.flights.flights`. `fig13` needs their kept run folders.
+
+    Raises:
+        RecordError: these are not there.
     """
     drawn = DRAWN.get(name)
     return draw_table(table, columns) if drawn is None else drawn(flown(flights), columns)
@@ -171,8 +175,10 @@ def _fig11(table: pa.Table, columns: str) -> Figure:
 
 def _fig13(table: pa.Table, columns: str) -> Figure:
     """The pair of missions that a fault prolongs most, from above."""
-    folder = Path(next(path for path in table["path"].to_pylist() if path)).parents[1]
-    with Ledger(folder) as ledger:
+    kept = [Path(path) for path in table["path"].to_pylist() if path]
+    if not kept:
+        raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
+    with Ledger(kept[0].parents[1]) as ledger:
         chosen = pair(ledger, among=frozenset(table["number"].to_pylist()))
     panels = [
         Panel(

@@ -139,6 +139,19 @@ def test_what_is_no_ledger_is_refused(tmp_path, content, error, problem):
         Ledger(tmp_path)
 
 
+def test_a_damaged_ledger_is_one_line(tmp_path):
+    with written(tmp_path) as ledger:
+        ledger.add(0, **ROW)
+    path = tmp_path / LEDGER
+    data = bytearray(path.read_bytes())
+    for page in range(8192, len(data), 512):
+        data[page : page + 64] = bytes([255] * 64)
+    path.write_bytes(data)
+    for read in (Ledger.planned, Ledger.cells, Ledger.results, Ledger.missing, Ledger.fates):
+        with Ledger(tmp_path) as damaged, pytest.raises(RecordError, match="malformed"):
+            list(read(damaged))
+
+
 def test_a_database_of_somebody_else_is_refused(tmp_path):
     with contextlib.closing(sqlite3.connect(tmp_path / LEDGER)) as other:
         other.execute("CREATE TABLE songs (name TEXT)")

@@ -3,17 +3,22 @@
 import json
 import signal
 
+import pyarrow as pa
 import pytest
 
+from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.core.errors import Interrupted
+from mavfi_cli.core.files import write_parquet
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission import run as run_module
 from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.replay import config_of
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
+CUT_OFF = "interrupted: the mission was not flown to its end"
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
 )
@@ -49,12 +54,12 @@ def sideways(fly_short):
 
 def test_an_interrupted_golden_pair_is_not_kept(command_line, sideways, cut_once):
     before = {path.name for path in sideways.path.iterdir()}
-    cut_once("mavfi_cli.mission.golden")
+    cut_once("mavfi_cli.mission.repetition")
     code, out, err = command_line("show", "--pair", sideways.path)
     assert (code, out) == (130, "")
     assert err.splitlines() == [
         "flying the golden pair: farm, seed 5",
-        "interrupted: the golden pair was not flown to its end",
+        CUT_OFF,
     ]
     assert {path.name for path in sideways.path.iterdir()} == before
     code, out, err = command_line("show", sideways.path)
@@ -84,9 +89,24 @@ def test_an_interrupted_repetition_is_neither_equal_nor_different(
     again = "without its fault" if "--without-fault" in options else "again"
     assert err.splitlines() == [
         f"flying farm, seed 5, {again}",
-        "interrupted: the repetition was not flown to its end",
+        CUT_OFF,
     ]
     assert not list((tmp_path / "again").iterdir())
+
+
+def test_an_interrupted_mission_of_a_campaign_leaves_nothing(
+    command_line, short_flight, cut_once, tmp_path
+):
+    changes = canonical(changes_of(config_of(load_run(short_flight.path))))
+    columns = {"number": [0], "outcome": ["success"], "changes": [changes]}
+    write_parquet(tmp_path / "campaign.parquet", pa.table(columns))
+    cut_once("mavfi_cli.mission.repetition")
+    asked = ("replay", "campaign.parquet", "--mission", "0", "--out", "again")
+    code, out, err = command_line(*asked)
+    assert (code, out, err.splitlines()[-1]) == (130, "", CUT_OFF)
+    assert not list((tmp_path / "again").iterdir())
+    code, out, _ = command_line(*asked)
+    assert (code, "identical in every measure" in out) == (0, True)
 
 
 def test_an_interrupted_repetition_is_not_looked_at(command_line, short_flight, cut_once, tmp_path):
@@ -94,7 +114,7 @@ def test_an_interrupted_repetition_is_not_looked_at(command_line, short_flight, 
     cut_once("mavfi_cli.mission.repetition")
     code, out, err = command_line("view", short_flight.path, "--save", "flight.mcap")
     assert (code, out) == (130, "")
-    assert err.splitlines()[-1] == "interrupted: the repetition was not flown to its end"
+    assert err.splitlines()[-1] == CUT_OFF
     assert not list(tmp_path.glob("*.mcap"))
 
 

@@ -116,7 +116,7 @@ def test_bad_input_is_one_line(short_flight, mavfi, tmp_path):
     for line, told in (
         ([short_flight.path, "--save", "x.png"], "ends in .rrd (rerun) or .mcap (Foxglove)"),
         ([tmp_path / "nothing", "--save", "x.mcap"], "no such run folder"),
-        ([short_flight.path, "--save", tmp_path / "no" / "x.mcap"], "No such file"),
+        ([short_flight.path, "--save", tmp_path / "no" / "x.mcap"], "its folder does not exist"),
     ):
         done = mavfi("view", *line)
         assert done.returncode == 1

@@ -8,6 +8,7 @@ import pytest
 from made_flights import flight, struck, table
 from matplotlib.text import Text
 
+from mavfi_cli.core.errors import RecordError
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.paper_figures import (
     MARKERS,
@@ -100,3 +101,8 @@ def test_what_is_drawn_is_what_the_table_says():
     worst = of_flights("fig12", FLIGHTS).rows[0].cells[1].value
     drawn = [max(line.get_xdata()) for line in axes.lines if line.get_marker() == "s"]
     assert drawn == [pytest.approx(worst)]
+
+
+def test_trajectories_need_a_kept_run():
+    with pytest.raises(RecordError, match="no run folder was kept"):
+        DRAWN["fig13"](FLIGHTS, "one")
