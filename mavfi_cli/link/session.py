@@ -39,6 +39,7 @@ _LARGEST_FLOAT32 = 3.4028234663852886e38
 _HEARTBEAT_INTERVAL_S = 1.0
 _MAX_ANSWERS = 64  # maximum replies per tick; further requests are ignored
 _HEIGHT_REACHED_M = 0.3  # tolerance below the take-off height
+_LISTEN_S = 1.2  # time in which a second autopilot would send a HEARTBEAT, too
 _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the vehicle itself
 
 
@@ -332,6 +333,8 @@ class OffboardSession:
         if not self._camera_heard and self._elapsed_s() >= settings.camera_timeout_s:
             raise NoCamera(self._url, settings.camera_timeout_s)
         self._require_soon()
+        if self._elapsed_s() < _LISTEN_S:
+            return False
         return self._camera_heard and not asked.pending and self.telemetry.state is not None
 
     def _waiting_ready(self) -> None:

@@ -19,6 +19,7 @@ from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
 from mavfi_cli.core.types import FloatArray, VehicleState
 from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.seat import TWO_AUTOPILOTS
 from mavfi_cli.link.texts import TextCollector
 
 
@@ -276,18 +277,20 @@ class Telemetry:
         """Handle a STATUSTEXT of the autopilot, or of a component that speaks for it."""
         before = self.texts.total
         self.texts.add(message, self.now_s)
-        self._look_for_collision(before)
+        self._look_for_verdict(before)
 
     def expire(self) -> None:
         """Close texts whose missing chunks are overdue."""
         before = self.texts.total
         self.texts.expire(self.now_s)
-        self._look_for_collision(before)
+        self._look_for_verdict(before)
 
-    def _look_for_collision(self, before: int) -> None:
+    def _look_for_verdict(self, before: int) -> None:
         for text in self.texts.since(before):
             if self.collision_text is None and text.text.startswith("Collision"):
                 self.collision_text = text.text
+            elif text.text.startswith(TWO_AUTOPILOTS):
+                self.unfit = text.text
 
 
 def _name(enum: str, number: int) -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.link.codec import Codec, Message, Signing
+from mavfi_cli.link.seat import two_autopilots
 from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
@@ -132,6 +133,12 @@ class RecordedLink:
                 self._tlog.write(stamp_s, *frames)
             self._early.clear()
             yield
+
+    @property
+    def rivals(self) -> str:
+        """Text about two autopilots that send to this end; "" without a second one."""
+        rival = self._transport.rival_address
+        return two_autopilots(self._transport.address, rival) if rival else ""
 
     def receive(self, timeout_s: float) -> bytes:
         """Return the next bytes, or b"" after `timeout_s`.

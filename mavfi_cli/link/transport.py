@@ -16,11 +16,11 @@ from typing import Any, NoReturn, Protocol
 from mavfi_cli.core.errors import EndpointError, LinkLost
 from mavfi_cli.link.codec import begins_with_frame
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, parse_endpoint
+from mavfi_cli.link.seat import Seat, is_autopilots
 
 MAX_PEERS = 16  # of one listener
 MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
 _JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost
-_PEER_SILENCE_S = 5.0  # time after which another sender may take a silent peer's place
 _PUMPED = 1000  # datagrams that one pass reads
 _CONNECT_TIMEOUT_S = 5.0
 _SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
@@ -40,6 +40,14 @@ class Transport(Protocol):
     @property
     def datagram(self) -> bool:
         """True if every `receive` returns whole frames; an argument of `Codec.decode`."""
+
+    @property
+    def address(self) -> str:
+        """Address of a network peer, for error messages; "" if unknown."""
+
+    @property
+    def rival_address(self) -> str:
+        """Address of an autopilot that sends here beside the peer; "" without one."""
 
     def send(self, data: bytes) -> None:
         """Send whole frames. Datagrams may be lost. Raises LinkLost if the peer has closed."""
@@ -218,6 +226,12 @@ class _Receiver(ABC):
 
     url: str
     datagram = False
+    address = ""
+
+    @property
+    def rival_address(self) -> str:
+        """See `Transport`."""
+        return ""
 
     def receive(self, timeout_s: float) -> bytes:
         """See `Transport`."""
@@ -275,8 +289,11 @@ class _StreamTransport(_SocketOwner, _Receiver):
     64 KiB at most, and drops the oldest sends first, so that what arrives is recent.
     """
 
-    def __init__(self, connection: socket.socket, url: str, *, patient: bool = True) -> None:
+    def __init__(
+        self, connection: socket.socket, url: str, *, patient: bool = True, address: str = ""
+    ) -> None:
         super().__init__(connection, url)
+        self.address = address
         self._patient = patient
         self._chunk = _CHUNK if patient else _SMALL_CHUNK
         self._begun = b""  # rest of a send of which the peer has a part
@@ -335,7 +352,7 @@ class _TcpListener(_SocketOwner):
         clients: list[_StreamTransport] = []
         while True:
             try:
-                connection = self._socket.accept()[0]
+                connection, address = self._socket.accept()
             except OSError:  # no client is waiting, or it has disconnected already
                 return clients
             self._peers = [peer for peer in self._peers if peer.fileno() >= 0]
@@ -345,7 +362,9 @@ class _TcpListener(_SocketOwner):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if not patient:  # the system's buffers would hold telemetry of half a minute
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BACKLOG)
-            self._peers.append(_StreamTransport(connection, self.url, patient=patient))
+            self._peers.append(
+                _StreamTransport(connection, self.url, patient=patient, address=_text_of(address))
+            )
             clients.append(self._peers[-1])
 
 
@@ -452,12 +471,15 @@ class _UdpTransport(_SocketOwner, _Receiver):
     ) -> None:
         super().__init__(opened, url)
         self._admits = admits
-        self._peer: Any = None
-        self._silent_from_s = 0.0  # then the peer has been silent for too long
+        self._seat: Seat[Any] = Seat()
+
+    @property
+    def rival_address(self) -> str:
+        return _text_of(self._seat.rival)
 
     def send(self, data: bytes) -> None:
-        if self._peer is not None or self._admits is None:
-            _send_datagrams(self._socket, data, self._peer)
+        if self._seat.holder is not None or self._admits is None:
+            _send_datagrams(self._socket, data, self._seat.holder)
 
     def _pull(self) -> bytes:
         for _ in range(_PUMPED):
@@ -467,14 +489,23 @@ class _UdpTransport(_SocketOwner, _Receiver):
         return b""
 
     def _is_peer(self, data: bytes, sender: Any) -> bool:
-        now_s = time.monotonic()
-        if sender != self._peer:
-            assert self._admits is not None
-            if now_s < self._silent_from_s or not self._admits(data):
-                return False
-            self._peer = sender
-        self._silent_from_s = now_s + _PEER_SILENCE_S
-        return True
+        assert self._admits is not None
+        if self._seat.hears(sender):
+            return True
+        if not self._admits(data):
+            return False
+        if self._seat.is_free:
+            self._seat.take(sender)
+            self.address = _text_of(sender)
+            return True
+        if is_autopilots(data):
+            self._seat.challenge(sender)
+        return False
+
+
+def _text_of(address: Any) -> str:
+    """Return host and port of a socket's address; "" for None."""
+    return "" if address is None else f"{address[0]}:{address[1]}"
 
 
 def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:
@@ -571,6 +602,7 @@ class _UdpPeer(_Receiver):
     def __init__(self, listener: _UdpListener, address: Any) -> None:
         self._listener = listener
         self._address = address
+        self.address = _text_of(address)
         self.url = listener.url
         self.waiting: deque[bytes] = deque(maxlen=MAX_WAITING)
         self.lost = False
@@ -615,6 +647,7 @@ class _MemoryTransport:
     """
 
     datagram = False
+    address = rival_address = ""
 
     def __init__(self, url: str) -> None:
         self.url = url

@@ -262,6 +262,8 @@ class Flight:
         data = self._receive(IDLE_S)
         waited_s = time.monotonic() - begun_s
         stamp_s = self._take(data) if data else None
+        if self._session.telemetry.heard and self.link.rivals:
+            self._session.telemetry.unfit = self.link.rivals
         if stamp_s is not None and not clock.heard:
             self._take_clock(stamp_s)
         if self._tick(stamp_s):

@@ -2,48 +2,70 @@
 
 from __future__ import annotations
 
-import selectors
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from mavfi_cli.core.errors import LinkLost
-from mavfi_cli.link.codec import Codec, Signing, begins_with_frame
-from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
-from mavfi_cli.link.transport import Listener, Transport, open_listener
+from mavfi_cli.link.codec import Codec, Signing, dialect
+from mavfi_cli.link.endpoint import parse_endpoint
+from mavfi_cli.link.seat import Seat, is_of_autopilot, two_autopilots
+from mavfi_cli.link.texts import text_messages
+from mavfi_cli.link.transport import Transport
 from sitl.camera.component import COMPONENT_ID
+from sitl.peers import Peer, Peers
 
-SILENCE_S = 30.0  # time after which a UDP sender that says nothing valid is forgotten
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Door:
-    """An endpoint and what its scheme means for its peers."""
-
-    listener: Listener
-    scheme: str
+_TURN_S = 0.02  # time for the messages of all peers, after which the camera acts
+_TEXT_ID = 2  # of the texts about two autopilots; the referee's have another
 
 
-@dataclass(slots=True, kw_only=True)
-class _Peer:
-    link: Transport
-    codec: Codec  # of what it sends
-    door: _Door
-    heard_s: float
-    spoke: bool = False
+class _Linked(Peer):
+    """An autopilot, companion or ground station on one of the links.
 
-    @property
-    def awaits_frames(self) -> bool:
-        """True unless it is a companion that has started the camera and is not ready yet."""
-        return self.spoke or self.door.scheme != "fd"
+    Args:
+        transport: Its connection.
+        router: Hears its messages.
+        seats: Place of the autopilot of each system at the peer's endpoint.
+        awaits_frames: False for a companion that has started the camera, until it speaks.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        *,
+        router: Router,
+        seats: dict[int, Seat[_Linked]],
+        awaits_frames: bool,
+    ) -> None:
+        super().__init__(transport)
+        self.seats, self.awaits_frames, self._router = seats, awaits_frames, router
+        self._codec = Codec(0, 0, signing=router.signing)
+
+    def take(self, data: bytes) -> list[Any]:
+        """Handle received bytes. Return the messages in them."""
+        messages = self._codec.decode(data, datagram=self.transport.datagram)
+        self.awaits_frames = self.awaits_frames or bool(messages)
+        for message in messages:
+            self._router.hear(message, self)
+        return messages
+
+    def forward(self, *, frame: bytes, of: Peer) -> None:
+        """See `Peer`."""
+        if self.awaits_frames:
+            super().forward(frame=frame, of=of)
+
+    def close(self) -> None:
+        """Close the connection and leave every place."""
+        super().close()
+        for seat in self.seats.values():
+            seat.leave(self)
 
 
 class Router:
     """Joins the peers of several endpoints, and is the camera component among them.
 
-    A sender on a listening endpoint is a peer after its first valid frame.
+    Two autopilots of the same system id at one endpoint would be one vehicle that jumps. The frames
+    of the second are dropped, and a STATUSTEXT tells both senders.
 
     Args:
         urls: Endpoints to open. The autopilot may be on any of them.
@@ -53,7 +75,9 @@ class Router:
         clock: Monotonic clock in seconds.
 
     Attributes:
-        over: True once an inherited connection has closed.
+        codec: Encoder of the camera's messages.
+        peers: Everybody on the links.
+        take: Handles a message. Returns True if it goes to the other peers, too.
 
     Raises:
         EndpointError: An endpoint cannot be opened.
@@ -67,102 +91,66 @@ class Router:
         allow_unsigned: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.over = False
-        self._signing, self._clock = signing, clock
-        self._codec = Codec(1, COMPONENT_ID, signing=signing)
-        self._doors: list[_Door] = []
-        self._peers: list[_Peer] = []
-        admits = begins_with_frame if signing is None else signing.vouches
+        self.signing, self._clock = signing, clock
+        self.codec = Codec(1, COMPONENT_ID, signing=signing)
+        self.take: Callable[[Any], bool] = lambda _message: True
+        self.peers: Peers[_Linked] = Peers(
+            signing=signing, allow_unsigned=allow_unsigned, clock=clock
+        )
         try:
             for url in urls:
-                listener = open_listener(
-                    url, signed=signing is not None, allow_unsigned=allow_unsigned, admits=admits
-                )
-                self._doors.append(_Door(listener=listener, scheme=parse_endpoint(url).scheme))
-            self._welcome()
+                waits = parse_endpoint(url).scheme != "fd"
+                make = partial(_Linked, router=self, seats={}, awaits_frames=waits)
+                self.peers.open(url, make)
         except BaseException:
             self.close()
             raise
 
-    @property
-    def system(self) -> int:
-        """MAVLink system id of the camera."""
-        return self._codec.system
-
-    @system.setter
-    def system(self, system: int) -> None:
-        self._codec.system = system
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait until a peer says something, or until the time is over."""
-        with selectors.DefaultSelector() as selector:
-            descriptors = {door.listener.fileno() for door in self._doors}
-            descriptors |= {peer.link.fileno() for peer in self._peers}
-            for descriptor in descriptors:
-                if descriptor >= 0:  # a door with one peer closes with it
-                    selector.register(descriptor, selectors.EVENT_READ)
-            selector.select(timeout_s)
-
-    def serve(self, take: Callable[[Any], bool]) -> None:
-        """Handle all waiting messages.
-
-        Args:
-            take: Handles a message. Returns True if it goes to the other peers, too.
+    def serve(self) -> None:
+        """Handle waiting messages, for a bounded time.
 
         Raises:
             LinkLost: The peer of an endpoint that does not listen closed it.
         """
-        self._welcome()
-        for peer in list(self._peers):
-            while data := self._try(peer, partial(peer.link.receive, 0.0)):
-                for message in peer.codec.decode(data, datagram=peer.link.datagram):
-                    peer.heard_s, peer.spoke = self._clock(), True
-                    if take(message):
-                        self._forward(message, peer)
-        self._forget_silent()
+        self.peers.serve(self._clock() + _TURN_S)
+        if self.peers.lost is not None:
+            raise self.peers.lost
+
+    def hear(self, message: Any, source: _Linked) -> None:
+        """Handle a message of a peer, and pass it on."""
+        if self._is_of_holder(message, source) and self.take(message):
+            frame = bytes(message.get_msgbuf())
+            self.peers.each(partial(_Linked.forward, frame=frame, of=source))
+
+    def _is_of_holder(self, message: Any, source: _Linked) -> bool:
+        """Return False for the frame of a second autopilot."""
+        if not is_of_autopilot(message):
+            return True
+        seat = source.seats.setdefault(message.get_srcSystem(), Seat(self._clock))
+        if seat.hears(source):
+            self._tell_rival(seat)
+        elif seat.is_free:
+            seat.take(source)
+        else:
+            if isinstance(message, dialect.MAVLink_heartbeat_message):  # once a second
+                seat.challenge(source)
+            return False
+        return True
+
+    def _tell_rival(self, seat: Seat[_Linked]) -> None:
+        """Send the addresses of two autopilots, if both speak."""
+        if seat.holder is None or seat.rival is None:
+            return
+        text = two_autopilots(seat.holder.transport.address, seat.rival.transport.address)
+        seat.rival = None
+        severity = dialect.MAV_SEVERITY_CRITICAL
+        self.send(list(text_messages(severity, text.encode(), _TEXT_ID)))
 
     def send(self, messages: Sequence[Any]) -> None:
-        """Send messages of the camera to all peers. Raises as `serve`."""
-        data = b"".join(self._codec.encode(message) for message in messages)
-        for peer in list(self._peers) if data else ():
-            self._try(peer, partial(peer.link.send, data))
+        """Send messages of the camera to all peers."""
+        if data := b"".join(self.codec.encode(message) for message in messages):
+            self.peers.each(lambda peer: peer.transport.send(data))
 
     def close(self) -> None:
         """Close every link."""
-        for peer in self._peers:
-            peer.link.close()
-        for door in self._doors:
-            door.listener.close()
-
-    def _forward(self, message: Any, source: _Peer) -> None:
-        frame = bytes(message.get_msgbuf())
-        for peer in list(self._peers):
-            if peer is not source and peer.awaits_frames:
-                self._try(peer, partial(peer.link.send, frame))
-
-    def _welcome(self) -> None:
-        for door in self._doors:
-            for link in door.listener.accept_ready():
-                codec = Codec(0, 0, signing=self._signing)
-                self._peers.append(_Peer(link=link, codec=codec, door=door, heard_s=self._clock()))
-
-    def _forget_silent(self) -> None:
-        since_s = self._clock() - SILENCE_S
-        for peer in list(self._peers):
-            if peer.door.scheme == "udpin" and peer.heard_s < since_s:
-                self._remove(peer)
-
-    def _try(self, peer: _Peer, action: Callable[[], bytes | None]) -> bytes | None:
-        try:
-            return action()
-        except LinkLost:
-            self._remove(peer)
-            if peer.door.scheme not in (*LISTENING, "fd"):
-                raise
-            self.over = self.over or peer.door.scheme == "fd"
-            return None
-
-    def _remove(self, peer: _Peer) -> None:
-        peer.link.close()
-        if peer in self._peers:
-            self._peers.remove(peer)
+        self.peers.close()

@@ -135,6 +135,7 @@ class Station:
         self.frames_sent = 0
         self._tracker, self._router, self._witness = tracker, router, witness
         self._clock = clock
+        router.take = self._take
         self._autopilot: int | None = None  # system id; None before its first heartbeat
         self._placed = False
         self._unplaced_since_s: float | None = None  # by the autopilot's clock
@@ -150,13 +151,13 @@ class Station:
         Raises:
             LinkLost: The peer of a link closed it.
         """
-        while keep_on() and not self._router.over:
-            self._router.wait(_WAIT_S)
+        while keep_on() and not self._router.peers.over:
+            self._router.peers.wait(_WAIT_S)
             self.serve()
 
     def serve(self) -> None:
         """Handle all waiting messages and send the due ones."""
-        self._router.serve(self._take)
+        self._router.serve()
         self._announce()
         self._place()
         self._ask()
@@ -212,7 +213,7 @@ class Station:
             ):
                 return False
             self._autopilot = self.camera.system = message.get_srcSystem()
-            self._router.system = self.camera.system
+            self._router.codec.system = self.camera.system
         return bool(message.get_srcSystem() == self._autopilot)
 
     def _announce(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from typing import Any
 
@@ -11,6 +10,7 @@ from mavfi_cli.link.transport import Transport
 from sitl.autopilot.autopilot import COMPONENT, Autopilot
 from sitl.autopilot.streams import Preset
 from sitl.camera.component import COMPONENT_ID as CAMERA
+from sitl.peers import Peer
 from sitl.server.simulation import Simulation
 
 _COMMANDS = (dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT)
@@ -22,7 +22,7 @@ _FRAMES = (
 _OVERHEARD = 10  # number of newest texts to keep
 
 
-class Client:
+class Client(Peer):
     """Turns bytes of one connection into calls of the simulation, and messages into bytes.
 
     Depth frames go to the clients that started the capture. All clients get the camera's
@@ -31,19 +31,17 @@ class Client:
     Attributes:
         overheard: frames of received STATUSTEXTs for the other clients, unchanged, as an
             autopilot forwards its companion's texts to the ground station.
-        heard_s: `time.monotonic` of the newest valid frame, at first of the client's arrival.
     """
 
     def __init__(
         self,
         simulation: Simulation,
         transport: Transport,
-        preset: Preset,
         *,
+        preset: Preset,
         signing: Signing | None = None,
     ) -> None:
-        self.transport = transport
-        self.heard_s = time.monotonic()
+        super().__init__(transport)
         self._simulation = simulation
         self._preset = preset
         self._link = simulation.autopilot.open_link(preset)
@@ -61,7 +59,7 @@ class Client:
     def close(self) -> None:
         """Leave the autopilot and release the connection."""
         self._simulation.autopilot.close_link(self._link)
-        self.transport.close()
+        super().close()
 
     def receive(self, timeout_s: float) -> list[Any]:
         """Handle the next bytes, waiting at most `timeout_s`; return the handled messages.
@@ -71,20 +69,10 @@ class Client:
         """
         with self._simulation.wall.measure("wait"):
             data = self.transport.receive(timeout_s)
-        return self._take(data) if data else []
+        return self.take(data) if data else []
 
-    def hear(self) -> bool:
-        """Handle a few waiting bytes. Return True if there were any.
-
-        Raises:
-            LinkLost: The peer is gone.
-        """
-        data = self.transport.receive(0.0)
-        if data and self._take(data):
-            self.heard_s = time.monotonic()
-        return bool(data)
-
-    def _take(self, data: bytes) -> list[Any]:
+    def take(self, data: bytes) -> list[Any]:
+        """Handle received bytes; return the handled messages."""
         with self._simulation.wall.measure("link"):
             messages = self._codec.decode(data, datagram=self.transport.datagram)
             for message in messages:
@@ -123,11 +111,6 @@ class Client:
     def send_answers(self) -> None:
         """Send answers without waiting for the tick."""
         self._send([], self._simulation.autopilot.take_outbox(self._link))
-
-    def forward(self, *, frame: bytes, of: Client) -> None:
-        """Send a frame of another client unchanged."""
-        if of is not self:
-            self.transport.send(frame)
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
         """Send messages of both components; the camera's answers are the first."""

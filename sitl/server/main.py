@@ -7,11 +7,9 @@ has sent SET_POSITION_TARGET_LOCAL_NED with the same time_boot_ms.
 
 from __future__ import annotations
 
-import select
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,15 +18,16 @@ import click
 
 from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
-from mavfi_cli.link.codec import Signing, begins_with_frame, dialect, key_from_file
+from mavfi_cli.link.codec import Signing, dialect, key_from_file
 from mavfi_cli.link.endpoint import parse_endpoint
-from mavfi_cli.link.transport import Listener, memory_pair, open_listener, open_transport
+from mavfi_cli.link.transport import memory_pair, open_transport
 from sitl.autopilot.streams import STEP_US, TICK_US, Preset
 from sitl.briefing import write_briefing
 from sitl.command_line import exit_code, stop_on_signals
 from sitl.control.cascade import control_step
 from sitl.firmware.simulation import FirmwareSimulation
 from sitl.firmware.start import PARAMETERS, open_firmware
+from sitl.peers import Peers
 from sitl.server.client import Client
 from sitl.server.options import ServerOptions, parse
 from sitl.server.simulation import Simulation
@@ -38,7 +37,6 @@ from sitl.world import load_world
 _PATIENCE_S = 0.5
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
 _LOOK_UP_S = 0.2  # interval at which a silent wait checks for a stop
-_SILENCE_S = 30.0  # time after which a UDP client that says nothing valid is forgotten
 _SHARE = 0.25  # share of a tick's time that clients get when the tick is overdue
 
 
@@ -71,7 +69,7 @@ def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[
     Raises:
         VehicleProcessError: The companion gave no answer within the limit.
     """
-    client = Client(simulation, open_transport(f"fd:{options.fd}"), Preset.LOCKSTEP)
+    client = Client(simulation, open_transport(f"fd:{options.fd}"), preset=Preset.LOCKSTEP)
     pace = None if options.speed is None else _Pace(options.speed)
     try:
         while not stopped():
@@ -136,7 +134,7 @@ class _EmbeddedVehicle:
     def __init__(self, simulation: Simulation, truth_folder: Path) -> None:
         self._simulation = simulation
         self.link, end = memory_pair("the simulated vehicle")
-        self._client = Client(simulation, end, Preset.LOCKSTEP)
+        self._client = Client(simulation, end, preset=Preset.LOCKSTEP)
         self._begun = self._ended = False
         self.truth_folder = truth_folder
         self.error: Exception | None = None
@@ -184,28 +182,18 @@ class _EmbeddedVehicle:
         self._simulation.save_truth(self.truth_folder)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Door:
-    """An endpoint for clients, and their preset."""
-
-    listener: Listener
-    preset: Preset
-    signing: Signing | None  # one for all clients, so that no frame counts twice
-    forgets: bool  # silent clients leave
-    ends_with_peer: bool  # an inherited connection; the server ends with it
-
-
 class _Realtime:
     """The clients of a simulation that is paced by the wall clock, any number of them."""
 
     def __init__(self, options: ServerOptions, simulation: Simulation) -> None:
         self._options = options
         self._simulation = simulation
-        self._doors: list[_Door] = []
         self._pace = _Pace(options.speed or 1.0)
-        self._clients: list[tuple[Client, _Door]] = []
-        self._turns = 0
-        self._over = False
+        file = options.key_file  # one signing for all clients, so that no frame counts twice
+        self._signing = None if file is None else Signing(key_from_file(file), clock=time.time)
+        self._clients: Peers[Client] = Peers(
+            signing=self._signing, allow_unsigned=options.allow_unsigned
+        )
         self._told_collision = False
 
     def open(self) -> None:
@@ -213,32 +201,23 @@ class _Realtime:
 
         Raises:
             EndpointError: One of them cannot be opened.
-            ConfigError: The file of the signing key cannot be read.
         """
-        file, allowed = self._options.key_file, self._options.allow_unsigned
-        signing = None if file is None else Signing(key_from_file(file), clock=time.time)
-        admits = begins_with_frame if signing is None else signing.vouches
         for preset, url in self._options.links:
-            scheme = parse_endpoint(url).scheme
-            listener = open_listener(
-                url, signed=signing is not None, allow_unsigned=allowed, admits=admits
+            inherited = parse_endpoint(url).scheme == "fd"
+            signing = None if inherited else self._signing
+            self._clients.open(
+                url, partial(Client, self._simulation, preset=preset, signing=signing)
             )
-            inherited = scheme == "fd"
-            door = _Door(
-                listener=listener, preset=preset, signing=None if inherited else signing,
-                forgets=scheme == "udpin", ends_with_peer=inherited,
-            )  # fmt: skip
-            self._doors.append(door)
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Run until stopped, or until an inherited connection closes."""
         self._simulation.begin(stopped)
         if (kind := self._options.firmware_kind) is not None and not stopped():
             click.echo(f"{kind.value} is ready: clients may connect", err=True)
-        self._welcome()
-        while not stopped() and not self._over:
-            self._each(Client.send_tick)
-            if any(client.is_fast for client, _ in self._clients):
+        self._clients.serve(until_s=0.0)
+        while not stopped() and not self._clients.over:
+            self._clients.each(Client.send_tick)
+            if any(client.is_fast for client in self._clients):
                 self._serve(STEP_US, stopped)
                 self._simulation.advance(partial(self._between, stopped=stopped))
             else:
@@ -250,12 +229,12 @@ class _Realtime:
 
     def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
         """Send the fast streams at a stamp within a tick, and wait for the next step."""
-        self._each(partial(Client.send_between, stamp_us=stamp_us))
+        self._clients.each(partial(Client.send_between, stamp_us=stamp_us))
         self._serve(STEP_US, stopped)
 
     def _restart(self) -> None:
         self._simulation.restart()
-        self._each(Client.rejoin)
+        self._clients.each(Client.rejoin)
         self._told_collision = False
         click.echo("restarted")
 
@@ -267,11 +246,8 @@ class _Realtime:
             click.echo(f"{collision.text}; the vehicle stays there until a client reboots it")
 
     def close(self) -> None:
-        """Close every client and door."""
-        for client, _ in self._clients:
-            client.close()
-        for door in self._doors:
-            door.listener.close()
+        """Close every client and endpoint."""
+        self._clients.close()
 
     def _serve(self, duration_us: int, stopped: Callable[[], bool]) -> None:
         """Answer clients for a part of the tick; at least once, also if it is overdue.
@@ -282,69 +258,19 @@ class _Realtime:
         share_s = _SHARE * duration_us * 1e-6 / self._pace.speed
         until_s = time.monotonic() + max(self._pace.remaining_s(), share_s)
         while True:
-            self._wait(max(self._pace.remaining_s(), 0.0))
-            self._welcome()
-            self._hear(until_s)
+            self._clients.wait(max(self._pace.remaining_s(), 0.0))
+            self._clients.serve(until_s)
             self._forward()
-            self._each(Client.send_answers)
-            if self._pace.remaining_s() <= 0.0 or stopped() or self._over:
+            self._clients.each(Client.send_answers)
+            if self._pace.remaining_s() <= 0.0 or stopped() or self._clients.over:
                 break
-        self._forget_silent()
-
-    def _hear(self, until_s: float) -> None:
-        """Handle the bytes of all clients by turns, until nothing waits or the time is over."""
-        quiet = 0
-        while quiet < len(self._clients) and time.monotonic() < until_s:
-            self._turns = (self._turns + 1) % len(self._clients)
-            client, door = self._clients[self._turns]
-            heard = self._try(Client.hear, client, door)
-            quiet = 0 if heard else quiet + 1
-
-    def _forget_silent(self) -> None:
-        since_s = time.monotonic() - _SILENCE_S
-        for client, door in list(self._clients):
-            if door.forgets and client.heard_s < since_s:
-                self._remove(client, door)
 
     def _forward(self) -> None:
         """Forward the status texts of each client to all others."""
-        for speaker, _ in list(self._clients):
+        for speaker in self._clients:
             while speaker.overheard:
-                self._each(partial(Client.forward, frame=speaker.overheard.popleft(), of=speaker))
-
-    def _wait(self, timeout_s: float) -> None:
-        poller = select.poll()
-        descriptors = {door.listener.fileno() for door in self._doors}
-        descriptors |= {client.transport.fileno() for client, _ in self._clients}
-        for descriptor in descriptors:
-            if descriptor >= 0:  # a door with one peer closes with it
-                poller.register(descriptor, select.POLLIN)
-        poller.poll(timeout_s * 1e3)
-
-    def _welcome(self) -> None:
-        for door in self._doors:
-            for transport in door.listener.accept_ready():
-                client = Client(self._simulation, transport, door.preset, signing=door.signing)
-                self._clients.append((client, door))
-                self._try(Client.hear, client, door)  # else a copy of its frame is as new
-
-    def _each(self, action: Callable[[Client], object]) -> None:
-        """Call a function with every client, and remove disconnected ones."""
-        for client, door in list(self._clients):
-            self._try(action, client, door)
-
-    def _try(self, action: Callable[[Client], object], client: Client, door: _Door) -> object:
-        """Call a function with a client. Remove a disconnected one, and return None."""
-        try:
-            return action(client)
-        except LinkLost:
-            self._remove(client, door)
-            self._over = self._over or door.ends_with_peer
-            return None
-
-    def _remove(self, client: Client, door: _Door) -> None:
-        client.close()
-        self._clients.remove((client, door))
+                frame = speaker.overheard.popleft()
+                self._clients.each(partial(Client.forward, frame=frame, of=speaker))
 
 
 def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:

@@ -362,7 +362,7 @@ def test_a_udp_port_keeps_its_first_valid_sender_until_that_is_silent(
         near.send(b"answer")
         assert first.receive(1.0) == b"answer"
         assert second.receive(0.0) == stranger.receive(0.0) == b""
-        monkeypatch.setattr(near, "_silent_from_s", 0.0)
+        monkeypatch.setattr(near._seat, "_silent_from_s", 0.0)  # type: ignore[attr-defined]
         second.send(frame[1])
         assert near.receive(1.0) == frame[1]
         near.send(b"answer")
@@ -385,3 +385,32 @@ def test_a_signed_udp_port_takes_no_unsigned_sender() -> None:
     finally:
         near.close()
         far.close()
+
+
+@pytest.mark.parametrize(
+    ("component", "outlived", "is_rival"),
+    [
+        pytest.param(1, True, True, id="two autopilots"),
+        pytest.param(1, False, False, id="an autopilot that restarts at another port"),
+        pytest.param(190, True, False, id="a ground station"),
+    ],
+)
+def test_a_udp_port_tells_a_second_autopilot(
+    component: int, outlived: bool, is_rival: bool
+) -> None:
+    near = open_transport("udpin:127.0.0.1:0")
+    url = f"udpout:127.0.0.1:{near.port}"  # type: ignore[attr-defined]
+    first, second = (open_transport(url) for _ in range(2))
+    try:
+        first.send(Codec(1, 1).encode(HEARTBEAT))
+        second.send(Codec(1, component).encode(HEARTBEAT))
+        assert near.receive(1.0)
+        assert near.receive(0.1) == b""
+        if outlived:
+            first.send(Codec(1, 1).encode(HEARTBEAT))
+            assert near.receive(1.0)
+        port = second._socket.getsockname()[1]  # type: ignore[attr-defined]
+        assert near.rival_address == (f"127.0.0.1:{port}" if is_rival else "")
+    finally:
+        for each in (near, first, second):
+            each.close()

@@ -145,6 +145,20 @@ def test_a_second_autopilot_on_the_link_is_told_before_take_off(autopilot_on_udp
     assert not fake.armed
 
 
+@pytest.mark.parametrize("eyes", [False, True])
+def test_a_second_autopilot_at_another_address_is_told_before_take_off(
+    autopilot_on_udp, fly_short, eyes
+):
+    """Both are system 1, as two simulators are that somebody has started at once."""
+    fakes = FakePX4(), FakePX4()
+    _, url = autopilot_on_udp(fakes[0], camera=not eyes)
+    autopilot_on_udp(fakes[1], camera=False)
+    place = r"127\.0\.0\.1:\d+"
+    with pytest.raises(UnfitAutopilot, match=f"two autopilots send here, {place} and {place}"):
+        fly_short(link=url, **(EYES if eyes else {}))
+    assert not any(fake.armed for fake in fakes)
+
+
 @pytest.mark.parametrize(
     ("kind", "autopilot", "said"),
     [

@@ -322,14 +322,15 @@ def test_nothing_is_saved_of_a_vehicle_that_was_never_seen(tmp_path: Path) -> No
 def test_a_second_companion_joins_where_the_first_was(tmp_path: Path) -> None:
     """Neither takes the other's place, and a stranger's bytes are no peer."""
     with contextlib.closing(Router(["udpin:127.0.0.1:0"])) as router:
-        port = router._doors[0].listener.port  # type: ignore[attr-defined]
+        port = router.peers._endpoints[0][1].port  # type: ignore[attr-defined]
         heard: list[Any] = []
+        router.take = lambda message: bool(heard.append(message.get_srcSystem()))
         for name in (1, 2):
             far = open_transport(f"udpout:127.0.0.1:{port}")
             far.send(b"\xfd no frame")
             far.send(Codec(name, 191).encode(heartbeat(8)))
-            router.wait(1.0)
-            router.serve(lambda message: bool(heard.append(message.get_srcSystem())))
+            router.peers.wait(1.0)
+            router.serve()
             far.close()
         assert heard == [1, 2]
-        assert len(router._peers) == 2
+        assert len(list(router.peers)) == 2
