@@ -135,6 +135,11 @@ class OffboardSession:
         """Newest vehicle state in ENU; None before position and attitude are known."""
         return self.telemetry.state
 
+    @property
+    def is_up(self) -> bool:
+        """True if the vehicle is in the air, or was at the take-off height."""
+        return self._was_up or self.telemetry.in_air
+
     def state_at(self, stamp_s: float) -> VehicleState | None:
         """Return the state at a stamp, exact or interpolated; None outside the last ten seconds."""
         return self.telemetry.history.at(stamp_s)

@@ -21,7 +21,13 @@ from mavfi_cli.autonomy.planners.base import Planner
 from mavfi_cli.companion.injection import NoInjection, SourceInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection, Protection
-from mavfi_cli.core.errors import Interrupted, LinkLost, NoAutopilot
+from mavfi_cli.core.errors import (
+    CommandRefused,
+    Interrupted,
+    LinkError,
+    LinkLost,
+    NoAutopilot,
+)
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Message, dialect
@@ -103,7 +109,7 @@ class Flight:
         self.end_s = 0.0
         self.outcome: Outcome | None = None
         self.reason = ""
-        self._lands = False
+        self._lands = self._landing = False
 
     def _new_session(self, telemetry: Telemetry | None = None) -> OffboardSession:
         settings = SessionSettings(
@@ -199,7 +205,7 @@ class Flight:
         """Fly until the mission has an outcome.
 
         Raises:
-            CommandRefused: The autopilot refused to arm, take off or change its mode.
+            CommandRefused: The autopilot refused to arm or to take off.
             RecordError: The tlog could not be written.
         """
         with self.link.recording(tlog):
@@ -213,19 +219,29 @@ class Flight:
                 self.end_s = self.stamp_s if self.outcome is None else self.end_s
 
     def _finished(self) -> bool:
-        if self._session.failure is not None and self._session.failure is not self._landing_failed:
-            raise self._session.failure
+        if self._session.failure is not None and self.outcome is None:
+            self._take_refusal(self._session.failure)
         if self.outcome is None:
             return False
         if not (self._config.land and self._lands) or len(self._interrupts) > 1:
             return True
-        self._session.request_land()
+        if not self._landing:
+            self._landing = True
+            self._session.request_land()
+        elif self._session.phase is Phase.FAILED:
+            refusal = str(self._session.failure)
+            self.logger.note(self.stamp_s, "autopilot", refusal, self._session.state)
         return self._session.phase in (Phase.DONE, Phase.FAILED)
 
-    @property
-    def _landing_failed(self) -> Exception | None:
-        """Return the error of a failed landing, which does not change the mission's outcome."""
-        return self._session.failure if self.outcome is not None else None
+    def _take_refusal(self, failure: LinkError) -> None:
+        """End the mission because the autopilot refuses a command in the air, and land.
+
+        Raises:
+            LinkError: The vehicle is on the ground, or nothing was refused.
+        """
+        if not (isinstance(failure, CommandRefused) and self._session.is_up):
+            raise failure
+        self.end(Outcome.FAILSAFE, str(failure), lands=True)
 
     def end(self, outcome: Outcome, reason: str = "", *, lands: bool = False) -> None:
         """Set the outcome of the mission. Later calls have no effect.

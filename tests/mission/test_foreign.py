@@ -326,6 +326,76 @@ def test_a_failsafe_is_told_in_the_autopilot_s_terms(autopilot_on_udp, fly_short
     assert any("battery" in event["text"] for event in run.result["events"])
 
 
+@pytest.fixture
+def briefly_waited(monkeypatch):
+    """Nobody waits longer than 3 s for a take-off or a landing."""
+    settings = flight.SessionSettings
+    monkeypatch.setattr(
+        flight,
+        "SessionSettings",
+        lambda **o: settings(takeoff_timeout_s=6.0, land_timeout_s=6.0, **o),
+    )
+
+
+def test_a_command_refused_in_the_air_is_recorded_and_the_vehicle_lands(
+    autopilot_on_udp, fly_short
+):
+    autopilot = FakePX4()
+    autopilot.refuse_offboard = True
+    _, url = autopilot_on_udp(autopilot)
+    run = load_run(fly_short(link=url, land=True).path)
+    assert run.result["outcome"] == "failsafe"
+    reason = run.result["reason"]
+    assert reason.startswith("autopilot refused mode OFFBOARD: ")
+    assert "Switching to Offboard is currently not available" in reason
+    assert run.result["quality_of_flight"]["flight_time_s"] is None
+    assert max(event["position_enu_m"][2] for event in run.result["events"][2:]) > 4.0
+    assert [e["text"] for e in run.result["events"] if e["kind"] == "phase"][-2:] == [
+        "landing", "done",
+    ]  # fmt: skip
+    assert not autopilot.armed
+
+
+def test_a_climb_that_stops_is_recorded_and_the_vehicle_lands(
+    autopilot_on_udp, fly_short, at_event, briefly_waited
+):
+    autopilot = FakeArduCopter()
+    _, url = autopilot_on_udp(autopilot)
+    climb = autopilot._move
+
+    def stuck():
+        climb()
+        autopilot.position_enu_m[2] = min(autopilot.position_enu_m[2], 2.0)
+
+    autopilot._move = stuck
+    run = load_run(fly_short(link=url, land=True).path)
+    assert run.result["outcome"] == "failsafe"
+    assert run.result["reason"].startswith("autopilot refused take-off: height not reached")
+    assert not autopilot.armed
+
+
+def test_a_landing_that_is_refused_too_is_told_and_ends_the_mission(
+    autopilot_on_udp, fly_short, briefly_waited
+):
+    autopilot = FakePX4()
+    autopilot.refuse_offboard = True
+    command = autopilot._command
+
+    def never_down(message):
+        if message.command == dialect.MAV_CMD_NAV_LAND:
+            autopilot._ack(message.command, dialect.MAV_RESULT_DENIED)
+        else:
+            command(message)
+
+    autopilot._command = never_down
+    _, url = autopilot_on_udp(autopilot)
+    result = load_run(fly_short(link=url, land=True).path).result
+    assert (result["outcome"], result["reason"][:31]) == (
+        "failsafe", "autopilot refused mode OFFBOARD",
+    )  # fmt: skip
+    assert result["events"][-1]["text"] == "autopilot refused landing: denied"
+
+
 def test_garbage_on_the_link_does_not_disturb_the_flight(autopilot_on_udp, fly_short):
     link, url = autopilot_on_udp(FakePX4())
     rng = np.random.default_rng(1)

@@ -207,7 +207,7 @@ def a_trace():
 
 
 TRUTH = {
-    "stamp_s": np.array([0.0, 0.02, 0.06]), "position_enu_m": np.arange(9.0).reshape(3, 3),
+    "stamp_s": np.array([0.0, 0.02, 0.16]), "position_enu_m": np.arange(9.0).reshape(3, 3),
     "velocity_enu_mps": np.zeros((3, 3)), "clearance_m": np.array([9.0, 8.0, 7.0]),
     "power_regression_w": np.ones(3), "power_propeller_w": np.ones(3),
 }  # fmt: skip
@@ -252,6 +252,16 @@ def test_truth_between_two_ticks_is_interpolated():
     ticks["clearance_m"] = np.array([1.0, np.inf, np.inf])
     _, second = a_trace().table(ticks).to_pylist()
     assert (second["truth_x_m"], second["truth_z_m"]) == pytest.approx((1.25, 4.0))
+
+
+@pytest.mark.parametrize(("gap_s", "is_known"), [(0.024, True), (0.099, True), (0.102, False)])
+def test_truth_is_null_in_a_long_silence_of_the_referee(gap_s, is_known):
+    """PX4's own simulator tells its attitude every 16 or 24 ms."""
+    stamps = a_trace().table(None)["stamp_s"].to_pylist()
+    ticks = {name: np.repeat(column[:1], 2, axis=0) for name, column in TRUTH.items()}
+    ticks["stamp_s"] = stamps[1] + gap_s * np.array([-0.5, 0.5])
+    _, second = a_trace().table(ticks).to_pylist()
+    assert (second["truth_x_m"] is not None) == is_known
 
 
 def test_a_trace_of_nothing_is_a_table_all_the_same(tmp_path):
