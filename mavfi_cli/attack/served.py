@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.core.processes import receive, send
+from mavfi_cli.core.processes import PYTHON, receive, send
 from mavfi_cli.fi.tracer import linux
 
 CHANNEL = 3  # file descriptor of the program's end of the socket
@@ -63,8 +63,7 @@ class ServedProcess:
             (os.POSIX_SPAWN_DUP2, self._errors, 2),
             (os.POSIX_SPAWN_DUP2, theirs.fileno(), CHANNEL),
         ]
-        # -P: the working directory must not decide what is imported, and so the memory layout.
-        line = [sys.executable, "-P", "-m", self._module]
+        line = [*PYTHON, "-m", self._module]  # what is imported decides the memory layout
         self._started_ns = time.clock_gettime_ns(_FILE_CLOCK)
         with theirs, linux.fixed_addresses():
             self.pid = os.posix_spawn(

@@ -135,7 +135,7 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 @campaign.command()
 @click.argument("what", metavar="WHAT")
 @click.option("--item", metavar="ITEM",
-              help="Figure or table of the paper, such as fig12 of table4; needed for the folder "
+              help="Figure or table of the paper, such as fig12 of table4; needed in the folder "
                    "of `mavfi reproduce`  [that of the preset].")  # fmt: skip
 @click.option("--format", "form", type=click.Choice(["text", "markdown", "latex", "csv"]),
               default="text", show_default=True, help="Format of the table.")  # fmt: skip

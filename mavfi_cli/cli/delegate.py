@@ -7,6 +7,8 @@ import sys
 
 import click
 
+from mavfi_cli.core.processes import PYTHON
+
 
 def _delegate(name: str, module: str) -> click.Command:
     @click.command(
@@ -19,7 +21,7 @@ def _delegate(name: str, module: str) -> click.Command:
         """Become `python -m module arguments`, with its streams, signals and exit code."""
         sys.stdout.flush()
         sys.stderr.flush()
-        os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
+        os.execv(sys.executable, [*PYTHON, "-m", module, *arguments])
 
     return command
 

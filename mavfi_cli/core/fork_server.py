@@ -46,7 +46,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.processes import fork
+from mavfi_cli.core.processes import PYTHON, fork
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 # What ps calls them.
@@ -118,7 +118,7 @@ class ForkServer:
             return self._control
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
-            line = [sys.executable, "-m", "mavfi_cli.core.fork_server", str(theirs.fileno())]
+            line = [*PYTHON, "-m", "mavfi_cli.core.fork_server", str(theirs.fileno())]
             self._process = subprocess.Popen(
                 [*line, self._module],
                 stdin=subprocess.DEVNULL,

@@ -8,8 +8,12 @@ import os
 import pickle
 import signal
 import socket
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
+
+PYTHON = (sys.executable, "-P")
+"""This interpreter, which imports nothing from the working directory: that is the user's."""
 
 _LENGTH = 8
 _libc = ctypes.CDLL(None)

@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mavfi_cli.core.processes import PYTHON
+
 OK = "ok"
 LIMITED = "limited"  # flying works, but something else does not
 FAILED = "failed"  # flying does not work
@@ -137,7 +139,7 @@ def _physics() -> Check:
     """Start the vehicle's process, which loads JSBSim and its compiled kernels."""
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
-            [sys.executable, "-c", _LOAD_VEHICLE], capture_output=True, text=True, cwd=folder,
+            [*PYTHON, "-c", _LOAD_VEHICLE], capture_output=True, text=True, cwd=folder,
             timeout=120.0, check=False,
         )  # fmt: skip
     if run.returncode == 0:

@@ -14,7 +14,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, VehicleProcessError
+from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import Transport, open_transport
@@ -83,7 +83,7 @@ class VehicleProcess:
         self.folder = folder
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        line = [sys.executable, "-m", *self._line(config, theirs.fileno())]
+        line = [*PYTHON, "-m", *self._line(config, theirs.fileno())]
         with theirs:
             try:
                 self._process = subprocess.Popen(

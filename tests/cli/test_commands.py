@@ -162,6 +162,14 @@ def test_sitl_errors_pass_through(command_line):
     assert command_line("sitl", "--speed", "-1")[0] == 2
 
 
+def test_modules_of_the_user_are_not_imported(command_line, tmp_path):
+    for name in ("attrs", "click", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('imported')")
+    for line in (("world", "list"), ("sitl", "--help")):
+        code, _, err = command_line(*line)
+        assert (code, err) == (0, "")
+
+
 # doctor --------------------------------------------------------------------------------------
 
 

@@ -54,6 +54,13 @@ def test_a_worker_has_its_own_end_report_and_surroundings(server, tmp_path, task
         assert gone((tmp_path / "left" / "orphan").read_text())
 
 
+def test_a_module_of_the_user_is_not_imported(server, tmp_path, monkeypatch):
+    (tmp_path / "tempfile.py").write_text("raise RuntimeError('imported')")
+    monkeypatch.chdir(tmp_path)
+    _, ended = heard(server.start({}, tmp_path, LONG_S))
+    assert ended["exit"] == 0
+
+
 def test_a_defect_is_reported_with_its_traceback(server, tmp_path):
     _, ended = heard(server.start({"defect": True}, tmp_path, LONG_S))
     assert ended["report"]["traceback"].endswith("ZeroDivisionError\n")
