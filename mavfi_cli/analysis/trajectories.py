@@ -9,10 +9,11 @@ from typing import Any
 
 from mavfi_cli.analysis.groups import TREATMENT, untreated
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import COUNTED, Injected, MissionResult, ResultState, label_text
+from mavfi_cli.campaigns.missions import COUNTED, Injected, MissionResult, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.record.measures import fields_of
 from mavfi_cli.mission.record.run_folder import RESULT
+from mavfi_cli.spec.mission import MissionConfig
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 
@@ -29,10 +30,10 @@ def pair(
         among: numbers of the missions to choose from and to draw; None means all.
 
     Returns:
-        `panels`: a row a fault with its `title`, what is struck, empty of golden flights; and its
-        `flights`, golden ones first, protected ones last: `number` of the mission, `name` of its
-        setting, as short as tells it from the others beside it, `outcome`, `flight_time_s`, and the
-        `path` of its run folder. `absent`: what is not in the picture, and why, a line each.
+        `panels`: a row a fault with its `title`, the fault in words, empty of golden flights; and
+        its `flights`, golden ones first, protected ones last: `number` of the mission, `name` of
+        its setting, as short as tells it from the others beside it, `outcome`, `flight_time_s`, and
+        the `path` of its run folder. `absent`: what is not in the picture, and why, a line each.
 
     Raises:
         ConfigError: the list has no such mission.
@@ -112,17 +113,12 @@ def _panels(flown: Sequence[MissionResult]) -> list[dict[str, Any]]:
             struck.setdefault(untreated(each.mission.labels), []).append(each)
     if not struck:
         return [_panel("", golden)]
-    faults = [those[0].mission.labels for those in struck.values()]
-    labels = faults if len(faults) > 1 else [each.mission.labels for each in flown]
-    shared = set.intersection(*(set(each.items()) for each in labels))
-    hidden = {*TREATMENT, *(name for name, _ in shared)}
-    titles = [
-        label_text({name: value for name, value in each.items() if name not in hidden})
-        for each in faults
-    ]
-    return [
-        _panel(title, golden + those) for title, those in zip(titles, struck.values(), strict=True)
-    ]
+    return [_panel(_fault(those[0].mission.config), golden + those) for those in struck.values()]
+
+
+def _fault(config: MissionConfig) -> str:
+    asked = config.fault or config.instruction
+    return "" if asked is None else asked.words()
 
 
 def _panel(title: str, flown: Sequence[MissionResult]) -> dict[str, Any]:
@@ -141,7 +137,7 @@ def _panel(title: str, flown: Sequence[MissionResult]) -> dict[str, Any]:
         "flights": [
             {
                 "number": each.number,
-                "name": name if often[name] == 1 else f"{name} {_treatment(each)}".rstrip(),
+                "name": name if often[name] == 1 else ", ".join([name, *_treatment(each)]),
                 "outcome": each.outcome,
                 "flight_time_s": fields_of(each.result)["flight_time_s"],
                 "path": each.path,
@@ -162,7 +158,8 @@ def _setting(each: MissionResult) -> str:
     return told if watched is None else f"{told}, {watched.name}"
 
 
-def _treatment(each: MissionResult) -> str:
+def _treatment(each: MissionResult) -> list[str]:
     """The rest of its treatment, to tell settings of one name apart."""
     labels = each.mission.labels
-    return ", ".join(str(labels[name]) for name in TREATMENT[1:] if labels.get(name) is not None)
+    told = [str(labels[name]) for name in TREATMENT[1:] if labels.get(name) is not None]
+    return ["no detector" if name == "none" else name for name in told]

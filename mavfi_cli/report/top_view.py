@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ from mavfi_cli.report.drawing import (
     new_figure,
     open_frame,
 )
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,6 +50,7 @@ _LABELS = {
 }
 _WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # line widths in points, so that equal paths stay visible
 _COLUMNS = 3
+_TITLE = 66  # characters in a line of a title
 _MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # offset from the position, points
 _BESIDE = 11.0  # points between marks at the same position
 _PLANS = 6  # the newest plans, which one can tell apart
@@ -280,7 +283,7 @@ def _caption(figure: Figure, axes: Axes, flight: FlightRecord) -> None:
 
 
 def _treatment(flight: FlightRecord) -> list[str]:
-    """Return the fault and the detector of a flight in one line; nothing if it has neither."""
+    """Return the fault and the detector of a flight; nothing if it has neither."""
     told = []
     if fault := flight.fault:
         what = _struck(fault)
@@ -289,17 +292,15 @@ def _treatment(flight: FlightRecord) -> list[str]:
     if detection := flight.detection:
         count = detection["alarm_count"]
         told.append(f"detector: {detection['detector']}, {count or 'no'} alarm{'s'[count == 1 :]}")
-    return ["; ".join(told)] if told else []
+    return textwrap.wrap("; ".join(told), _TITLE)
 
 
 def _struck(fault: Mapping[str, Any]) -> str:
-    """Return what a fault was to strike."""
+    """Return the fault in words, with the state or the node that was drawn."""
     if fault["level"] == "instruction":
-        return f"an instruction of the {fault['node']} node"
-    if fault["stage"] == "process":
-        return f"the process of {', '.join(fault['states'])} is killed"
+        return InstructionConfig(**fault["request"]).words(fault["node"])
     states = fault["states"]
-    return states[0] if len(states) == 1 else f"{fault['request']['target']} ({len(states)} states)"
+    return FaultConfig(**fault["request"]).words(states[0] if len(states) == 1 else None)
 
 
 # Flights of one mission: golden, with a fault, protected ---------------------------------------
@@ -386,7 +387,8 @@ def _draw_panel(
     _draw_panel_marks(figure, axes, panel, colours)
     _frame(axes, first.world, everywhere)
     if panel.title:
-        axes.set_title(f"fault: {panel.title}", fontsize=9.5, loc="left")
+        title = textwrap.fill(f"fault: {panel.title}", _TITLE)
+        axes.set_title(title, fontsize=9.5, loc="left")
     axes.legend(
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, fontsize=8
     )

@@ -10,6 +10,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import presets
 from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.report.tables.campaign import SettingColumns
 from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.reproduction.evidence import items_of_preset, table_of_item
 from mavfi_cli.reproduction.flying import stored_plan
@@ -19,6 +20,8 @@ from mavfi_cli.reproduction.missions import key_of, missions_of, numbers_of
 from mavfi_cli.stats.shares import rate
 
 ROWS = 14  # of a table on one screen
+WIDE = 2  # columns of settings on one screen
+SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
 def preset_of(ledger: Ledger) -> str | None:
@@ -67,17 +70,18 @@ def settings_table(ledger: Ledger) -> PaperTable:
               "energy_regression_j": ("energy, kJ", 1e-3), "replans": ("replans", 1.0)}  # fmt: skip
     assert tuple(scales) == METRICS
     found = groups(ledger)
+    settings = SettingColumns.of([group.labels for group in found])
     return PaperTable(
-        name="settings",
+        name=SETTINGS,
         title=f"{ledger.meta('name') or ledger.folder.name}: settings",
-        labels=("setting",),
+        labels=settings.heads,
         columns=(
             PaperColumn(title="success, %", ends=0),
             *(PaperColumn(title=title) for title, _ in scales.values()),
         ),
         rows=tuple(
             PaperRow(
-                labels=(group.name,),
+                labels=tuple(settings.cells(group.labels, group.name)),
                 cells=(
                     _success(group),
                     *(mean_cell(scale * group.successes(name))
@@ -86,7 +90,10 @@ def settings_table(ledger: Ledger) -> PaperTable:
             )
             for group in found
         ),
-        notes=("success: golden missions and faults that struck; means: the successful of them",),
+        notes=(
+            *settings.told(),
+            "success: golden missions and faults that struck; means: the successful of them",
+        ),
     )  # fmt: skip
 
 
@@ -120,11 +127,18 @@ def _progress_table(ledger: Ledger) -> PaperTable:
 
 
 def short(table: PaperTable) -> PaperTable:
-    """The table cut to one screen."""
-    if len(table.rows) <= ROWS:
+    """The table cut to one screen: its first rows, and of settings the first columns."""
+    wide = len(table.columns) if table.name != SETTINGS else WIDE
+    left = [column.title.partition(",")[0] for column in table.columns[wide:]]
+    left += [f"{len(table.rows) - ROWS} more rows"] if len(table.rows) > ROWS else []
+    if not left:
         return table
-    more = f"and {len(table.rows) - ROWS} more rows: mavfi campaign report"
-    return replace(table, rows=table.rows[:ROWS], notes=(more, *table.notes))
+    return replace(
+        table,
+        columns=table.columns[:wide],
+        rows=tuple(replace(row, cells=row.cells[:wide]) for row in table.rows[:ROWS]),
+        notes=(f"mavfi campaign report has {', '.join(left)}", *table.notes),
+    )
 
 
 def progress_lines(ledger: Ledger) -> list[str]:

@@ -76,6 +76,34 @@ class FaultConfig:
         """Array of the detector's memory to corrupt; None to draw one."""
         return self.target.partition(".")[2] or None
 
+    def words(self, struck: str | None = None) -> str:
+        """The fault as a title says it, such as "an exponent bit of waypoint x, stuck-at".
+
+        Args:
+            struck: the state that was drawn from the target; None if none was.
+        """
+        if self.killed_node is not None:
+            what = f"the process of {self.killed_node} is killed"
+        elif self.effect == Effect.FLIP.value:
+            what = f"{self._bits()} of {self._place(struck or self.target)}"
+        else:
+            change = {Effect.ZERO.value: "set to zero", Effect.RANDOM.value: "drawn anew"}
+            what = f"{self._place(struck or self.target)} {change[self.effect]}"
+        held = [self.persistence] if self.persistence != Persistence.TRANSIENT.value else []
+        when = [f"at {self.at.replace('=', ' ')}"] if self.at != When.RANDOM.value else []
+        return ", ".join([what.replace("_", " "), *held, *when])
+
+    def _bits(self) -> str:
+        if self.exact_bits:
+            numbers = " and ".join(map(str, self.exact_bits))
+            return f"bit{'s'[len(self.exact_bits) == 1 :]} {numbers}"
+        return bits_in_words(self.bits, self.field)
+
+    def _place(self, target: str) -> str:
+        where = target.partition(".")[2] if self.strikes_queue else target
+        what = f"each component of {where}" if self.together else where
+        return f"{what} in control's queue" if self.strikes_queue else what
+
     def check(self) -> None:
         """Validate the configuration. Raises as `draw`."""
         if self.killed_node is not None:
@@ -147,6 +175,14 @@ class FaultConfig:
         )
 
 
+def bits_in_words(count: int, field: str) -> str:
+    """So many bits of a field: "a bit", "an exponent bit", "3 bits"."""
+    kind = "bit" if field == Field.ANY.value else f"{field} bit"
+    if count > 1:
+        return f"{count} {kind}s"
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
+
+
 def _parse_trigger(text: str) -> Trigger:
     """Parse a trigger such as `time=12.5`.
 
@@ -205,6 +241,16 @@ class InstructionConfig:
     field: str = "any"
     bits: int = 1
     null: bool = False
+
+    def words(self, struck: str | None = None) -> str:
+        """The fault as a title says it, such as "a bit in an instruction of octomap".
+
+        Args:
+            struck: the node that was drawn from the target; None if none was.
+        """
+        bits = "no bit" if self.null else bits_in_words(self.bits, self.field)
+        where = f" ({', '.join((*self.sites, *self.roles))})" if self.sites or self.roles else ""
+        return f"{bits} in an instruction of {struck or self.target}{where}".replace("_", " ")
 
     def node(self) -> str:
         """Return the target node.

@@ -48,7 +48,7 @@ def test_a_panel_for_each_fault_with_golden_faulty_and_protected(book):
     fly(book, 2, (20.0,) * 5)
     drawn = pair(book.ledger, 3)
     assert drawn == pair(book.ledger, 0)
-    assert [panel.title for panel in drawn.panels] == ["stage=perception", "stage=planning"]
+    assert [panel.title for panel in drawn.panels] == ["a bit of perception", "a bit of planning"]
     assert [[(each.number, each.name) for each in panel.flights] for panel in drawn.panels] == [
         [(0, "golden"), (1, "FI"), (3, "D&R(A)")],
         [(0, "golden"), (2, "FI"), (4, "D&R(A)")],
@@ -118,7 +118,7 @@ def test_settings_of_one_name_are_told_apart(book):
                  path="runs/some")  # fmt: skip
     (panel,) = pair(book.ledger).panels
     assert [each.name for each in panel.flights] == [
-        "D&R gad, planning", "D&R gad, control", "D&R aad, control",
+        "D&R, gad, planning", "D&R, gad, control", "D&R, aad, control",
     ]  # fmt: skip
 
 

@@ -184,31 +184,34 @@ SOURCE = {
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"fault": SOURCE}, "fault: waypoint_z"),
+        ({"fault": SOURCE}, "fault: a bit of waypoint z"),
         (
             {
                 "fault": SOURCE | {"states": ["waypoint_x", "waypoint_y", "waypoint_z"],
-                                   "request": {"target": "waypoint_position"}},
+                                   "request": {"target": "waypoint_position", "together": True,
+                                               "field": "exponent"}},
                 "detection": {"detector": "aad", "alarm_count": 1},
             },
-            "fault: waypoint_position (3 states); detector: aad, 1 alarm",
+            "fault: an exponent bit of each component of waypoint position; detector: aad, 1 alarm",
         ),
         (
             {"fault": SOURCE | {"state": "not_injected"},
              "detection": {"detector": "gad", "alarm_count": 0}},
-            "fault: waypoint_z (not injected); detector: gad, no alarms",
+            "fault: a bit of waypoint z (not injected); detector: gad, no alarms",
         ),
         (
-            {"fault": SOURCE | {"stage": "process", "states": ["octomap"]}},
+            {"fault": SOURCE | {"stage": "process", "states": ["octomap"],
+                                "request": {"target": "process.octomap"}}},
             "fault: the process of octomap is killed",
         ),
         (
-            {"fault": {"level": "instruction", "node": "planner", "state": "applied"}},
-            "fault: an instruction of the planner node",
+            {"fault": {"level": "instruction", "node": "octomap", "state": "applied",
+                       "request": {"target": "perception", "sites": [], "roles": []}}},
+            "fault: a bit in an instruction of octomap",
         ),
         ({"detection": {"detector": "l2", "alarm_count": 12}}, "detector: l2, 12 alarms"),
     ],
 )  # fmt: skip
 def test_the_title_names_fault_and_detector(run, changes, told):
     title = draw_top_view(changed(run, **changes)).axes[0].get_title("left")
-    assert title.splitlines()[1:] == [told]
+    assert " ".join(title.splitlines()[1:]) == told

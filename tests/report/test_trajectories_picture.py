@@ -40,8 +40,8 @@ def panels(golden):
     lost = faulty(golden, outcome="collision", shift_m=1.0)
     saved = faulty(golden, (FAULT, ALARM), shift_m=0.5, time_s=21.0, detection={"alarms": []})
     return [
-        Panel(title="stage=perception", flights=[("golden", golden), ("FI", faulty(golden))]),
-        Panel(title="stage=planning", flights=[("golden", golden), ("FI", lost), ("D&R", saved)]),
+        Panel(title="a bit of x", flights=[("golden", golden), ("FI", faulty(golden))]),
+        Panel(title="a bit of y", flights=[("golden", golden), ("FI", lost), ("D&R", saved)]),
     ]
 
 
@@ -68,7 +68,7 @@ def test_the_svg_has_every_flight_and_says_what_became_of_it(panels, golden, tmp
     longer, shorter = (f"{100 * (time_s / golden_s - 1):+.1f} %" for time_s in (30.0, 21.0))
     assert said.count(f"golden: success, {golden_s:.1f} s") == 2
     assert {
-        "posts, seed 2", "fault: stage=perception", "fault: stage=planning", "east, m", "goal",
+        "posts, seed 2", "fault: a bit of x", "fault: a bit of y", "east, m", "goal",
         f"FI: success, 30.0 s ({longer})", "FI: collision, 30.0 s", "fault", "alarm", "start",
         f"D&R: success, 21.0 s ({shorter})", "collision",
     } <= set(said)  # fmt: skip
@@ -129,7 +129,7 @@ def test_faults_and_alarms_have_the_colour_of_their_flight(figure):
 
 def test_it_is_told_in_words_too(panels, golden):
     told = lines(panels)
-    assert told[:2] == ["posts, seed 2", "fault: stage=perception"]
+    assert told[:2] == ["posts, seed 2", "fault: a bit of x"]
     assert told[2].endswith(f" s  {golden.folder.path}")
     assert told[6].startswith("  FI: collision, 30.0 s  ")
     assert len(told) == 1 + 3 + 4

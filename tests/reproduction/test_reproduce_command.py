@@ -132,3 +132,18 @@ def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
         assert (run.returncode > 0, run.stdout) == (True, "")
         assert len(run.stderr.splitlines()) == 1
         assert told in run.stderr
+
+
+def test_status_of_a_campaign_of_ones_own_is_one_table(table3, mavfi):
+    """What all settings share is said once, below the table."""
+    with Ledger(table3, writing=True) as ledger:
+        ledger.set_meta({"name": "mine"})
+    lines = mavfi("campaign", "status", table3).stdout.splitlines()
+    (shared,) = [line for line in lines if "site=waypoint_acceleration" in line]
+    assert shared.startswith("in all settings that have it: ")
+    assert "mavfi campaign report has distance, energy, replans" in lines
+    heads = [line for line in lines if line.startswith("setting")]
+    assert [head.split()[:3] for head in heads] == [["setting", "bits", "n"]]
+    whole = mavfi("campaign", "report", table3).stdout
+    assert whole.count("site=waypoint_acceleration") == 1
+    assert "energy, kJ" in whole

@@ -56,7 +56,7 @@ def campaign_lines(told: Row) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class _SettingColumns:
+class SettingColumns:
     """Columns and common labels of some settings.
 
     Attributes:
@@ -68,7 +68,7 @@ class _SettingColumns:
     common: Mapping[str, Any]
 
     @classmethod
-    def of(cls, settings: Sequence[Mapping[str, Any]]) -> _SettingColumns:
+    def of(cls, settings: Sequence[Mapping[str, Any]]) -> SettingColumns:
         """The columns of settings, from their labels. They differ without the common ones.
 
         A single setting has no columns, because its name is enough.
@@ -85,6 +85,11 @@ class _SettingColumns:
                 (common[key],) = values.values()
         return cls(tuple(key for key in keys if key not in common), common)
 
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """Headings of the labels' columns."""
+        return self.keys or ("setting",)
+
     def told(self) -> list[str]:
         """The line of common labels above a table; no line if there are none."""
         return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
@@ -98,12 +103,12 @@ class _SettingColumns:
             head: head of the cells.
             rows: labels, name and cells of each setting.
         """
-        labels = [self._labels(labels, name) for labels, name, _ in rows]
-        heads = list(self.keys) or ["setting"]
+        labels = [self.cells(labels, name) for labels, name, _ in rows]
+        heads = list(self.heads)
         told = [[*own, *cells] for own, (_, _, cells) in zip(labels, rows, strict=True)]
         return blocks([[*heads, *head], *told], len(heads))
 
-    def _labels(self, labels: Mapping[str, Any], name: str) -> list[str]:
+    def cells(self, labels: Mapping[str, Any], name: str) -> list[str]:
         """The cells of a setting's labels; the first empty one has the rest of its name."""
         if not self.keys:
             return [name]
@@ -123,7 +128,7 @@ def _cells(labels: Mapping[str, Any], keys: Sequence[str]) -> list[str]:
 
 def _summary(summary: Row) -> list[str]:
     """The settings and the comparisons."""
-    settings = _SettingColumns.of([cell["labels"] for cell in summary["cells"]])
+    settings = SettingColumns.of([cell["labels"] for cell in summary["cells"]])
     fates = [(cell["labels"], cell["name"], _fate_cells(cell)) for cell in summary["cells"]]
     means = [(cell["labels"], cell["name"], _mean_cells(cell)) for cell in summary["cells"]]
     otherwise = ["ended otherwise"] if any(cells[-1] for _, _, cells in fates) else []
@@ -166,7 +171,7 @@ def _mean_cells(cell: Row) -> list[str]:
     return [number(means[name]["value"], ".1f", scale, unit) for name, scale, unit in units]
 
 
-def _comparison_table(settings: _SettingColumns, found: Sequence[Row]) -> list[str]:
+def _comparison_table(settings: SettingColumns, found: Sequence[Row]) -> list[str]:
     """One line per comparison, without empty columns."""
     head = ["pairs", "success, points", "p", "time, s", "worst over own golden",
             "worst over mean golden"]  # fmt: skip
@@ -210,7 +215,7 @@ def _quality(found: Sequence[Row], confidence: float) -> list[str]:
     if not found:
         return []
     first = [each["labels"] for each in found if each["metric"] == METRICS[0]]
-    settings = _SettingColumns.of(first)
+    settings = SettingColumns.of(first)
     head = ["flights", f"mean ({_sure(confidence)})", "least", "median", "most", "to golden"]
     told = []
     for metric, (title, scale) in _TITLES.items():
@@ -240,7 +245,7 @@ def _overhead(found: Sequence[Row], confidence: float) -> list[str]:
     """A table of detection, measured on the host, and a table of recovery, simulated."""
     if not found:
         return ["", "overhead: no flight with a detector"]
-    settings = _SettingColumns.of([each["labels"] for each in found])
+    settings = SettingColumns.of([each["labels"] for each in found])
     sure = f"({_sure(confidence)})"
     named = [(each, (each["labels"], label_text(each["labels"]))) for each in found]
     return [

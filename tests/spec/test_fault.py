@@ -1,0 +1,37 @@
+"""A fault in words, as the titles of pictures say it."""
+
+import pytest
+
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"target": "planning"}, "a bit of planning"),
+        ({"target": "command_vx", "field": "exponent"}, "an exponent bit of command vx"),
+        ({"target": "command_vx", "bits": 3, "field": "sign"}, "3 sign bits of command vx"),
+        ({"target": "command_vx", "exact_bits": (62,)}, "bit 62 of command vx"),
+        ({"target": "command_vx", "exact_bits": (1, 62)}, "bits 1 and 62 of command vx"),
+        ({"target": "command_vx", "effect": "zero"}, "command vx set to zero"),
+        ({"target": "waypoint_position", "together": True},
+         "a bit of each component of waypoint position"),
+        ({"target": "queue.waypoint_x"}, "a bit of waypoint x in control's queue"),
+        ({"target": "process.octomap"}, "the process of octomap is killed"),
+        ({"target": "time_to_collision", "persistence": "stuck-at", "at": "time=8"},
+         "a bit of time to collision, stuck-at, at time 8"),
+    ],
+)  # fmt: skip
+def test_a_fault_in_a_state_in_words(changes, words):
+    assert FaultConfig(**changes).words() == words
+
+
+def test_a_drawn_state_stands_for_the_stage():
+    assert FaultConfig(target="planning").words("waypoint_z") == "a bit of waypoint z"
+
+
+def test_a_fault_in_an_instruction_in_words():
+    fault = InstructionConfig(target="perception", sites=("flags",), bits=2)
+    assert fault.words() == "2 bits in an instruction of perception (flags)"
+    assert fault.words("point_cloud") == "2 bits in an instruction of point cloud (flags)"
+    assert InstructionConfig(target="control", null=True).words().startswith("no bit in an")
