@@ -242,7 +242,8 @@ class Telemetry:
 
     def _attitude_from(self, components: list[float]) -> None:
         """Store a body-FRD-to-NED quaternion w x y z if it is valid."""
-        norm = math.sqrt(sum(c * c for c in components))
+        w, x, y, z = components  # added one by one: `sum` rounds floats otherwise from 3.12 on
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
         if math.isfinite(norm) and 0.5 < norm < 2.0:
             self._quaternion = flu_enu_from_frd_ned([c / norm for c in components])
 

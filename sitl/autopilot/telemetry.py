@@ -6,7 +6,9 @@ request only.
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -157,10 +159,15 @@ def _gps_raw_int(s: Snapshot) -> Any:
     )  # fmt: skip
 
 
+def _thrust(s: Snapshot) -> float:
+    """Mean motor command, added one by one: `sum` rounds floats otherwise from Python 3.12 on."""
+    commands = s.truth.motor_commands.tolist()
+    return float(functools.reduce(operator.add, commands)) / len(commands)
+
+
 def _vfr_hud(s: Snapshot) -> Any:
     vn, ve, vd = s.truth.velocity_ned_mps.tolist()
-    commands = s.truth.motor_commands.tolist()
-    throttle = 100.0 * sum(commands) / len(commands)
+    throttle = 100.0 * _thrust(s)
     speed = math.hypot(vn, ve)
     return dialect.MAVLink_vfr_hud_message(
         speed, speed, _int16(s.heading_deg), _uint16(throttle),
@@ -229,10 +236,9 @@ def _position_target_local_ned(s: Snapshot) -> Any:
 
 def _attitude_target(s: Snapshot) -> Any:
     """Return ATTITUDE_TARGET: the present attitude and the mean motor command as thrust."""
-    commands = s.truth.motor_commands.tolist()
     return dialect.MAVLink_attitude_target_message(
         s.boot_ms, 0, s.truth.quaternion_frd_ned.tolist(), *s.truth.rates_frd_radps.tolist(),
-        sum(commands) / len(commands),
+        _thrust(s),
     )  # fmt: skip
 
 

@@ -71,7 +71,8 @@ class GroundRule:
         """Return the height of the body's lowest corner, m, and the tilt of its up axis, rad."""
         w, x, y, z = quaternion.tolist()
         up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
-        reach = sum(abs(u) * half for u, half in zip(up, self.half_m, strict=True))
+        parts = [abs(u) * half for u, half in zip(up, self.half_m, strict=True)]
+        reach = parts[0] + parts[1] + parts[2]  # `sum` rounds otherwise from Python 3.12 on
         return float(position[2]) - reach, math.acos(max(-1.0, min(1.0, up[2])))
 
 

@@ -158,7 +158,7 @@ def test_world_errors_pass_through(command_line):
 def test_sitl_errors_pass_through(command_line):
     code, out, err = command_line("sitl", "--vehicle", "sollo")
     assert (code, out) == (2, "")
-    assert err.startswith("error: unknown vehicle 'sollo'; did you mean 'solo'?")
+    assert "error: unknown vehicle 'sollo'; did you mean 'solo'?" in err
     assert command_line("sitl", "--speed", "-1")[0] == 2
 
 
