@@ -7,7 +7,6 @@ the same population.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -16,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.analysis.groups import Group
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary, silent_of_all
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical
-from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import cross_layer, failures_per_hour, rate
 
-KERNELS = "kernels.json"  # written by `mavfi kernels --out`
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 Runs = Mapping[str, tuple[int, int]]  # kernel -> silent corruptions, injected faults
 
@@ -100,18 +99,9 @@ class _Alone:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / KERNELS
-        try:
-            told = json.loads(self._path.read_text(encoding="utf-8"))
-            plan = told["plan"]
-            self._population = {name: plan[name] for name in ("rule", "compat", "model")}
-            self.runs: Runs = {
-                each["kernel"]: (each["outcomes"]["sdc"]["count"], each["outcomes"]["sdc"]["of"])
-                for each in told["kernels"]
-            }
-        except OSError as error:
-            raise RecordError(f"{self._path}: {error.strerror or error}") from None
-        except (ValueError, KeyError, TypeError) as error:
-            raise RecordError(f"{self._path}: no summary of `mavfi kernels`: {error!r}") from None
+        told = kernel_summary(self._path)
+        self._population = {name: told["plan"][name] for name in ("rule", "compat", "model")}
+        self.runs: Runs = {each["kernel"]: silent_of_all(each) for each in told["kernels"]}
 
     def require(self, config: MissionConfig) -> None:
         """Require that a mission's fault is drawn like those of the isolated kernels."""

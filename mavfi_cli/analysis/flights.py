@@ -117,9 +117,10 @@ def _column(values: Sequence[Any]) -> pa.Array:
 
 
 def chosen(table: pa.Table, **values: Any) -> pa.Table:
-    """The rows whose columns have these values."""
+    """The rows whose columns have these values; None means empty."""
     for name, value in values.items():
-        table = table.filter(pc.equal(table[name], value))
+        column = table[name]
+        table = table.filter(pc.is_null(column) if value is None else pc.equal(column, value))
     return table
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.analysis.kernel_runs import silent_of_all
 from mavfi_cli.campaigns.specification_file import to_toml
 from mavfi_cli.claims.arms import arms
 from mavfi_cli.claims.beyond import (
@@ -18,12 +19,13 @@ from mavfi_cli.claims.beyond import (
     state_map,
 )
 from mavfi_cli.claims.catalogue import CLAIMS, Claim
-from mavfi_cli.claims.effects import Finding, Protected, count, lost_share, struck, worst_flights
+from mavfi_cli.claims.effects import Finding, Protected, lost_share, struck, worst_flights
 from mavfi_cli.claims.findings import Kernels, instruction_faults
 from mavfi_cli.claims.flights import FlownMission, GoldenFlights, comparable, where
 from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.core.installed import __version__
-from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT
+from mavfi_cli.report.tables.paper_table import count_of
+from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT, printed_name
 from mavfi_cli.stats.effects import ClaimVerdict, judge
 from mavfi_cli.stats.shares import wilson
 
@@ -45,6 +47,7 @@ def document(
         stack: [each for each in evidence.missions(stack) if each.as_paper] for stack in STACKS
     }
     kernels = _kernels(evidence)
+    silent = {name: silent_of_all(each) for name, each in kernels.items()}
     claims = [_judged(claim, flights, kernels) for claim in CLAIMS]
     maps = {stack: state_map(flights[stack]) for stack in STACKS}
     return {
@@ -56,13 +59,13 @@ def document(
         "verdicts": {where: _counted(claims, where) for where in (*STACKS, _ISOLATED)},
         "worst": [row for stack in STACKS for row in _worst(stack, flights[stack])],
         "spreads": [row for stack in STACKS for row in _spreads(stack, flights[stack])],
-        "flows": {stack: kernel_flows(flights[stack], _silent(kernels)) for stack in STACKS},
+        "flows": {stack: kernel_flows(flights[stack], silent) for stack in STACKS},
         "fates": [*Fate],
         "maps": [part for stack in STACKS for part in _matrices(stack, maps[stack])],
         "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
         "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
         "items": _items(items),
-        "left_out": {_as_printed(name): why for name, why in LEFT_OUT.items()},
+        "left_out": {printed_name(name): why for name, why in LEFT_OUT.items()},
         "detectors": ("", "gad", "aad"),
         "upsets_per_hour": upsets_per_hour,
         "hourly": {stack: hourly_failures(flights[stack], upsets_per_hour) for stack in STACKS},
@@ -91,22 +94,10 @@ def _items(shown: Iterable[Any]) -> list[dict[str, Any]]:
     return [*found.values()]
 
 
-def _as_printed(name: str) -> str:
-    """Such as `Table I` of `table1`."""
-    if name.startswith("table"):
-        return "Table " + "I" * int(name.removeprefix("table"))
-    return f"Fig. {name.removeprefix('fig')}"
-
-
 def _kernels(evidence: Evidence) -> Kernels:
     return {
         each["kernel"]: each for source in evidence.kernels for each in source.summary["kernels"]
     }
-
-
-def _silent(kernels: Kernels) -> dict[str, tuple[int, int]]:
-    outcomes = {name: each["outcomes"]["sdc"] for name, each in kernels.items()}
-    return {name: (each["count"], each["of"]) for name, each in outcomes.items()}
 
 
 # Claims -------------------------------------------------------------------------------------------
@@ -235,7 +226,7 @@ def _sentence(parts: Sequence[str]) -> str:
 
 def _rate(share: Any) -> str:
     ends = f"{100 * share.low:.0f} to {100 * share.high:.0f}"
-    return f"{100 * share.share:.0f} % ({count(share)}; 95 % interval {ends} %)"
+    return f"{100 * share.share:.0f} % ({count_of(share)}; 95 % interval {ends} %)"
 
 
 # Worst cases and spreads --------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from mavfi_cli.claims.flights import EVERY_STAGE, LONGER, FlownMission, GoldenFlights, where
+from mavfi_cli.report.tables.paper_table import count_of
 from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.effects import (
     as_interval,
@@ -51,11 +52,6 @@ def harm_share(golden: GoldenFlights, flights: Iterable[FlownMission]) -> Share:
     return wilson(sum(map(golden.harmed, paired)), len(paired))
 
 
-def count(share: Share) -> str:
-    """Such as `3 of 98`."""
-    return f"{share.count:,} of {share.total:,}"
-
-
 def success_lost(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Finding:
     """Success of the golden flights minus that of the same missions with a fault."""
     pairs = [(own, each) for each in flights if (own := golden.any_of(each)) is not None]
@@ -63,8 +59,8 @@ def success_lost(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Find
     change = paired_difference(test)
     return Finding(
         effect=_turned(change) if test.pairs else None,
-        told=f"{count(lost_share([each for _, each in pairs]))} lost; golden "
-        f"{count(lost_share([each for each, _ in pairs]))}",
+        told=f"{count_of(lost_share([each for _, each in pairs]))} lost; golden "
+        f"{count_of(lost_share([each for each, _ in pairs]))}",
     )
 
 
@@ -82,7 +78,7 @@ def harm_difference(
     shares = harm_share(golden, first), harm_share(golden, second)
     if not all(each.total for each in shares):
         return NOTHING
-    told = "; ".join(f"{name} {count(each)}" for name, each in zip(names, shares, strict=True))
+    told = "; ".join(f"{name} {count_of(each)}" for name, each in zip(names, shares, strict=True))
     return Finding(effect=rate_difference(*shares), told=f"harmful: {told}")
 
 
@@ -91,7 +87,7 @@ def harmful(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Finding:
     share = harm_share(golden, flights)
     if not share.total:
         return NOTHING
-    return Finding(effect=as_interval(share), told=f"{count(share)} harmful")
+    return Finding(effect=as_interval(share), told=f"{count_of(share)} harmful")
 
 
 def worst_as_long(
@@ -104,7 +100,7 @@ def worst_as_long(
     beyond = wilson(sum(each >= ratio for each in ratios), len(ratios))
     return Finding(
         effect=longest_reaches(beyond, missions),
-        told=f"{count(beyond)} as long; longest {100.0 * (max(ratios) - 1.0):+.1f} %",
+        told=f"{count_of(beyond)} as long; longest {100.0 * (max(ratios) - 1.0):+.1f} %",
     )
 
 
@@ -145,7 +141,7 @@ class Protected:
         share = wilson(sum(not each.lost for _, each in lost), len(lost))
         if not share.total:
             return Finding(effect=None, told=f"0 of {len(self.pairs):,} lost without")
-        return Finding(effect=as_interval(share), told=f"{count(share)} lost missions saved")
+        return Finding(effect=as_interval(share), told=f"{count_of(share)} lost missions saved")
 
     def undone(self, *, longer_only: bool = False) -> Share:
         """The share of harmful faults that do no harm with the detector."""
@@ -162,7 +158,7 @@ class Protected:
         if not share.total:
             return NOTHING
         return Finding(
-            effect=as_interval(share), told=f"{count(share)} longer flights brought back"
+            effect=as_interval(share), told=f"{count_of(share)} longer flights brought back"
         )
 
 

@@ -11,7 +11,6 @@ from mavfi_cli.claims.effects import (
     Finding,
     Protected,
     compared,
-    count,
     harm_difference,
     harmful,
     lost_share,
@@ -21,6 +20,7 @@ from mavfi_cli.claims.effects import (
 )
 from mavfi_cli.claims.flights import EVERY_STAGE, FlownMission, GoldenFlights, where
 from mavfi_cli.core.types import Stage
+from mavfi_cli.report.tables.paper_table import count_of
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.effects import (
     as_interval,
@@ -79,7 +79,7 @@ def least_benign(kernels: Kernels) -> Finding:
     least = min(others, key=lambda each: _outcome(kernels, each, "benign").share)
     share = _outcome(kernels, least, "benign")
     return Finding(
-        effect=as_interval(share), told=f"least: {kernels[least]['title']}, {count(share)}"
+        effect=as_interval(share), told=f"least: {kernels[least]['title']}, {count_of(share)}"
     )
 
 
@@ -204,7 +204,7 @@ def five_bits(flights: Flights) -> Finding:
     shares = lost_share(_bits(flights, 5)), lost_share(_bits(flights, 1))
     if not all(each.total for each in shares):
         return NOTHING
-    told = f"lost: {count(shares[0])} with 5 bits, {count(shares[1])} with 1"
+    told = f"lost: {count_of(shares[0])} with 5 bits, {count_of(shares[1])} with 1"
     return Finding(effect=rate_difference(*shares), told=told)
 
 
@@ -249,7 +249,7 @@ def detour(stage: str, ratio: float) -> Callable[[Flights], Finding]:
         if not ratios:
             return NOTHING
         share = wilson(sum(each >= ratio for each in ratios), len(ratios))
-        return Finding(effect=as_interval(share), told=f"{count(share)} as long")
+        return Finding(effect=as_interval(share), told=f"{count_of(share)} as long")
 
     return find
 
@@ -283,7 +283,7 @@ def dense_worse(flights: Flights) -> Finding:
     ]
     if not all(each.total for each in shares):
         return NOTHING
-    told = f"lost: dense {count(shares[0])}, farm {count(shares[1])}"
+    told = f"lost: dense {count_of(shares[0])}, farm {count_of(shares[1])}"
     return Finding(effect=rate_difference(*shares), told=told)
 
 
@@ -299,7 +299,7 @@ def control_recovers_most(detector: str) -> Callable[[Flights], Finding]:
         if not all(each.total for each in shares.values()):
             return NOTHING
         other = max(STAGES[:2], key=lambda each: shares[each].share)
-        told = ", ".join(f"{name} {count(each)}" for name, each in shares.items())
+        told = ", ".join(f"{name} {count_of(each)}" for name, each in shares.items())
         effect = rate_difference(shares["control"], shares[other])
         return Finding(effect=effect, told=f"harm undone: {told}")
 
@@ -314,7 +314,7 @@ def all_stages_best(detector: str) -> Callable[[Flights], Finding]:
         single = _undone(flights, detector, "control")
         if not (whole.total and single.total):
             return NOTHING
-        told = f"harm undone: all stages {count(whole)}, control {count(single)}"
+        told = f"harm undone: all stages {count_of(whole)}, control {count_of(single)}"
         return Finding(effect=rate_difference(whole, single), told=told)
 
     return find

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import numbers, paired
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.claims.sources import STACKS, Evidence
 from mavfi_cli.core.types import Outcome, Stage
@@ -24,7 +23,7 @@ from mavfi_cli.reproduction.evidence import model_report
 from mavfi_cli.reproduction.figures import draw_flights, draw_table
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
-from mavfi_cli.reproduction.measures import golden, of
+from mavfi_cli.reproduction.measures import golden, with_own
 from mavfi_cli.reproduction.missions import key_of, kinds_of
 
 if TYPE_CHECKING:
@@ -101,13 +100,11 @@ def _kept(table: pa.Table) -> bool:
 
 def _over_own(table: pa.Table) -> Iterator[dict[str, Any]]:
     """The successful faulty flights, with the columns in which they differ."""
-    struck = of(table.filter(pc.is_valid(table["level"])), succeeded=True)
-    own, both = paired(of(golden(table), succeeded=True), struck, ["pair"])
-    rows = both.select([*_SETTING, "flight_time_s"]).to_pylist()
+    both, ratios = with_own(golden(table), table.filter(pc.is_valid(table["level"])))
+    rows = both.select(_SETTING).to_pylist()
     varying = [name for name in _SETTING if len({row[name] for row in rows}) > 1]
-    for row, golden_s in zip(rows, numbers(own, "flight_time_s"), strict=True):
-        ratio = f"{row['flight_time_s'] / golden_s:.4f}"
-        yield {**{name: row[name] for name in varying}, "over_golden": ratio}
+    for row, ratio in zip(rows, ratios, strict=True):
+        yield {**{name: row[name] for name in varying}, "over_golden": f"{ratio:.4f}"}
 
 
 def pooled(tables: Sequence[pa.Table], stack: str) -> pa.Table:
@@ -145,10 +142,10 @@ def _filled(table: pa.Table) -> pa.Table:
 def _of_kind(item: Item, stack: str, table: pa.Table) -> pa.Table:
     kinds = {_kind(key_of(mission)) for mission in kinds_of([item], stack)}
     known: dict[str, bool] = {}
-    chosen = [
+    wanted = [
         known.setdefault(kind, kind in kinds) for kind in map(_kind, table["changes"].to_pylist())
     ]
-    return table.filter(pa.array(chosen, pa.bool_()))
+    return table.filter(pa.array(wanted, pa.bool_()))
 
 
 def _kind(changes: str) -> str:

@@ -10,8 +10,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.failures import KERNELS
 from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
 from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.specification import Spec
@@ -144,7 +144,7 @@ def _read(path: Path) -> CampaignSource | KernelSource:
         return _from_ledger(path.parent)
     if path.suffix == _EXPORT:
         return _from_export(path)
-    return _from_kernels(path)
+    return KernelSource(path=path, summary=kernel_summary(path))
 
 
 def _from_ledger(folder: Path) -> CampaignSource:
@@ -192,16 +192,6 @@ def _spec_beside(path: Path) -> Spec | None:
         if stem in presets():
             return load_spec(stem)
     return None
-
-
-def _from_kernels(path: Path) -> KernelSource:
-    try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        for each in told["kernels"]:
-            each["kernel"], each["outcomes"]["sdc"]["of"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise RecordError(f"{path}: no summary of `mavfi kernels` ({error!r})") from None
-    return KernelSource(path=path, summary=told)
 
 
 # What is missing ----------------------------------------------------------------------------------

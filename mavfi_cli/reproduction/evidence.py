@@ -10,11 +10,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
 from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.core.errors import RecordError
 from mavfi_cli.report.tables.paper_table import PaperTable
-from mavfi_cli.reproduction.flying import FlightsPlan, stored_plan
+from mavfi_cli.reproduction.flying import KERNELS_FOLDER, FlightsPlan, stored_plan
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
-from mavfi_cli.reproduction.kernel_folder import kernel_summary
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
 from mavfi_cli.reproduction.missions import key_of, missions_of
 from mavfi_cli.vpm.model import schemes_with
@@ -81,6 +82,9 @@ def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
 
 
 def _unflown(item: Item, out: Path) -> PaperTable:
-    return (
-        of_model(model_report()) if item.source is Source.MODEL else of_kernels(kernel_summary(out))
-    )
+    if item.source is Source.MODEL:
+        return of_model(model_report())
+    path = out / KERNELS_FOLDER / KERNELS
+    if not path.is_file():
+        raise RecordError(f"{path.parent}: no runs of kernels (mavfi reproduce fig6)")
+    return of_kernels(kernel_summary(path))

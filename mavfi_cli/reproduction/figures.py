@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import flown
+from mavfi_cli.analysis.flights import chosen, flown
 from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.errors import RecordError
@@ -37,7 +37,7 @@ from mavfi_cli.reproduction.layouts import (
     whole,
     worlds_of,
 )
-from mavfi_cli.reproduction.measures import PERCENT, faulty, golden, of, over_own
+from mavfi_cli.reproduction.measures import PERCENT, faulty, golden, over_own
 from mavfi_cli.reproduction.paper import printed
 
 if TYPE_CHECKING:
@@ -88,9 +88,9 @@ def _number(name: str, *keys: object) -> float | None:
 def _fig7(table: pa.Table, columns: str) -> Figure:
     strips = []
     for title, (node, planner) in KERNELS_FLOWN.items():
-        chosen = faulty(table, level="instruction", fault_target=node, planner=planner)
-        bare = of(golden(table), planner=planner)
-        strips.append(Strip(label=title, values=_increase(bare, chosen), style=1))
+        struck = faulty(table, level="instruction", fault_target=node, planner=planner)
+        bare = chosen(golden(table), planner=planner)
+        strips.append(Strip(label=title, values=_increase(bare, struck), style=1))
     return draw_strips([StripPanel(title="fault in", strips=strips)], _QUANTITY, columns)
 
 
@@ -98,7 +98,9 @@ def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
     def draw_values(table: pa.Table, columns: str) -> Figure:
         bare, struck = golden(table), faulty(table)
         strips = [
-            Strip(label=str(value), values=_increase(bare, of(struck, **{column: value})), style=1)
+            Strip(
+                label=str(value), values=_increase(bare, chosen(struck, **{column: value})), style=1
+            )
             for value in dict.fromkeys(struck[column].to_pylist())
         ]
         return draw_strips([StripPanel(title="fault in", strips=strips)], _QUANTITY, columns)
@@ -106,28 +108,38 @@ def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
     return draw_values
 
 
+def _beside_detectors(title: str, table: pa.Table, paper: float | None) -> StripPanel:
+    """A row for the flights with faults, and one for those with each detector.
+
+    Args:
+        paper: the largest increase without a detector.
+    """
+    strips = [
+        Strip(
+            label=label,
+            values=_increase(golden(table), faulty(table, name)),
+            style=style,
+            paper=None if name else paper,
+        )
+        for style, (name, label) in enumerate(_SETTINGS.items(), start=1)
+    ]
+    return StripPanel(title=title, strips=strips)
+
+
 def _fig12(table: pa.Table, columns: str) -> Figure:
     table = whole(table)
     panels = []
     for world in worlds_of(table):
-        here = of(table, world=world)
-        strips = [
-            Strip(
-                label=label,
-                values=_increase(golden(here), faulty(here, name)),
-                style=style,
-                paper=None if name else _number("fig12", "worst_increase_percent", world),
-            )
-            for style, (name, label) in enumerate(_SETTINGS.items(), start=1)
-        ]
-        panels.append(StripPanel(title=world, strips=strips))
+        here = chosen(table, world=world)
+        worst = _number("fig12", "worst_increase_percent", world)
+        panels.append(_beside_detectors(world, here, worst))
     return draw_strips(panels, _QUANTITY, columns)
 
 
 def _fig14(table: pa.Table, columns: str) -> Figure:
     panels = []
     for world in worlds_of(table):
-        here = of(table, world=world)
+        here = chosen(table, world=world)
         bare = golden(here)
         strips = [Strip(label="no protection", values=_increase(bare, faulty(here)), style=1)]
         for style, detector in enumerate(DETECTORS, start=2):
@@ -153,18 +165,10 @@ def _short(stages: str) -> str:
 def _fig16(table: pa.Table, columns: str) -> Figure:
     panels = []
     for platform in dict.fromkeys(table["platform"].to_pylist()):
-        here = of(table, platform=platform)
+        here = chosen(table, platform=platform)
         ratio = _number("fig16", "worst_ratio", platform)
-        strips = [
-            Strip(
-                label=label,
-                values=_increase(golden(here), faulty(here, name)),
-                style=style,
-                paper=None if name or ratio is None else PERCENT * (ratio - 1.0),
-            )
-            for style, (name, label) in enumerate(_SETTINGS.items(), start=1)
-        ]
-        panels.append(StripPanel(title=platform, strips=strips))
+        worst = None if ratio is None else PERCENT * (ratio - 1.0)
+        panels.append(_beside_detectors(platform, here, worst))
     return draw_strips(panels, _QUANTITY, columns)
 
 
@@ -179,13 +183,13 @@ def _fig13(table: pa.Table, columns: str) -> Figure:
     if not kept:
         raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
     with Ledger(kept[0].parents[1]) as ledger:
-        chosen = pair(ledger, among=frozenset(table["number"].to_pylist()))
+        drawn = pair(ledger, among=frozenset(table["number"].to_pylist()))
     panels = [
         Panel(
             title=panel["title"],
             flights=[(each["name"], load_run(each["path"])) for each in panel["flights"]],
         )
-        for panel in chosen["panels"]
+        for panel in drawn["panels"]
     ]
     figure = draw_trajectories(panels, across=1 if columns == "one" else 2)
     for axes in figure.axes:  # room for the legend below the smaller panel

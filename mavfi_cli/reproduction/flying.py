@@ -23,7 +23,7 @@ from mavfi_cli.reproduction.missions import (
     numbers_of,
 )
 
-OUT = Path("reproduction")
+OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
 _META = "reproduction"  # key of the ledger's `meta`
 _MEASURED = 12  # missions that are flown before the forecast
 _RUN_BYTES = 2_000_000  # of a kept run folder, until one is there

@@ -23,67 +23,44 @@ class Item:
 
     Attributes:
         name: as on the command line, such as `fig6`.
-        paper: as the paper calls it, such as `Fig. 6`.
         title: what it shows.
         preset: the campaign that flies it; empty if its source is not flights.
     """
 
     name: str
-    paper: str
     title: str
     preset: str = ""
     source: Source = Source.FLIGHTS
 
+    @property
+    def paper(self) -> str:
+        """The paper's name of it."""
+        return printed_name(self.name)
+
+
+_ROMAN = ("", "I", "II", "III", "IV", "V")
+
+
+def printed_name(name: str) -> str:
+    """The paper's name of a figure or table, such as `Fig. 6` of `fig6`."""
+    table = name.removeprefix("table")
+    return f"Fig. {name.removeprefix('fig')}" if table == name else f"Table {_ROMAN[int(table)]}"
+
 
 ITEMS = (
-    Item(
-        name="fig6",
-        paper="Fig. 6",
-        title="outcomes of faults in isolated kernels",
-        source=Source.KERNELS,
-    ),
-    Item(name="fig7", paper="Fig. 7", title="faults in each kernel of the flight", preset="fig7"),
-    Item(name="fig8", paper="Fig. 8", title="faults in each inter-kernel state", preset="fig8"),
-    Item(name="fig9", paper="Fig. 9", title="faults in each field of float64", preset="fig9"),
-    Item(
-        name="fig11",
-        paper="Fig. 11",
-        title="ranges of the states' values and of their deltas",
-        preset="fig11",
-    ),
-    Item(
-        name="fig12",
-        paper="Fig. 12",
-        title="flight time with detection and recovery",
-        preset="table4",
-    ),
-    Item(
-        name="fig13",
-        paper="Fig. 13",
-        title="trajectories: golden, with a fault, recovered",
-        preset="fig13",
-    ),
-    Item(
-        name="fig14",
-        paper="Fig. 14",
-        title="worst flight time by protected stages",
-        preset="fig14",
-    ),
-    Item(
-        name="fig15",
-        paper="Fig. 15",
-        title="flight time with redundant computers",
-        source=Source.MODEL,
-    ),
-    Item(name="fig16", paper="Fig. 16", title="two computing platforms", preset="fig16"),
-    Item(name="table3", paper="Table III", title="number of flipped bits", preset="table3"),
-    Item(name="table4", paper="Table IV", title="success rate in four worlds", preset="table4"),
-    Item(
-        name="table5",
-        paper="Table V",
-        title="compute time of detection and recovery",
-        preset="table4",
-    ),
+    Item(name="fig6", title="outcomes of faults in isolated kernels", source=Source.KERNELS),
+    Item(name="fig7", title="faults in each kernel of the flight", preset="fig7"),
+    Item(name="fig8", title="faults in each inter-kernel state", preset="fig8"),
+    Item(name="fig9", title="faults in each field of float64", preset="fig9"),
+    Item(name="fig11", title="ranges of the states' values and of their deltas", preset="fig11"),
+    Item(name="fig12", title="flight time with detection and recovery", preset="table4"),
+    Item(name="fig13", title="trajectories: golden, with a fault, recovered", preset="fig13"),
+    Item(name="fig14", title="worst flight time by protected stages", preset="fig14"),
+    Item(name="fig15", title="flight time with redundant computers", source=Source.MODEL),
+    Item(name="fig16", title="two computing platforms", preset="fig16"),
+    Item(name="table3", title="number of flipped bits", preset="table3"),
+    Item(name="table4", title="success rate in four worlds", preset="table4"),
+    Item(name="table5", title="compute time of detection and recovery", preset="table4"),
 )
 BY_NAME = {item.name: item for item in ITEMS}
 

@@ -7,13 +7,14 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
 from mavfi_cli.campaigns.progress import Spectator, duration
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
 from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise
-from mavfi_cli.reproduction.kernel_folder import FOLDER, SUMMARY, kernel_summary
+from mavfi_cli.reproduction.flying import KERNELS_FOLDER
 
 PAPER_RUNS = 5000  # of each kernel
 _SEED = 1
@@ -29,7 +30,7 @@ class KernelRuns:
     """The runs of all kernels in the folder of a reproduction.
 
     Attributes:
-        out: folder of all stacks; the runs are in FOLDER beside those.
+        out: folder of all stacks; the runs are in KERNELS_FOLDER beside those.
         runs: of each kernel.
         jobs: runs at the same time.
     """
@@ -41,13 +42,14 @@ class KernelRuns:
     @property
     def folder(self) -> Path:
         """The folder of the runs, as of `mavfi kernels --out`."""
-        return self.out / FOLDER
+        return self.out / KERNELS_FOLDER
 
     def missing(self) -> int:
         """Number of runs that the summary lacks."""
-        if not (self.folder / SUMMARY).is_file():
+        path = self.folder / KERNELS
+        if not path.is_file():
             return self.runs * len(select(()))
-        summary = kernel_summary(self.out)
+        summary = kernel_summary(path)
         return sum(max(0, self.runs - each["runs"]) for each in summary["kernels"])
 
     @property

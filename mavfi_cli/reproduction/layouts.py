@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import flown, known, numbers, paired
+from mavfi_cli.analysis.flights import chosen, flown, known, numbers
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.mission.record.run_folder import TRACE
@@ -28,11 +28,11 @@ from mavfi_cli.reproduction.measures import (
     maximum,
     mean,
     mean_cell,
-    of,
     over_own,
     recovered,
     share_cell,
     success,
+    with_own,
     worst_mean,
     worst_own,
 )
@@ -136,7 +136,7 @@ def _worst_told(rows: Sequence[PaperRow]) -> str:
 
 def fig7(flights: pa.Table) -> PaperTable:
     """Faults in each kernel beside the golden flights with the same planner."""
-    bare = {name: of(golden(flights), planner=name) for name in _PLANNERS}
+    bare = {name: chosen(golden(flights), planner=name) for name in _PLANNERS}
     rows = [
         _with_energy(_golden_row(f"golden, {_PLANNERS[name]}", table), table)
         for name, table in bare.items()
@@ -144,9 +144,9 @@ def fig7(flights: pa.Table) -> PaperTable:
     ]
     struck = []
     for title, (node, planner) in KERNELS_FLOWN.items():
-        chosen = faulty(flights, level="instruction", fault_target=node, planner=planner)
-        if chosen.num_rows:
-            struck.append(_with_energy(_struck_row(title, bare[planner], chosen), chosen))
+        hit = faulty(flights, level="instruction", fault_target=node, planner=planner)
+        if hit.num_rows:
+            struck.append(_with_energy(_struck_row(title, bare[planner], hit), hit))
     worst = printed("fig7", "worst_increase_percent")
     lost = printed("fig7", "success_lost_points")
     return _table(
@@ -162,7 +162,7 @@ def _by_value(name: str, column: str, heading: str, flights: pa.Table) -> PaperT
     values = list(dict.fromkeys(struck[column].to_pylist()))
     rows = [
         _struck_row(
-            str(value), bare, of(struck, **{column: value}),
+            str(value), bare, chosen(struck, **{column: value}),
             str(printed(name, "critical", value) or "-"),
         )
         for value in values
@@ -196,7 +196,8 @@ def table3(flights: pa.Table) -> PaperTable:
     """Quality of flight by the number of flipped bits."""
     struck = faulty(flights)
     groups = {0: golden(flights)} | {
-        bits: of(struck, fault_bits=bits) for bits in sorted(set(struck["fault_bits"].to_pylist()))
+        bits: chosen(struck, fault_bits=bits)
+        for bits in sorted(set(struck["fault_bits"].to_pylist()))
     }
     rows = []
     for bits, table in groups.items():
@@ -245,7 +246,7 @@ def table4(flights: pa.Table) -> PaperTable:
     worlds = worlds_of(flights)
     rows = [
         _row(title, cells=[
-            success(of(table, world=world), printed("table4", "success_percent", key, world))
+            success(chosen(table, world=world), printed("table4", "success_percent", key, world))
             for world in worlds
         ])
         for title, (key, table) in _settings(flights).items()
@@ -263,7 +264,7 @@ def fig12(flights: pa.Table) -> PaperTable:
     flights = whole(flights)
     rows = []
     for world in worlds_of(flights):
-        here = of(flights, world=world)
+        here = chosen(flights, world=world)
         bare, struck = golden(here), faulty(here)
         increase = printed("fig12", "worst_increase_percent", world)
         rows.append(_row(world, cells=[
@@ -298,7 +299,7 @@ def fig14(flights: pa.Table) -> PaperTable:
         for stages in PROTECTED:
             cells = []
             for world in worlds:
-                here = of(flights, world=world)
+                here = chosen(flights, world=world)
                 cells.append(recovered(
                     golden(here), faulty(here), faulty(here, detector, protect=stages),
                     printed("fig14", "recovered_percent", detector, world, stages),
@@ -325,7 +326,7 @@ def table5(flights: pa.Table) -> PaperTable:
     worlds = worlds_of(flights)
     rows = []
     for detector in DETECTORS:
-        watched = {world: faulty(of(flights, world=world), detector) for world in worlds}
+        watched = {world: faulty(chosen(flights, world=world), detector) for world in worlds}
         rows += [
             _row(detector.upper(), title, cells=[
                 mean_cell(PERCENT * _summed(table, columns),
@@ -378,7 +379,7 @@ def values_and_deltas(flights: pa.Table) -> dict[str, tuple[FloatArray, FloatArr
 
     Reads the traces of the successful flights whose run folders are there.
     """
-    runs = [Path(each) for each in of(flights, succeeded=True)["path"].to_pylist() if each]
+    runs = [Path(each) for each in chosen(flights, succeeded=True)["path"].to_pylist() if each]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
     found = {}
     for state in SHOWN_STATES:
@@ -459,12 +460,11 @@ def fig13(flights: pa.Table) -> PaperTable:
 
 def _with(bare: pa.Table, struck: pa.Table, protected: pa.Table) -> FloatArray:
     """Increase of the protected flight whose unprotected one is prolonged most, (1,) or (0,)."""
-    own, both = paired(of(bare, succeeded=True), of(struck, succeeded=True), ["pair"])
+    both, ratios = with_own(bare, struck)
     if not both.num_rows:
         return np.zeros(0)
-    ratios = numbers(both, "flight_time_s") / numbers(own, "flight_time_s")
     pair = both["pair"][int(np.argmax(ratios))].as_py()
-    return PERCENT * (over_own(bare, of(protected, pair=pair)) - 1.0)
+    return PERCENT * (over_own(bare, chosen(protected, pair=pair)) - 1.0)
 
 
 # Platforms: Fig. 16 ------------------------------------------------------------------------------
@@ -474,7 +474,7 @@ def fig16(flights: pa.Table) -> PaperTable:
     """Worst flight time on each platform, and what each detector recovers of it."""
     rows = []
     for platform in dict.fromkeys(flights["platform"].to_pylist()):
-        here = of(flights, platform=platform)
+        here = chosen(flights, platform=platform)
         bare, struck = golden(here), faulty(here)
         own = over_own(bare, struck)
         rows.append(_row(platform, cells=[

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import flags, known, numbers, paired
+from mavfi_cli.analysis.flights import chosen, flags, known, numbers, paired
 from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.tables.paper_table import PaperCell, Printed
@@ -20,22 +20,14 @@ from mavfi_cli.stats.shares import Share, rate
 PERCENT = 100.0
 
 
-def of(table: pa.Table, **values: object) -> pa.Table:
-    """The rows whose columns have these values; None means empty."""
-    for name, value in values.items():
-        column = table[name]
-        table = table.filter(pc.is_null(column) if value is None else pc.equal(column, value))
-    return table
-
-
 def golden(table: pa.Table) -> pa.Table:
     """The flights without fault and detector."""
-    return of(table, level=None, detector=None)
+    return chosen(table, level=None, detector=None)
 
 
 def faulty(table: pa.Table, detector: str | None = None, **values: object) -> pa.Table:
     """The flights with a fault, without a detector or with this one."""
-    return of(table.filter(pc.is_valid(table["level"])), detector=detector, **values)
+    return chosen(table.filter(pc.is_valid(table["level"])), detector=detector, **values)
 
 
 def share_cell(share: Share, paper: Printed = None) -> PaperCell:
@@ -71,13 +63,18 @@ def mean(table: pa.Table, name: str, paper: Printed = None, scale: float = 1.0) 
 
 def of_successes(table: pa.Table, name: str) -> FloatArray:
     """A measure of the successful missions that have it."""
-    return known(numbers(of(table, succeeded=True), name))
+    return known(numbers(chosen(table, succeeded=True), name))
+
+
+def with_own(bare: pa.Table, flights: pa.Table) -> tuple[pa.Table, FloatArray]:
+    """The flights that succeed as their golden flights do, and their time over that of these."""
+    own, both = paired(chosen(bare, succeeded=True), chosen(flights, succeeded=True), ["pair"])
+    return both, numbers(both, "flight_time_s") / numbers(own, "flight_time_s")
 
 
 def over_own(bare: pa.Table, flights: pa.Table) -> FloatArray:
     """Flight times over those of the golden flights of the same missions, if both succeed."""
-    own, both = paired(of(bare, succeeded=True), of(flights, succeeded=True), ["pair"])
-    return numbers(both, "flight_time_s") / numbers(own, "flight_time_s")
+    return with_own(bare, flights)[1]
 
 
 def worst_own(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> PaperCell:

@@ -120,12 +120,7 @@ class Board:
 
     @classmethod
     def load(cls, name_or_path: str) -> Board:
-        """A shipped board by name, or a user's own by the path of its TOML file.
-
-        Raises:
-            UnknownName: no shipped board has this name, and it is not a path to a TOML file.
-            ConfigError: the file cannot be used.
-        """
+        """A shipped board by name, or a user's own by path. Raises as `ModelVehicle.load`."""
         return load_toml(_BOARDS.path(name_or_path), cls)
 
     @classmethod

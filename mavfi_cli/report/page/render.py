@@ -19,7 +19,7 @@ from mavfi_cli.report.page.charts import (
     inline,
     spread_chart,
 )
-from mavfi_cli.report.tables.paper_table import as_csv, cells_of
+from mavfi_cli.report.tables.paper_table import as_csv, cells_of, count_of
 
 _FOLDER = Path(__file__).parent
 _LIBRARIES = ("jinja2", "scipy")  # of the extra `report`
@@ -121,11 +121,6 @@ def effect(found: Any, unit: str) -> str:
     digits = 0 if largest >= 0.1 else 1 if largest >= 0.01 else 4
     value = f"{100 * found.value:{'+' if unit == 'points' else ''}z.{digits}f}"
     return f"{value} {'points' if unit == 'points' else '%'} ({ends(found, digits=digits)})"
-
-
-def count_of(share: Any) -> str:
-    """Such as `3 of 98`."""
-    return f"{share.count:,} of {share.total:,}"
 
 
 def p_value(chance: float | None) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.analysis.kernel_runs import KERNELS
 from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
@@ -299,7 +300,7 @@ def save_runs(
         RecordError: a file cannot be written.
     """
     write_text(folder / "kernels.csv", runs_csv(columns, campaign))
-    write_json(folder / "kernels.json", told)
+    write_json(folder / KERNELS, told)
 
 
 def _cells(entry: Record, columns: Sequence[str]) -> dict[str, str]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from mavfi_cli.report.tables.columns import WIDTH, blocks, csv_text
+from mavfi_cli.stats.shares import Share
 
 Printed = float | str | None  # a number of the paper, its words for it, or nothing
 
@@ -220,6 +221,11 @@ def _long(table: PaperTable) -> Iterator[Mapping[str, object]]:
                 "n": cell.count,
                 "paper": "" if cell.paper is None else cell.paper,
             }
+
+
+def count_of(share: Share) -> str:
+    """The counts of a share, such as `3 of 98`."""
+    return f"{share.count:,} of {share.total:,}"
 
 
 def _plain(value: float) -> object:

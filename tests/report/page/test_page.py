@@ -10,7 +10,8 @@ import pytest
 from committed import everything
 
 from mavfi_cli.claims.catalogue import CLAIMS
-from mavfi_cli.report.page.render import count_of, effect, ends, hourly, p_value, percent, render
+from mavfi_cli.report.page.render import effect, ends, hourly, p_value, percent, render
+from mavfi_cli.report.tables.paper_table import count_of
 from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.shares import wilson
 

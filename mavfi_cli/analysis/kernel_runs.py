@@ -1,0 +1,36 @@
+"""The summary of attacked kernels that `mavfi kernels --out` writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.core.errors import RecordError
+
+KERNELS = "kernels.json"
+
+
+def kernel_summary(path: Path) -> Mapping[str, Any]:
+    """Read a summary.
+
+    Raises:
+        RecordError: the file cannot be read, or is no such summary.
+    """
+    try:
+        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        found["plan"]["rule"], found["plan"]["compat"], found["plan"]["model"]
+        for each in found["kernels"]:
+            each["kernel"], each["outcomes"]["sdc"]["of"]
+    except OSError as error:
+        raise RecordError(f"{path}: {error.strerror or error}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordError(f"{path}: no summary of `mavfi kernels` ({error!r})") from None
+    return found
+
+
+def silent_of_all(kernel: Mapping[str, Any]) -> tuple[int, int]:
+    """Silent corruptions of a kernel, and faults that were injected into it."""
+    sdc = kernel["outcomes"]["sdc"]
+    return sdc["count"], sdc["of"]
