@@ -155,18 +155,28 @@ def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
         known = sum(found.values()) - found[ClaimVerdict.NOT_FLOWN]
         if known:
             place = f"about {name}" if name == _ISOLATED else f"flown on {name}"
-            parts.append(
-                f"of {known} claims {place}, {_are(found[ClaimVerdict.REPRODUCED])} reproduced, "
-                f"{_are(found[ClaimVerdict.NOT_REPRODUCED])} not, and "
-                f"{_are(found[ClaimVerdict.OPEN])} not distinguishable at this n"
-            )
+            verdicts = [f"{_are(found[each])} {told}" for each, told in _VERDICTS if found[each]]
+            claims_told = f"of {known} claim{'s'[known == 1 :]} {place}"
+            parts.append(f"{claims_told}, {_listed_in_words(verdicts)}")
     if not parts:
         return "None of the claims has been flown yet."
     return _sentence(parts)
 
 
+_VERDICTS = (
+    (ClaimVerdict.REPRODUCED, "reproduced"),
+    (ClaimVerdict.NOT_REPRODUCED, "not"),
+    (ClaimVerdict.OPEN, "not distinguishable at this n"),
+)
+
+
 def _are(number: int) -> str:
     return f"{number} {'is' if number == 1 else 'are'}"
+
+
+def _listed_in_words(parts: Sequence[str]) -> str:
+    *first, last = parts
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
@@ -177,10 +187,9 @@ def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
         golden = GoldenFlights(those)
         faulty = golden.paired(faulty)
         if faulty:
-            own = {each.pair: each for each in faulty}
             parts.append(
                 f"on {stack}, a bit flip in {kind} loses {_rate(lost_share(faulty))} of the "
-                f"missions that {len(own):,} golden flights complete"
+                "missions whose golden flight succeeds"
             )
     if not parts:
         return "No flight with a fault has a golden flight beside it, so the cost is not known."
@@ -190,14 +199,16 @@ def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
 def _saved_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
     parts = []
     for stack, those in flights.items():
-        saved = {}
-        for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
-            lost = [each for own, each in Protected.of(those, detector).pairs if own.lost]
-            if lost:
-                saved[name] = _rate(wilson(sum(not each.lost for each in lost), len(lost)))
-        if saved:
-            told = " and ".join(f"{name} saves {share}" for name, share in saved.items())
-            parts.append(f"on {stack}, {told} of the missions that are lost without a detector")
+        for level, kind in (("instruction", "an instruction"), ("source", "a state")):
+            saved = []
+            for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
+                pairs = Protected.of(those, detector).pairs
+                lost = [each for own, each in pairs if own.lost and own.level == level]
+                share = wilson(sum(not each.lost for each in lost), len(lost))
+                saved += [f"{name} saves {_rate(share)}"] if lost else []
+            if saved:
+                place = f"on {stack}, of the missions that a fault in {kind} loses"
+                parts.append(f"{place}, {_listed_in_words(saved)}")
     if not parts:
         return "No mission that a fault loses was flown again with a detector."
     return _sentence(parts)

@@ -348,6 +348,11 @@ def shortened_on(platform: str, detector: str) -> Callable[[Flights], Finding]:
 # Costs --------------------------------------------------------------------------------------------
 
 
+_NO_COSTS = Finding(
+    effect=None, told="flown, but an exported file does not hold these times; the folder does"
+)
+
+
 def overhead_of(detector: str) -> Callable[[Flights], Finding]:
     """The mean share of the flight time that detection and recovery take."""
 
@@ -355,7 +360,7 @@ def overhead_of(detector: str) -> Callable[[Flights], Finding]:
         shares = [each.overhead for each in _watched(flights, detector)]
         known = [each for each in shares if each is not None]
         if not known:
-            return NOTHING
+            return _NO_COSTS if shares else NOTHING
         found = interval(known, resamples=RESAMPLES)
         return Finding(effect=found, told="time of the computer that flew, and simulated recovery")
 
@@ -370,7 +375,7 @@ def gaussian_dearer(flights: Flights) -> Finding:
     ]
     both = sorted(costs[0].keys() & costs[1].keys())
     if not both:
-        return NOTHING
+        return _NO_COSTS if _watched(flights, "gad") else NOTHING
     found = interval([costs[0][key] - costs[1][key] for key in both], resamples=RESAMPLES)
     return Finding(effect=found, told="the same faults with either detector")
 

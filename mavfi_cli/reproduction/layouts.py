@@ -284,7 +284,8 @@ def fig12(flights: pa.Table) -> PaperTable:
     return _table(
         "fig12", ["world"], columns, rows,
         notes=[MAXIMUM, "over mean: the longest flight over the mean golden one",
-               "GAD, AAD: what they recover of the worst, in points of the golden flight time"],
+               "GAD, AAD: what they recover of the worst of the same faults, in points of the "
+               "golden flight time"],
         result="nothing flown yet" if most is None else
         f"worst flight {_told(most.cells[1], _WORST, ' %')} in {most.labels[0]}, GAD recovers "
         f"{_told(most.cells[3], columns[3])} and AAD {_told(most.cells[4], columns[4])} points",
@@ -311,8 +312,8 @@ def fig14(flights: pa.Table) -> PaperTable:
     return _table(
         "fig14", ["recovered, %", "protected stages"],
         [PaperColumn(title=world) for world in worlds], rows,
-        notes=[MAXIMUM, "recovered: share of the worst increase over own golden flights; a dash: "
-               "faults prolong no flight"],
+        notes=[MAXIMUM, "recovered: share of the worst increase of the same faults; a dash: they "
+               "prolong no flight"],
         result="all stages, " + "; ".join(
             f"{row.labels[0]} recovers {_told(row.cells[0], column, ' %')} in {worlds[0]}"
             for row in protected
@@ -341,11 +342,19 @@ def table5(flights: pa.Table) -> PaperTable:
         "table5", ["%", "of flight time"],
         [PaperColumn(title=world, digits=4, ends=2) for world in worlds], rows,
         notes=["stages: their recovery, simulated time; detection: one check for all stages, "
-               "host time"],
+               "host time", *_unknown_costs(flights)],
         result="detection and recovery, " + "; ".join(
             f"{row.labels[0]} {_told(row.cells[-1], shown, ' %')} in {worlds[-1]}" for row in sums
         ),
     )  # fmt: skip
+
+
+def _unknown_costs(flights: pa.Table) -> list[str]:
+    """Why watched flights have no costs."""
+    watched = flights.num_rows > flights["detector"].null_count
+    if not watched or len(known(numbers(flights, "check_share"))):
+        return []
+    return ["no numbers: an exported file does not hold these times, the campaign's folder does"]
 
 
 def _parts(detector: str) -> dict[str, tuple[Sequence[str], Sequence[str]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -100,8 +100,25 @@ def worst_mean(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> Pape
 
 
 def recovery(bare: pa.Table, faults: pa.Table, protected: pa.Table) -> WorstCase:
-    """The worst case over own golden flights, and what of it a protection recovers."""
-    return worst_case(OWN, over_own(bare, faults).tolist(), over_own(bare, protected).tolist())
+    """The worst case over own golden flights, and what of it a protection recovers.
+
+    Only faults count that were flown with the protection, too: of more flights the longest is
+    longer.
+    """
+    both = _of_faults(faults, set(_faults(protected)))
+    return worst_case(OWN, over_own(bare, both).tolist(), over_own(bare, protected).tolist())
+
+
+_FAULT = ("pair", "level", "fault_target", "fault_seed", "fault_bits", "fault_field")
+
+
+def _faults(table: pa.Table) -> list[tuple[object, ...]]:
+    """What tells the fault of each flight from every other."""
+    return list(zip(*(table[name].to_pylist() for name in _FAULT), strict=True))
+
+
+def _of_faults(table: pa.Table, chosen: Collection[tuple[object, ...]]) -> pa.Table:
+    return table.filter(pa.array([each in chosen for each in _faults(table)], pa.bool_()))
 
 
 def recovered(

@@ -5,8 +5,8 @@ import pyarrow as pa
 _KINDS = {
     "number": pa.int64(), "pair": pa.string(), "world": pa.string(), "planner": pa.string(),
     "platform": pa.string(), "level": pa.string(), "fault_target": pa.string(),
-    "fault_bits": pa.int64(), "fault_field": pa.string(), "detector": pa.string(),
-    "protect": pa.string(), "state": pa.string(), "succeeded": pa.bool_(),
+    "fault_seed": pa.int64(), "fault_bits": pa.int64(), "fault_field": pa.string(),
+    "detector": pa.string(), "protect": pa.string(), "state": pa.string(), "succeeded": pa.bool_(),
     "flight_time_s": pa.float64(), "distance_m": pa.float64(), "energy_regression_j": pa.float64(),
     "replans": pa.int64(), "check_share": pa.float64(), "path": pa.string(),
     **{f"recovery_share_{stage}": pa.float64() for stage in ("perception", "planning", "control")},

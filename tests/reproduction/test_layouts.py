@@ -64,6 +64,16 @@ def test_fig_12_compares_each_flight_with_its_own_golden_one():
     assert "worst flight +50.0 % (paper +62.6 %) in sparse" in found.result
 
 
+def test_a_longer_fault_that_no_detector_saw_is_not_recovered():
+    flights = table(
+        flight("a", 20.0), struck("a", 22.0, fault_seed=1), struck("a", 40.0, fault_seed=2),
+        struck("a", 22.0, fault_seed=1, detector="gad"),
+    )  # fmt: skip
+    found = of_flights("fig12", flights)
+    assert cell(found, "sparse", "worst, %").value == pytest.approx(100.0)
+    assert cell(found, "sparse", "GAD, points").value == pytest.approx(0.0)
+
+
 def test_fig_14_gives_the_recovered_share_by_protected_stages():
     flights = table(
         flight("a", 20.0, world="factory"),
@@ -91,6 +101,11 @@ def test_table_iii_has_a_row_for_each_number_of_bits():
     assert cell(found, "0", "replans").value == 1.5
     assert cell(found, "5", "energy, kJ").value == 20.0
     assert (cell(found, "1", "success, %").value, cell(found, "1", "success, %").paper) == (50, 92)
+
+
+def test_table_v_says_that_an_export_has_no_times():
+    found = of_flights("table5", table(struck("a", 20.0, detector="gad")))
+    assert any(note.startswith("no numbers: an exported file") for note in found.notes)
 
 
 def test_table_v_adds_detection_and_recovery():
