@@ -48,7 +48,7 @@ def test_the_whole_interval_decides(effect, low, high, verdict):
 
 
 def test_fishers_test_of_the_papers_table_iv():
-    """The numbers of docs/paper.md."""
+    """The numbers of docs/results/paper.md."""
     assert fisher((100, 100), (275, 300)) == pytest.approx(0.0012, abs=5e-5)
     assert fisher((380, 400), (1058, 1200)) == pytest.approx(5e-5, abs=5e-6)
 

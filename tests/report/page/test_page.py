@@ -65,7 +65,7 @@ def test_every_chart_has_its_data(page):
 
 
 def test_the_counts_of_the_documents_are_in_it(page):
-    """docs/paper.md: 18 of 105 faults in planning in `dense` lose the mission."""
+    """docs/results/paper.md: 18 of 105 faults in planning in `dense` lose the mission."""
     text = html.unescape(page.read_text(encoding="utf-8"))
     assert "instruction: planning, dense" in text
     assert 'title="18 of 105 lost"' in text
