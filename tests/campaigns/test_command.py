@@ -128,7 +128,7 @@ def test_a_pair_is_drawn(flown, mavfi, tmp_path, chosen, seed):
     assert run.returncode == 0, run.stderr
     place, title, golden, faulty, written_to = run.stdout.splitlines()
     assert place == f"farm, seed {seed}"
-    assert title == "fault: field=mantissa site=waypoint_position together=true"
+    assert title == "fault: a mantissa bit of each component of waypoint position"
     assert re.fullmatch(rf"  golden: success, \d+\.\d s  {folder}/runs/00000\d-farm-{seed}", golden)
     assert faulty.startswith("  FI: success, ")
     assert written_to == f"Picture  {picture}"

@@ -8,7 +8,15 @@ import re
 import pytest
 from made_flights import flight, struck, table
 
-from mavfi_cli.report.tables.paper_table import FORMATS, PaperCell, PaperColumn, as_text, cells_of
+from mavfi_cli.report.tables.paper_table import (
+    FORMATS,
+    PaperCell,
+    PaperColumn,
+    PaperRow,
+    PaperTable,
+    as_text,
+    cells_of,
+)
 from mavfi_cli.reproduction.layouts import OF_FLIGHTS, of_flights
 
 WORLDS = ("factory", "farm", "sparse", "dense")
@@ -81,6 +89,22 @@ def test_latex_is_a_whole_tabular_of_plain_text(name):
     assert all(len(re.findall(r"(?<!\\)&", row)) == len(form) - 1 for row in rows)
     assert not re.search(r"(?<!\\)[%#_$]", text)
     assert text.count(r"\begin{") == text.count(r"\end{")
+
+
+@pytest.mark.parametrize(
+    ("columns", "place", "size"),
+    [(1, "table", "footnotesize"), (8, "table*", "footnotesize"), (14, "table*", "scriptsize")],
+)
+def test_a_latex_table_takes_the_place_that_it_needs(columns, place, size):
+    text = FORMATS["latex"](
+        PaperTable(
+            name="t", title="T", labels=("state",),
+            columns=(PaperColumn(title="time, s"),) * columns,
+            rows=(PaperRow(labels=("a",), cells=(PaperCell(value=12.5),) * columns),),
+        )
+    )  # fmt: skip
+    assert text.startswith(rf"\begin{{{place}}}")
+    assert rf"\centering\{size}" in text
 
 
 def test_a_maximum_has_no_interval_and_nothing_is_a_dash():

@@ -175,15 +175,25 @@ _LATEX = {
 }  # fmt: skip
 
 
+# Sizes of 8 and of 7 points: a character and the gap between two columns of a table are so wide, in
+# points, and so are a column of a printed page and the page.
+_SIZES = ((r"\footnotesize", 4.4, 6.0), (r"\scriptsize", 3.9, 6.0), (r"\scriptsize", 3.9, 4.0))
+_PLACES = (("table", 252.0), ("table*", 516.0))
+
+
 def as_latex(table: PaperTable) -> str:
-    """A float with a plain tabular, which needs no package."""
+    """A float with a plain tabular, which needs no package.
+
+    It is as wide as a column of two, or as the page, in the largest size that fits.
+    """
     head, *rows = cells_of(table)
     form = "l" * len(table.labels) + "r" * (len(head) - len(table.labels))
+    place, size, gap_pt = _latex_place([head, *rows])
     lines = [
-        r"\begin{table}",
+        rf"\begin{{{place}}}",
         rf"\caption{{{_latex(table.title)}}}",
         rf"\label{{tab:{table.name}}}",
-        r"\centering",
+        rf"\centering{size}\setlength{{\tabcolsep}}{{{gap_pt / 2:g}pt}}",
         rf"\begin{{tabular}}{{{form}}}",
         r"\hline",
         _latex_row(head),
@@ -192,9 +202,19 @@ def as_latex(table: PaperTable) -> str:
         r"\hline",
         r"\end{tabular}",
         *(rf"\par {_latex(note)}" for note in table.notes),
-        r"\end{table}",
+        rf"\end{{{place}}}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _latex_place(rows: Sequence[Sequence[str]]) -> tuple[str, str, float]:
+    """The narrowest float and the largest size that hold the table, and the gap; else the last."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for place, width_pt in _PLACES:
+        for size, character_pt, gap_pt in _SIZES:
+            if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:
+                return place, size, gap_pt
+    return place, size, gap_pt
 
 
 def _latex_row(row: Sequence[str]) -> str:
