@@ -30,7 +30,7 @@ _MEASURES = (
 
 
 def fate_of(golden: GoldenFlights, flight: FlownMission) -> Fate:
-    """What the kernel did that an instruction-level fault struck.
+    """What a kernel did after an instruction-level fault struck it.
 
     Missions repeat to the byte, so a flight that differs from its golden one does so by the fault.
     """

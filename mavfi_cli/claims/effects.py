@@ -93,7 +93,7 @@ def harmful(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Finding:
 def worst_as_long(
     golden: GoldenFlights, flights: Sequence[FlownMission], ratio: float, missions: int
 ) -> Finding:
-    """How probable it is that the longest of so many flights reaches a ratio to its golden one."""
+    """The probability that the longest of so many flights reaches a ratio to its golden flight."""
     ratios = golden.ratios(flights)
     if not ratios:
         return NOTHING

@@ -134,7 +134,7 @@ def map_harmless(flights: Flights) -> Finding:
 
 
 def longest_kernel_flight(ratio: float, missions: int) -> Callable[[Flights], Finding]:
-    """How probable a flight as long as the paper's longest is, with a fault in any kernel."""
+    """The probability of a flight as long as the paper's longest, with a fault in any kernel."""
 
     def find(flights: Flights) -> Finding:
         those = [each for kernel in _by_kernel(flights).values() for each in kernel]
@@ -231,7 +231,7 @@ def success_lost_in(world: str) -> Callable[[Flights], Finding]:
 
 
 def worst_in(world: str, ratio: float, missions: int) -> Callable[[Flights], Finding]:
-    """How probable a flight as long as the paper's longest is in a world."""
+    """The probability of a flight as long as the paper's longest in a world."""
 
     def find(flights: Flights) -> Finding:
         those = struck(where(_stage_faults(flights), world=world))
@@ -331,7 +331,7 @@ def _platform_faults(flights: Flights, platform: str) -> list[FlownMission]:
 
 
 def worst_on(platform: str, ratio: float, missions: int) -> Callable[[Flights], Finding]:
-    """How probable a flight as long as the paper's longest is on a computer."""
+    """The probability of a flight as long as the paper's longest on a computer."""
 
     def find(flights: Flights) -> Finding:
         those = _platform_faults(flights, platform)

@@ -197,9 +197,9 @@ class GoldenFlights:
         return flight.lost or (self.ratio(flight) or 0.0) > LONGER
 
     def paired(self, flights: Iterable[FlownMission]) -> list[FlownMission]:
-        """Those whose golden flight is there and succeeds."""
+        """The flights whose golden flight is there and succeeds."""
         return [each for each in flights if self.of(each) is not None]
 
     def ratios(self, flights: Sequence[FlownMission]) -> list[float]:
-        """The ratios that there are."""
+        """The ratios of the flights that have one."""
         return [each for each in map(self.ratio, flights) if each is not None]

@@ -124,7 +124,7 @@ def pooled(tables: Sequence[pa.Table], stack: str) -> pa.Table:
 
 
 def _filled(table: pa.Table) -> pa.Table:
-    """Without labels, and with the columns that an export lacks."""
+    """The table without its labels, and with empty columns in place of those that it lacks."""
     kept = [name for name in table.column_names if not name.startswith("label")]
     table = table.select([name for name in kept if name not in ("alarms", "struck_sites")])
     if "succeeded" not in kept:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, GroupOfCommands, given_options
 
 if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
@@ -29,7 +29,7 @@ _KEEP = ("none", "failures", "sampled", "all")
 _FULL = {"full", "by", "confidence", "quality", "overhead", "failures"}
 
 
-@click.group()
+@click.group(cls=GroupOfCommands)
 def campaign() -> None:
     """Plan, fly and evaluate thousands of paired missions.
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, names_in
+from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, GroupOfCommands, names_in
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
-@click.group()
+@click.group(cls=GroupOfCommands)
 def detect() -> None:
     """List the detectors and evaluate them."""
 

@@ -32,6 +32,20 @@ class GroupedCommand(click.Command):
                 formatter.write_dl(records)
 
 
+class GroupOfCommands(click.Group):
+    """A group whose help shows the whole first sentence of each command."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands."""
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [
+                    (name, command.get_short_help_str(limit=1000))
+                    for name, command in sorted(self.commands.items())
+                ]
+            )
+
+
 def given_options() -> dict[str, Any]:
     """The options that the user gave to the current command, by the names of its parameters."""
     context = click.get_current_context()

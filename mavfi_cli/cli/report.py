@@ -13,8 +13,8 @@ import click
 @click.option("-o", "--output", required=True, metavar="FILE", help="HTML file to write.",
               type=click.Path(path_type=Path, dir_okay=False))  # fmt: skip
 @click.option("--upsets", type=click.FloatRange(min=0.0), default=1.0, show_default=True,
-              help="Bit flips per hour that reach the injection sites, for the failures a "
-                   "flight hour.")  # fmt: skip
+              help="Bit flips per hour that reach the injection sites, for the table of "
+                   "failures per flight hour.")  # fmt: skip
 def report(places: tuple[Path, ...], output: Path, upsets: float) -> None:
     """Write one HTML file: the paper's claims, tables and figures beside flown missions.
 

@@ -29,7 +29,7 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_execution("--jobs", type=click.IntRange(min=1),
             help="Number of parallel missions  [one per core].")  # fmt: skip
 @_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("reproduction"),
-         show_default=True, help="Folder of all stacks.")  # fmt: skip
+         show_default=True, help="Folder in which each stack has a folder.")  # fmt: skip
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     """Fly the experiments of the paper, and print the results beside the paper's.

@@ -78,7 +78,7 @@ def _row(*labels: object, cells: Sequence[PaperCell]) -> PaperRow:
 
 
 def _told(cell: PaperCell, column: PaperColumn, unit: str = "") -> str:
-    """Ours, and the paper's if it prints one."""
+    """Our number, with the paper's in brackets if it prints one."""
     paper = column.printed(cell.paper)
     return f"{column.told(cell.value)}{unit}" + (f" (paper {paper}{unit})" if paper else "")
 

@@ -176,7 +176,7 @@ class FaultConfig:
 
 
 def bits_in_words(count: int, field: str) -> str:
-    """So many bits of a field: "a bit", "an exponent bit", "3 bits"."""
+    """A number of bits of a field in words, such as "a bit", "an exponent bit", "3 bits"."""
     kind = "bit" if field == Field.ANY.value else f"{field} bit"
     if count > 1:
         return f"{count} {kind}s"

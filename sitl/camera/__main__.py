@@ -35,8 +35,17 @@ from sitl.world import load_world
 
 
 @click.command(context_settings=CONTEXT)
-@click.option("--world", "name", default="dense", show_default=True, metavar="NAME|FILE")
-@click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True)
+@click.option(
+    "--world",
+    "name",
+    default="dense",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="World that the camera sees; `mavfi world list` lists the worlds.",
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=3, show_default=True, help="Seed of the world."
+)
 @click.option("--start", type=Place(), metavar="X,Y,Z", help="Start in the world, ENU m.")
 @click.option("--goal", type=Place(), metavar="X,Y,Z", help="Goal in the world, ENU m.")
 @click.option(
@@ -55,9 +64,25 @@ from sitl.world import load_world
     metavar="URL",
     help="Endpoint of an autopilot or client; repeatable. Frames are forwarded between all links.",
 )
-@click.option("--size", type=Size(), default="64x48", show_default=True)
-@click.option("--rate", "rate_hz", type=float, default=10.0, show_default=True, help="Hz.")
-@click.option("--hfov", "hfov_deg", type=float, default=90.0, show_default=True, help="Degrees.")
+@click.option(
+    "--size", type=Size(), default="64x48", show_default=True, help="Size of the image, pixels."
+)
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=float,
+    default=10.0,
+    show_default=True,
+    help="Frame rate for clients that ask for no interval, Hz.",
+)
+@click.option(
+    "--hfov",
+    "hfov_deg",
+    type=float,
+    default=90.0,
+    show_default=True,
+    help="Horizontal field of view, degrees.",
+)
 @click.option(
     "--mount",
     type=Place(),

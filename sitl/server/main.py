@@ -374,21 +374,21 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
     world = simulation.referee.world
     links = []
     for preset, url in options.links:
-        first, *rest = _how(url) or [""]
+        first, *rest = _ways_to(url) or [""]
         links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{each}" for each in rest)]
     lines = [
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
         f"system {options.system_id}, {options.speed:g} x real time",
-        f"commands: {_who(options)}",
+        f"takes commands from {_commanders(options)}",
         *(line.rstrip() for line in links),
-        *_wanted(options),
+        *_needs_of_firmware(options),
         "Ctrl-C ends it.",
     ]
     print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201 - for who starts it by hand
 
 
-def _wanted(options: ServerOptions) -> list[str]:
-    """What a firmware that somebody else starts has to do, one line each."""
+def _needs_of_firmware(options: ServerOptions) -> list[str]:
+    """The link and the parameters that a firmware started by somebody else needs, a line each."""
     kind = options.firmware_kind
     if kind is None or options.firmware is not None:
         return []
@@ -400,15 +400,15 @@ def _wanted(options: ServerOptions) -> list[str]:
     ]
 
 
-def _who(options: ServerOptions) -> str:
-    """Whose commands count."""
+def _commanders(options: ServerOptions) -> str:
+    """The clients whose commands are obeyed."""
     if options.trusted:
-        return f"of system {', '.join(map(str, sorted(options.trusted)))} only"
-    return "of anyone" + ("" if options.key_file is None else " who signs")
+        return f"system {', '.join(map(str, sorted(options.trusted)))} only"
+    return "anyone" + ("" if options.key_file is None else " who signs")
 
 
-def _how(url: str) -> list[str]:
-    """How clients reach an endpoint, one line each."""
+def _ways_to(url: str) -> list[str]:
+    """The options with which known clients reach an endpoint, a line each."""
     scheme, _, place = url.partition(":")
     port = place.rpartition(":")[2]
     mavsdk, mavproxy = {

@@ -80,9 +80,16 @@ class ServerOptions:
 
 
 @click.command(context_settings=CONTEXT)
-@click.option("--world", default="dense", show_default=True, help="Name, gen:density,size or file.")
+@click.option(
+    "--world",
+    default="dense",
+    show_default=True,
+    help="World: a name, gen:density,size or a TOML file.",
+)
 @click.option("--seed", type=int, default=3, show_default=True, help="Seed of the world.")
-@click.option("--vehicle", default="solo", show_default=True, help="Profile name or TOML file.")
+@click.option(
+    "--vehicle", default="solo", show_default=True, help="Vehicle: a name or a TOML file."
+)
 @click.option("--start", "start_enu_m", type=Place(), help="Start, ENU m. See --goal.")
 @click.option(
     "--goal", "goal_enu_m", type=Place(),
@@ -105,10 +112,13 @@ class ServerOptions:
     help="Time that the companion in lockstep may take for a tick, s.",
 )  # fmt: skip
 @click.option("--truth", type=click.Path(path_type=Path), help="Folder for the referee's truth.")
-@click.option("--camera-size", type=Size(), default="64x48", show_default=True)
 @click.option(
-    "--camera-rate", "camera_rate_hz", type=Positive(), default=10.0, show_default=True, help="Hz."
+    "--camera-size", type=Size(), default="64x48", show_default=True, help="Depth image, pixels."
 )
+@click.option(
+    "--camera-rate", "camera_rate_hz", type=Positive(), default=10.0, show_default=True,
+    help="Frame rate for clients that ask for no interval, Hz.",
+)  # fmt: skip
 @camera_heartbeat
 @click.option(
     "--sysid", "system_id", type=click.IntRange(1, 255), default=1, show_default=True,

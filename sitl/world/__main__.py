@@ -91,7 +91,7 @@ def _describe_pair(pair: GeneratorParams) -> str:
     )
 
 
-@_world.command(name="make", epilog=_WORLD_HELP)
+@_world.command(name="make", epilog=_WORLD_HELP, short_help="Write a world as a TOML file.")
 @_on_world
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="File  [standard output].")
 def _make(
@@ -111,7 +111,7 @@ def _make(
         click.echo(f"{output}: {_boxes(made)}")
 
 
-@_world.command(name="check", epilog=_WORLD_HELP)
+@_world.command(name="check", epilog=_WORLD_HELP, short_help="Check that it can be flown.")
 @_on_world
 @click.option(
     "--clearance",

@@ -208,7 +208,7 @@ def test_sitl_is_the_process_that_was_started_so_signals_reach_it():
         process.terminate()
         assert process.wait(20) == 0
     assert told[1:] == [
-        ["commands:", "of", "anyone"],
+        ["takes", "commands", "from", "anyone"],
         ["onboard", "udpout:127.0.0.1:9", "MAVSDK", "udpin://127.0.0.1:9"],
         ["MAVProxy", "--master=udpin:127.0.0.1:9"],
         ["Ctrl-C", "ends", "it."],

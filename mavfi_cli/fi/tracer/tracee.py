@@ -373,7 +373,7 @@ class Tracee:
     # -- counted stops
 
     def _run_to_detoured(self, address: int, count: int, detour: Detour) -> bool | None:
-        """As `run_to`; None if there is no detour from here."""
+        """Count by a detour; return as `run_to`, or None if no detour can be made here."""
         if address < self.registers.ip < address + detour.size:
             return None
         pages = self._map_near(address)

@@ -157,7 +157,7 @@ def _noticeable(runs: TargetRuns) -> Share:
 
 
 def _parts(records: Sequence[Record]) -> dict[str, Any]:
-    """For each part of silent corruptions: in how many runs there is one, and its size."""
+    """The parts of silent corruptions: the number of runs that have one, and its size."""
     found: dict[str, list[float]] = {}
     for entry in _with(records, RunOutcome.SDC):
         for name, size in entry["magnitude"]["parts"].items():

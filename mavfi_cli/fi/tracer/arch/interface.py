@@ -62,12 +62,12 @@ class Instruction:
 
 @dataclass(frozen=True, slots=True)
 class Detour:
-    """Where a detour fits that counts an instruction.
+    """The place of a detour that counts the executions of an instruction.
 
     Attributes:
-        size: length of the whole instructions from it on between which nothing jumps.
-        via: where bytes for the jump are that nothing executes, from the instruction; 0 if they
-            are not needed.
+        size: bytes of the whole instructions that the detour replaces; nothing jumps between them.
+        via: distance from the instruction to unused bytes that hold a second jump; 0 if one jump
+            is enough.
     """
 
     size: int

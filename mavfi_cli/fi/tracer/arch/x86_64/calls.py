@@ -26,7 +26,7 @@ _PATHS = {
 
 
 def asked(registers: Registers, memory: linux.Memory) -> Asked:
-    """What the system call asks for at whose entry the thread is stopped."""
+    """What a system call asks for; the thread is stopped at its entry."""
     number = registers.system_call
     if number == _IOCTL:
         fd, request = (registers.read(name) for name in _ARGUMENTS[:2])

@@ -31,7 +31,7 @@ _engine.detail = True
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetourCode:
-    """What to write for a detour."""
+    """The bytes of a detour."""
 
     jumps: dict[int, bytes]  # by address, in the code of the program
     pages: dict[int, bytes]  # by address
