@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from mavfi_cli.analysis.flights import chosen, flown
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.claims.sources import STACKS, Evidence
 from mavfi_cli.core.types import Outcome, Stage
@@ -108,12 +109,12 @@ def _over_own(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def pooled(tables: Sequence[pa.Table], stack: str) -> pa.Table:
-    """The flights of a stack in several tables, each mission once.
+    """The missions that flew on a stack in several tables, each once.
 
     Args:
         tables: of `analysis.flights.flights`, or of an export, which lacks some of their columns.
     """
-    kept = [_filled(each.filter(pc.equal(each["stack"], stack))) for each in tables]
+    kept = [_filled(chosen(flown(each), stack=stack)) for each in tables]
     if not kept:
         return pa.table({name: pa.array([], kind) for name, kind in _KINDS.items()})
     whole = pa.concat_tables(kept, promote_options="permissive").combine_chunks()

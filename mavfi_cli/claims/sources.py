@@ -16,7 +16,6 @@ from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.campaigns.specification_file import load_spec, presets
-from mavfi_cli.campaigns.world_search import SEARCH
 from mavfi_cli.claims.flights import FlownMission, flights_of
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
@@ -130,13 +129,14 @@ def _found(place: Path) -> Iterator[Path]:
         for path in place.rglob("*")
         if (path.name in (KERNELS, LEDGER) or path.suffix == _EXPORT)
         and path.name not in _OTHERS
-        and not _inside_campaign(path.relative_to(place))
+        and not _inside_campaign(path, place)
     )
 
 
-def _inside_campaign(path: Path) -> bool:
+def _inside_campaign(path: Path, place: Path) -> bool:
     """Whether it belongs to a campaign's own folders: kept runs, the search for a world."""
-    return bool({"runs", SEARCH, "profiles"} & set(path.parts[:-1]))
+    above = [each for each in path.parent.parents if each.is_relative_to(place)]
+    return any((each / LEDGER).is_file() for each in above)
 
 
 def _read(path: Path) -> CampaignSource | KernelSource:

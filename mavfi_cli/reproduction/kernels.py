@@ -49,8 +49,8 @@ class KernelRuns:
         path = self.folder / KERNELS
         if not path.is_file():
             return self.runs * len(select(()))
-        summary = kernel_summary(path)
-        return sum(max(0, self.runs - each["runs"]) for each in summary["kernels"])
+        done = {each["kernel"]: each["runs"] for each in kernel_summary(path)["kernels"]}
+        return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
 
     @property
     def disk_bytes(self) -> int:

@@ -119,6 +119,12 @@ def test_a_campaigns_own_folders_are_no_campaigns(tmp_path, campaign, export):
     assert len(gather([tmp_path]).campaigns) == 1
 
 
+def test_a_campaign_may_lie_in_a_folder_of_any_name(tmp_path, campaign):
+    (tmp_path / "runs").mkdir()
+    campaign("runs/whole", 1, 1)
+    assert len(gather([tmp_path]).campaigns) == 1
+
+
 def test_a_part_has_the_specification_beside_it(export, tmp_path):
     (tmp_path / "mine.toml").write_text("repetitions = 3\n[[setting]]\n")
     (source,) = gather([export("mine-part2.parquet", row())]).campaigns
@@ -133,6 +139,15 @@ def test_a_mission_in_two_places_counts_once(export):
     assert len(found.missions()) == 2
     assert pooled([each.table for each in found.campaigns], "mavbench").num_rows == 2
     assert found.missions("hardened") == []
+
+
+def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
+    failed = {"state": "error", "outcome": None}
+    places = [export("one.parquet", row(seed=1, **failed), row(seed=2)),
+              export("two.parquet", row(seed=1))]  # fmt: skip
+    found = gather(places)
+    assert len(found.missions()) == 2
+    assert pooled([each.table for each in found.campaigns], "mavbench").num_rows == 2
 
 
 def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
