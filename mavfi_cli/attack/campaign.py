@@ -71,7 +71,7 @@ Stage = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PreparedInput:
+class _PreparedInput:
     """One input of a target before its first fault."""
 
     golden: Golden
@@ -84,7 +84,7 @@ class TargetRuns:
 
     target: AttackTarget
     context: Mapping[str, Any]  # entries of every record about the target
-    inputs: tuple[PreparedInput, ...]
+    inputs: tuple[_PreparedInput, ...]
     records: tuple[Record, ...] = ()
     prepare_s: float
     wall_s: float = 0.0
@@ -199,7 +199,7 @@ def _prepare(
         target=place.target,
         context=stream | place.context(),
         inputs=tuple(
-            PreparedInput(golden=run, profile=profile)
+            _PreparedInput(golden=run, profile=profile)
             for run, profile in zip(golden, profiles, strict=True)
         ),
         prepare_s=time.perf_counter() - begun,

@@ -72,7 +72,7 @@ def absolute_arguments(
             yield str(path.resolve())
 
 
-def require_attackable(path: Path) -> None:
+def _require_attackable(path: Path) -> None:
     """Refuse a program that cannot be attacked.
 
     Raises:
@@ -184,7 +184,7 @@ class Workplace:
     kind = "program"
 
     def __init__(self, target: ProgramTarget) -> None:
-        require_attackable(Path(target.command.argv[0]))
+        _require_attackable(Path(target.command.argv[0]))
         self.target, self.limits = target, target.limits
         self._golden: Golden | None = None
         self._watched: Watched | None = None

@@ -29,7 +29,7 @@ _MEASURES = (
 )  # fmt: skip
 
 
-def fate_of(golden: GoldenFlights, flight: FlownMission) -> Fate:
+def _fate_of(golden: GoldenFlights, flight: FlownMission) -> Fate:
     """What a kernel did after an instruction-level fault struck it.
 
     Missions repeat to the byte, so a flight that differs from its golden one does so by the fault.
@@ -93,7 +93,7 @@ def _flow(
 ) -> KernelFlow:
     by_fate: dict[Fate, list[FlownMission]] = {fate: [] for fate in Fate}
     for each in flights:
-        by_fate[fate_of(golden, each)].append(each)
+        by_fate[_fate_of(golden, each)].append(each)
     lived = sum(each.lost for fate in (Fate.SAME, Fate.CHANGED) for each in by_fate[fate])
     layers = None if alone is None else cross_layer(*alone, lived, len(flights))
     return KernelFlow(

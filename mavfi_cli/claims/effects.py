@@ -175,7 +175,7 @@ def compared(first: Protected, second: Protected) -> McNemar:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WorstFlights:
+class _WorstFlights:
     """The longest flights of a setting.
 
     Attributes:
@@ -193,7 +193,7 @@ class WorstFlights:
     golden: float
 
 
-def worst_flights(golden: GoldenFlights, flights: Sequence[FlownMission]) -> WorstFlights:
+def worst_flights(golden: GoldenFlights, flights: Sequence[FlownMission]) -> _WorstFlights:
     """The worst case of a setting, as the paper may have read it in either way."""
     ratios = golden.ratios(flights)
     used = [each for each in flights if golden.ratio(each) is not None]
@@ -202,7 +202,7 @@ def worst_flights(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Wor
         [each.flight_time_s or math.nan for each in own.values()],
         [each.flight_time_s or math.nan for each in used],
     )
-    return WorstFlights(
+    return _WorstFlights(
         flights=len(ratios),
         longer=wilson(sum(each > LONGER for each in ratios), len(ratios)),
         paired=max(ratios) - 1.0 if ratios else math.nan,

@@ -153,7 +153,7 @@ def most_lost_kernel(flights: Flights) -> Finding:
     return Finding(effect=found.effect, told=f"most in {most}: {found.told}")
 
 
-def state_faults(flights: Flights, *states: str, **values: Any) -> list[FlownMission]:
+def _state_faults(flights: Flights, *states: str, **values: Any) -> list[FlownMission]:
     """Source-level faults in states in `sparse`, one bit in each component, of any field."""
     wanted: dict[str, Any] = {"world": "sparse", "fault_field": "any", "fault_bits": 1} | values
     found = struck(where(flights, level="source", platform="x86", fault_target=states, **wanted))
@@ -164,22 +164,22 @@ def collision_states(flights: Flights) -> Finding:
     """Harm by faults in a report's time minus harm by faults in its number."""
     return harm_difference(
         GoldenFlights(flights),
-        state_faults(flights, "time_to_collision"),
-        state_faults(flights, "future_collision_seq"),
+        _state_faults(flights, "time_to_collision"),
+        _state_faults(flights, "future_collision_seq"),
         ("time_to_collision", "future_collision_seq"),
     )
 
 
 def state_harm(*states: str) -> Callable[[Flights], Finding]:
     """The share of harmful faults in states."""
-    return lambda flights: harmful(GoldenFlights(flights), state_faults(flights, *states))
+    return lambda flights: harmful(GoldenFlights(flights), _state_faults(flights, *states))
 
 
 def fields_that_matter(flights: Flights) -> Finding:
     """Harm by sign and exponent of a position minus harm by its mantissa."""
 
     def of(*fields: str) -> list[FlownMission]:
-        return state_faults(flights, "waypoint_position", fault_field=fields)
+        return _state_faults(flights, "waypoint_position", fault_field=fields)
 
     return harm_difference(
         GoldenFlights(flights),
@@ -190,7 +190,7 @@ def fields_that_matter(flights: Flights) -> Finding:
 
 
 def _bits(flights: Flights, *bits: int) -> list[FlownMission]:
-    return state_faults(flights, "waypoint_acceleration", fault_bits=bits)
+    return _state_faults(flights, "waypoint_acceleration", fault_bits=bits)
 
 
 def one_bit(flights: Flights) -> Finding:

@@ -73,7 +73,6 @@ class Signing:
         key: 32 secret bytes, see `key_from_passphrase`.
         clock: Function of seconds since 1970 (`time.time`, or a fixed epoch plus simulated time).
         link_id: Id of this channel among those of the sender, 0..255.
-        accept_unsigned: Accept frames without a signature. Wrong signatures are always rejected.
 
     Raises:
         ValueError: The key does not have 32 bytes, or the link id is out of range.
@@ -85,7 +84,6 @@ class Signing:
         clock: Callable[[], float],
         *,
         link_id: int = 0,
-        accept_unsigned: bool = False,
     ) -> None:
         if len(key) != 32:
             raise ValueError(f"a signing key has 32 bytes, not {len(key)}")
@@ -94,7 +92,6 @@ class Signing:
         self._key = key
         self._clock = clock
         self._link_id = link_id
-        self._accept_unsigned = accept_unsigned
         self._next_timestamp = 0
         self._streams: dict[tuple[int, int, int], int] = {}
 
@@ -106,12 +103,12 @@ class Signing:
         return block + self._digest(frame + block)
 
     def accept(self, frame: bytes, header: int, message_id: int, *, signed: bool) -> bool:
-        """Return True if a frame is authentic and not a replay, or may be unsigned.
+        """Return True if a frame is authentic and not a replay, or a radio's report.
 
         Only authentic frames update the timestamps, so an attacker cannot block a stream.
         """
         if not signed:
-            return self._accept_unsigned or message_id == _RADIO_STATUS
+            return message_id == _RADIO_STATUS
         if not self._is_new(frame, header):
             return False
         timestamp = _timestamp(frame)

@@ -63,18 +63,14 @@ _COPTERS = (
     dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR, dialect.MAV_TYPE_TRICOPTER,
     dialect.MAV_TYPE_DODECAROTOR, dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_GENERIC_MULTIROTOR,
 )  # fmt: skip
+_KEPT = 512
 _REORDERED_MS = 1000  # older by less: a late packet; older by more: a restarted clock
 
 
 class _StateHistory:
-    """The newest states in order of their stamps.
+    """The newest states in order of their stamps, _KEPT of them at least."""
 
-    Args:
-        capacity: Minimum number of states to keep.
-    """
-
-    def __init__(self, capacity: int = 512) -> None:
-        self._capacity = capacity
+    def __init__(self) -> None:
         self._stamps_ms: list[int] = []
         self._states: list[VehicleState] = []
 
@@ -88,9 +84,9 @@ class _StateHistory:
             self._states.clear()
         self._stamps_ms.append(stamp_ms)
         self._states.append(state)
-        if len(self._states) >= 2 * self._capacity:
-            del self._stamps_ms[: -self._capacity]
-            del self._states[: -self._capacity]
+        if len(self._states) >= 2 * _KEPT:
+            del self._stamps_ms[:-_KEPT]
+            del self._states[:-_KEPT]
         return True
 
     def at(self, stamp_s: float) -> VehicleState | None:

@@ -135,7 +135,7 @@ class VehicleProcess:
         return VehicleProcessError(f"the {self._name} process {how}{last}")
 
 
-class EyesProcess(VehicleProcess):
+class _EyesProcess(VehicleProcess):
     """`python -m sitl.camera`: camera and referee of a foreign autopilot, and the link to it."""
 
     _name = "camera"
@@ -245,6 +245,6 @@ def other_end(
     folder = Path(tempfile.mkdtemp(prefix="mavfi-"))
     with contextlib.ExitStack() as leaving:
         leaving.callback(shutil.rmtree, folder, ignore_errors=True)
-        vehicle = (EyesProcess if config.eyes else launch)(config, folder)
+        vehicle = (_EyesProcess if config.eyes else launch)(config, folder)
         leaving.callback(vehicle.end)
         yield vehicle.link, vehicle

@@ -128,13 +128,11 @@ def draw_strips(
     panels: Sequence[StripPanel],
     quantity: str,
     columns: str = "one",
-    legend: Sequence[str] = (),
 ) -> Figure:
     """Each flight as a dot, the middle half of them as a bar, the median, and the paper's largest.
 
     Args:
         quantity: of the horizontal axis, with its unit.
-        legend: what the styles mean; empty if the labels say it.
     """
     across = min(len(panels), 4 if columns == "two" else 2)
     down = math.ceil(len(panels) / across)
@@ -151,7 +149,7 @@ def draw_strips(
     grid[0, 0].set_yticks(range(rows), [strip.label for strip in strips], fontsize=SMALLEST)
     grid[0, 0].set_ylim(rows - 0.5, -0.5)
     figure.supxlabel(quantity, fontsize=SMALLEST + 0.5, color=INK)
-    _explain_strips(figure, panels, legend)
+    _explain_strips(figure, panels)
     return figure
 
 
@@ -174,13 +172,9 @@ def _strip(axes: Axes, y: int, strip: Strip) -> None:
     axes.plot(values.max(), y, "|", color=INK, markersize=7, markeredgewidth=1.4)
 
 
-def _explain_strips(figure: Figure, panels: Sequence[StripPanel], legend: Sequence[str]) -> None:
+def _explain_strips(figure: Figure, panels: Sequence[StripPanel]) -> None:
     axes = figure.axes[0]
-    handles = [
-        axes.plot([], [], MARKERS[style], color=PALETTE[style], markersize=4, label=label)[0]
-        for style, label in enumerate(legend)
-    ]
-    handles += axes.plot([], [], "|", color=INK, markersize=7, label="longest", markeredgewidth=1.4)
+    handles = axes.plot([], [], "|", color=INK, markersize=7, label="longest", markeredgewidth=1.4)
     if any(strip.paper is not None for panel in panels for strip in panel.strips):
         handles += axes.plot([], [], label="paper's longest", **_PAPER)  # type: ignore[arg-type]
     figure.legend(

@@ -134,7 +134,7 @@ def _worst_told(rows: Sequence[PaperRow]) -> str:
     )
 
 
-def fig7(flights: pa.Table) -> PaperTable:
+def _fig7(flights: pa.Table) -> PaperTable:
     """Faults in each kernel beside the golden flights with the same planner."""
     bare = {name: chosen(golden(flights), planner=name) for name in _PLANNERS}
     rows = [
@@ -174,12 +174,12 @@ def _by_value(name: str, column: str, heading: str, flights: pa.Table) -> PaperT
     )  # fmt: skip
 
 
-def fig8(flights: pa.Table) -> PaperTable:
+def _fig8(flights: pa.Table) -> PaperTable:
     """Faults in each inter-kernel state."""
     return _by_value("fig8", "fault_target", "state", flights)
 
 
-def fig9(flights: pa.Table) -> PaperTable:
+def _fig9(flights: pa.Table) -> PaperTable:
     """Faults in each field of float64."""
     return _by_value("fig9", "fault_field", "field", flights)
 
@@ -192,7 +192,7 @@ _QUALITY = {  # the paper's name of a measure, its column, its scale, and its co
 }
 
 
-def table3(flights: pa.Table) -> PaperTable:
+def _table3(flights: pa.Table) -> PaperTable:
     """Quality of flight by the number of flipped bits."""
     struck = faulty(flights)
     groups = {0: golden(flights)} | {
@@ -240,7 +240,7 @@ def _settings(flights: pa.Table) -> dict[str, tuple[str, pa.Table]]:
     }
 
 
-def table4(flights: pa.Table) -> PaperTable:
+def _table4(flights: pa.Table) -> PaperTable:
     """Success in each world: golden, with faults, with each detector."""
     flights = whole(flights)
     worlds = worlds_of(flights)
@@ -259,7 +259,7 @@ def table4(flights: pa.Table) -> PaperTable:
     )  # fmt: skip
 
 
-def fig12(flights: pa.Table) -> PaperTable:
+def _fig12(flights: pa.Table) -> PaperTable:
     """Worst flight time with faults, and what each detector recovers of it, in points."""
     flights = whole(flights)
     rows = []
@@ -292,7 +292,7 @@ def fig12(flights: pa.Table) -> PaperTable:
     )  # fmt: skip
 
 
-def fig14(flights: pa.Table) -> PaperTable:
+def _fig14(flights: pa.Table) -> PaperTable:
     """Share of the worst increase that each detector recovers, by protected stages."""
     worlds = worlds_of(flights)
     rows = []
@@ -321,7 +321,7 @@ def fig14(flights: pa.Table) -> PaperTable:
     )  # fmt: skip
 
 
-def table5(flights: pa.Table) -> PaperTable:
+def _table5(flights: pa.Table) -> PaperTable:
     """Shares of the flight time that detection and recovery take."""
     flights = whole(flights)
     worlds = worlds_of(flights)
@@ -400,7 +400,7 @@ def values_and_deltas(flights: pa.Table) -> dict[str, tuple[FloatArray, FloatArr
     return found
 
 
-def fig11(flights: pa.Table) -> PaperTable:
+def _fig11(flights: pa.Table) -> PaperTable:
     """Ranges of the values of three states, and of their changes."""
     rows = []
     for state, (values, deltas) in values_and_deltas(golden(flights)).items():
@@ -440,7 +440,7 @@ def _reduction(values: float, deltas: float) -> float:
     return PERCENT * (1.0 - deltas / values) if values else math.nan
 
 
-def fig13(flights: pa.Table) -> PaperTable:
+def _fig13(flights: pa.Table) -> PaperTable:
     """The flight that a fault prolongs most, of each stage, and the same with the autoencoder."""
     rows = []
     bare = golden(flights)
@@ -479,7 +479,7 @@ def _with(bare: pa.Table, struck: pa.Table, protected: pa.Table) -> FloatArray:
 # Platforms: Fig. 16 ------------------------------------------------------------------------------
 
 
-def fig16(flights: pa.Table) -> PaperTable:
+def _fig16(flights: pa.Table) -> PaperTable:
     """Worst flight time on each platform, and what each detector recovers of it."""
     rows = []
     for platform in dict.fromkeys(flights["platform"].to_pylist()):
@@ -510,8 +510,8 @@ def fig16(flights: pa.Table) -> PaperTable:
 
 
 OF_FLIGHTS: Mapping[str, Callable[[pa.Table], PaperTable]] = {
-    "fig7": fig7, "fig8": fig8, "fig9": fig9, "fig11": fig11, "fig12": fig12, "fig13": fig13,
-    "fig14": fig14, "fig16": fig16, "table3": table3, "table4": table4, "table5": table5,
+    "fig7": _fig7, "fig8": _fig8, "fig9": _fig9, "fig11": _fig11, "fig12": _fig12, "fig13": _fig13,
+    "fig14": _fig14, "fig16": _fig16, "table3": _table3, "table4": _table4, "table5": _table5,
 }  # fmt: skip
 
 

@@ -58,10 +58,10 @@ def mean_cell(values: Sequence[float] | FloatArray, paper: Printed = None) -> Pa
 
 def mean(table: pa.Table, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
     """Mean of a measure over the successful missions."""
-    return mean_cell(scale * of_successes(table, name), paper)
+    return mean_cell(scale * _of_successes(table, name), paper)
 
 
-def of_successes(table: pa.Table, name: str) -> FloatArray:
+def _of_successes(table: pa.Table, name: str) -> FloatArray:
     """A measure of the successful missions that have it."""
     return known(numbers(chosen(table, succeeded=True), name))
 
@@ -92,7 +92,10 @@ def maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
 
 def worst_mean(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> PaperCell:
     """The longest flight over the mean golden one, as increase in per cent."""
-    golden_s, times_s = of_successes(bare, "flight_time_s"), of_successes(flights, "flight_time_s")
+    golden_s, times_s = (
+        _of_successes(bare, "flight_time_s"),
+        _of_successes(flights, "flight_time_s"),
+    )
     if not (len(golden_s) and len(times_s)):
         return PaperCell(paper=paper)
     increase = float(times_s.max() / golden_s.mean()) - 1.0

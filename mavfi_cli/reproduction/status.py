@@ -24,7 +24,7 @@ WIDE = 2  # columns of settings on one screen
 SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
-def preset_of(ledger: Ledger) -> str | None:
+def _preset_of(ledger: Ledger) -> str | None:
     """The preset that a campaign was begun from, with or without changes; None of others."""
     name = ledger.meta("name") or ""
     found = name.partition("-")[0]
@@ -33,7 +33,7 @@ def preset_of(ledger: Ledger) -> str | None:
 
 def item_of(ledger: Ledger) -> Item | None:
     """The paper's item of a campaign; None if the paper has none."""
-    preset = preset_of(ledger)
+    preset = _preset_of(ledger)
     return next(iter(items_of_preset(preset)), None) if preset else None
 
 
@@ -46,7 +46,7 @@ def asked_item(ledger: Ledger, name: str | None) -> Item | None:
     """
     if name is None:
         return item_of(ledger)
-    preset = preset_of(ledger)
+    preset = _preset_of(ledger)
     whole = stored_plan(ledger) is not None
     known = [each.name for each in ITEMS if whole or (each.preset and each.preset == preset)]
     (found,) = items_named([name])
@@ -61,10 +61,10 @@ def table_of(ledger: Ledger, item: Item | None = None) -> PaperTable:
         return table_of_item(item, ledger)
     if stored_plan(ledger) is not None:
         return _progress_table(ledger)
-    return settings_table(ledger)
+    return _settings_table(ledger)
 
 
-def settings_table(ledger: Ledger) -> PaperTable:
+def _settings_table(ledger: Ledger) -> PaperTable:
     """Success and quality of flight of each setting."""
     scales = {"flight_time_s": ("time, s", 1.0), "distance_m": ("distance, m", 1.0),
               "energy_regression_j": ("energy, kJ", 1e-3), "replans": ("replans", 1.0)}  # fmt: skip

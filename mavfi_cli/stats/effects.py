@@ -102,7 +102,7 @@ def effect_difference(first: Interval, second: Interval) -> Interval:
     return Interval(value=value, low=value - below, high=value + above, count=count)
 
 
-def paired_difference(test: McNemar, confidence: float = 0.95) -> Interval:
+def paired_difference(test: McNemar) -> Interval:
     """Success of the second treatment minus that of the first, of the same missions.
 
     D. G. Bonett and R. M. Price, J. Educational and Behavioral Statistics 37, 2012: one pair is
@@ -112,7 +112,7 @@ def paired_difference(test: McNemar, confidence: float = 0.95) -> Interval:
         return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
     gained, lost = ((each + 1) / (test.pairs + 2) for each in (test.only_second, test.only_first))
     centre = gained - lost
-    half = z_of(confidence) * math.sqrt((gained + lost - centre**2) / (test.pairs + 2))
+    half = z_of(0.95) * math.sqrt((gained + lost - centre**2) / (test.pairs + 2))
     return Interval(
         value=test.difference,
         low=max(-1.0, centre - half),

@@ -22,7 +22,7 @@ _COMPARED = frozenset(measures_of({})) | {"outcome"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CampaignMission:
+class _CampaignMission:
     """A mission of a campaign, and the measures that it had."""
 
     config: MissionConfig
@@ -43,7 +43,7 @@ class CampaignMission:
         ]
 
 
-def mission_of(campaign: Path, number: int) -> CampaignMission:
+def mission_of(campaign: Path, number: int) -> _CampaignMission:
     """One mission by its number.
 
     Args:
@@ -59,16 +59,16 @@ def mission_of(campaign: Path, number: int) -> CampaignMission:
         for entry in ledger.results([number]):
             if entry.outcome is not None:
                 row = {**measures_of(entry.result), "outcome": entry.outcome}
-                return CampaignMission(config=entry.mission.config, row=row)
+                return _CampaignMission(config=entry.mission.config, row=row)
     raise _not_flown(campaign, number)
 
 
-def _of_export(path: Path, number: int) -> CampaignMission:
+def _of_export(path: Path, number: int) -> _CampaignMission:
     table = read_parquet(path, "export of a campaign")
     for row in table.filter(pc.equal(table["number"], number)).to_pylist():
         if row["outcome"] is not None:
             config = structure(json.loads(row["changes"]), MissionConfig)
-            return CampaignMission(config=config, row=row)
+            return _CampaignMission(config=config, row=row)
     raise _not_flown(path, number)
 
 

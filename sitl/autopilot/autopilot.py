@@ -47,7 +47,6 @@ class Autopilot:
     Args:
         truth: Vehicle state before the first `observe`.
         system_id: MAVLink system id.
-        origin: Geographic origin of the local frame.
         trusted: MAVLink systems that may command; empty for all.
 
     Attributes:
@@ -59,7 +58,6 @@ class Autopilot:
         truth: Truth,
         *,
         system_id: int = 1,
-        origin: Origin | None = None,
         trusted: Sequence[int] = (),
     ) -> None:
         self.system_id = system_id
@@ -70,7 +68,7 @@ class Autopilot:
         self.snapshot = Snapshot(
             commander=self.commander,
             parameters=self.parameters,
-            origin=origin or Origin(),
+            origin=Origin(),
             truth=truth,
             home_ned_m=np.array(truth.position_ned_m),
         )

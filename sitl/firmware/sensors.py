@@ -86,12 +86,11 @@ class Sensors:
 
     Args:
         seed: Seed of the noise.
-        origin: Geographic origin of the world.
     """
 
-    def __init__(self, seed: int, origin: Origin | None = None) -> None:
+    def __init__(self, seed: int) -> None:
         self._noise = np.random.default_rng(seed)
-        self._origin = origin or Origin()
+        self._origin = Origin()
 
     def inertial(self, truth: Truth) -> tuple[Vector, Vector]:
         """Return rates (3,), rad/s, and specific force (3,), m/s^2, both in body FRD."""

@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 DEFAULT_CLEARANCE_M = 2.0
 """Half-width of the planner's drone box in the released code (MAVBench/MAV_apps, branch mavfi)."""
 
+_CELL_M = 0.5
 _STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
@@ -42,18 +43,16 @@ class WorldCheck:
         return self.path_m is not None
 
 
-def check_world(
-    world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M, cell_m: float = 0.5
-) -> WorldCheck:
+def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> WorldCheck:
     """Search a path from start to goal with `clearance_m` to every box."""
     height = float(world.goal_enu_m[2])
-    free, origin = _free_grid(world, height, clearance_m, cell_m)
-    cells = [_cell(p, origin, cell_m) for p in (world.start_enu_m, world.goal_enu_m)]
+    free, origin = _free_grid(world, height, clearance_m)
+    cells = [_cell(p, origin) for p in (world.start_enu_m, world.goal_enu_m)]
     found = _shortest(free, cells[0], cells[1])
     plan = world.goal_enu_m[:2] - world.start_enu_m[:2]
     path = np.zeros((0, 3))
     if found is not None:
-        corners = origin + (np.array(_straighten(free, found)) + 0.5) * cell_m
+        corners = origin + (np.array(_straighten(free, found)) + 0.5) * _CELL_M
         path = np.column_stack([corners, np.full(len(corners), height)])
     start_gaps = plan_distance_to_boxes(world.boxes_enu_m, world.start_enu_m)
     goal_gaps = distance_to_boxes(world.boxes_enu_m, world.goal_enu_m)
@@ -67,14 +66,12 @@ def check_world(
     )
 
 
-def _free_grid(
-    world: World, height_m: float, clearance_m: float, cell_m: float
-) -> tuple[Mask, Vector]:
+def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask, Vector]:
     """Return the free cells (columns, rows) at a height, and the lower corner (2,), ENU m."""
     origin = world.bounds_enu_m[:2]
-    count = np.maximum(1, np.ceil((world.bounds_enu_m[3:5] - origin) / cell_m)).astype(int)
-    x = origin[0] + (np.arange(count[0]) + 0.5) * cell_m
-    y = origin[1] + (np.arange(count[1]) + 0.5) * cell_m
+    count = np.maximum(1, np.ceil((world.bounds_enu_m[3:5] - origin) / _CELL_M)).astype(int)
+    x = origin[0] + (np.arange(count[0]) + 0.5) * _CELL_M
+    y = origin[1] + (np.arange(count[1]) + 0.5) * _CELL_M
     free = np.ones((count[0], count[1]), dtype=np.bool_)
     for box in world.boxes_enu_m:
         dz = max(box[2] - height_m, height_m - box[5], 0.0)
@@ -85,8 +82,8 @@ def _free_grid(
     return free, origin
 
 
-def _cell(place: Vector, origin: Vector, cell_m: float) -> tuple[int, int]:
-    i, j = np.floor((place[:2] - origin) / cell_m).astype(int)
+def _cell(place: Vector, origin: Vector) -> tuple[int, int]:
+    i, j = np.floor((place[:2] - origin) / _CELL_M).astype(int)
     return int(i), int(j)
 
 

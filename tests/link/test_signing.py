@@ -118,18 +118,11 @@ def test_a_forger_cannot_silence_a_stream() -> None:
     assert len(ours.decode(PING.pack(_pymavlink()))) == 1
 
 
-def test_unsigned_frames_are_refused_unless_allowed() -> None:
+def test_unsigned_frames_are_refused() -> None:
     plain = Codec(7, 9).encode(PING)
     ours = _codec()
     assert ours.decode(plain) == []
     assert ours.refused == 1
-    (message,) = _codec(accept_unsigned=True).decode(plain)
-    assert not message.get_signed()
-
-
-def test_a_wrong_signature_is_refused_where_none_would_be_fine() -> None:
-    wrong = PING.pack(_pymavlink(key=key_from_passphrase("other")))
-    assert _codec(accept_unsigned=True).decode(wrong) == []
 
 
 def test_a_radio_has_no_key_and_may_report() -> None:
@@ -140,7 +133,6 @@ def test_a_radio_has_no_key_and_may_report() -> None:
 def test_version_1_frames_carry_no_signature() -> None:
     frame = PING.pack(dialect.MAVLink(None, 7, 9), force_mavlink1=True)
     assert _codec().decode(frame) == []
-    assert len(_codec(accept_unsigned=True).decode(frame)) == 1
 
 
 def test_a_link_without_a_key_hears_signed_frames() -> None:

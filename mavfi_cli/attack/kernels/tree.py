@@ -65,7 +65,7 @@ def read_tree(data: bytes) -> Tree | None:
     table = np.frombuffer(nodes, _NODE)
     children = np.ascontiguousarray(table["children"])
     codes, depths = np.empty(len(table), np.int64), np.empty(len(table), np.int64)
-    if place_nodes(children, codes, depths) != len(table):
+    if _place_nodes(children, codes, depths) != len(table):
         return None
     return Tree(
         values=np.ascontiguousarray(table["value"]),
@@ -76,7 +76,7 @@ def read_tree(data: bytes) -> Tree | None:
 
 
 @compiled
-def place_nodes(
+def _place_nodes(
     children: NDArray[np.uint8], codes: NDArray[np.int64], depths: NDArray[np.int64]
 ) -> int:
     """Fill codes and depths (n,) of nodes in the order of the file.

@@ -56,7 +56,7 @@ def render(told: Mapping[str, Any]) -> str:
     )  # fmt: skip
     environment.filters |= {
         "percent": percent, "ends": ends, "effect": effect, "of": count_of, "p": p_value,
-        "times": times, "detector": detector, "hourly": hourly, "shade": shade, "csv": csv_link,
+        "times": times, "detector": detector, "hourly": hourly, "shade": _shade, "csv": csv_link,
         "cells": cells_of, "table_csv": lambda table: data_link(as_csv(table)),
     }  # fmt: skip
     style = (_FOLDER / "page.css").read_text(encoding="utf-8")
@@ -148,6 +148,6 @@ def hourly(rates: tuple[float, float, float]) -> str:
     return f"{point} ({low} to {high})"
 
 
-def shade(share: float | None) -> str:
+def _shade(share: float | None) -> str:
     """The strength of a cell's colour, from 0 to 100."""
     return "0" if share is None or not math.isfinite(share) else f"{100 * math.sqrt(share):.0f}"

@@ -156,7 +156,7 @@ def _in_pairs(table: PaperTable) -> Iterator[str]:
     yield from blocks(aligned, labels, WIDTH)
 
 
-def as_markdown(table: PaperTable) -> str:
+def _as_markdown(table: PaperTable) -> str:
     """A pipe table."""
     head, *rows = cells_of(table)
     aligned = ["---"] * len(table.labels) + ["---:"] * (len(head) - len(table.labels))
@@ -181,7 +181,7 @@ _SIZES = ((r"\footnotesize", 4.4, 6.0), (r"\scriptsize", 3.9, 6.0), (r"\scriptsi
 _PLACES = (("table", 252.0), ("table*", 516.0))
 
 
-def as_latex(table: PaperTable) -> str:
+def _as_latex(table: PaperTable) -> str:
     """A float with a plain tabular, which needs no package.
 
     It is as wide as a column of two, or as the page, in the largest size that fits.
@@ -254,7 +254,7 @@ def _plain(value: float) -> object:
 
 FORMATS: Mapping[str, Callable[[PaperTable], str]] = {
     "text": as_text,
-    "markdown": as_markdown,
-    "latex": as_latex,
+    "markdown": _as_markdown,
+    "latex": _as_latex,
     "csv": as_csv,
 }

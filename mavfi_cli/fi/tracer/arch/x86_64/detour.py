@@ -30,7 +30,7 @@ _engine.detail = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DetourCode:
+class _DetourCode:
     """The bytes of a detour."""
 
     jumps: dict[int, bytes]  # by address, in the code of the program
@@ -53,7 +53,7 @@ def flow(code: bytes, address: int) -> Flow | None:
     )
 
 
-def detour_code(code: bytes, address: int, pages: int, count: int, via: int) -> DetourCode | None:
+def detour_code(code: bytes, address: int, pages: int, count: int, via: int) -> _DetourCode | None:
     """Make the detour that stops before execution `count` of the instruction at `address`.
 
     Args:
@@ -91,7 +91,7 @@ def detour_code(code: bytes, address: int, pages: int, count: int, via: int) -> 
     jumps = {address + via: _jump(start, address + via)}
     if via:
         jumps[address] = b"\xeb" + struct.pack("<b", via - TRAITS.short_jump_bytes)
-    return DetourCode(
+    return _DetourCode(
         jumps=jumps,
         pages={pages: struct.pack("<QQQ", 0, count, returns_to), start: b"".join(parts)},
         stop=stop + 8,

@@ -54,7 +54,7 @@ def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
 
 
 @functools.lru_cache(maxsize=1)
-def xsave_components() -> dict[int, _Component]:
+def _xsave_components() -> dict[int, _Component]:
     """The user components from 2 on (AVX 2, opmask 5, ZMM_Hi256 6, Hi16_ZMM 7, PKRU 9)."""
     low, _, _, high = _cpuid(0xD, 0)
     enabled = low | high << 32
@@ -106,7 +106,7 @@ TRAITS = Traits(
 @functools.lru_cache(maxsize=1)
 def widest_vector() -> str:
     """The name of the full vector registers of this processor."""
-    components = xsave_components()
+    components = _xsave_components()
     return "zmm" if ZMM_HIGH in components else "ymm" if AVX in components else "xmm"
 
 
@@ -149,7 +149,7 @@ def register_kind(name: str) -> str:
 
 def _vector_spans(kind: str, index: int) -> list[_Span]:
     parts = {"xmm": 1, "ymm": 2, "zmm": 3}[kind]
-    components = xsave_components()
+    components = _xsave_components()
     if index >= 16:
         base = components[ZMM_UPPER].offset + 64 * index - 1024
         return [_Span(ZMM_UPPER, base, {"xmm": 16, "ymm": 32, "zmm": 64}[kind])]
@@ -255,7 +255,7 @@ class Registers:
         if match[1] == "mm":  # MMX names physical registers
             top = self.extended()[3] >> 3 & 7
             return [_Span(X87, 32 + 16 * ((index - top) & 7), 8)]
-        return [_Span(OPMASK, xsave_components()[OPMASK].offset + 8 * index, 8)]
+        return [_Span(OPMASK, _xsave_components()[OPMASK].offset + 8 * index, 8)]
 
     def rearm(self) -> None:
         """Let a breakpoint on the very next instruction hit.
@@ -286,7 +286,7 @@ class Registers:
 
 def all_registers() -> tuple[str, ...]:
     """Every full register of this processor that can be flipped."""
-    components = xsave_components()
+    components = _xsave_components()
     names = [*GENERAL, "rflags", "rip", *(f"st{i}" for i in range(8))]
     names += [f"{widest_vector()}{i}" for i in range(32 if ZMM_UPPER in components else 16)]
     if OPMASK in components:

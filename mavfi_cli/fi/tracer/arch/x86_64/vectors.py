@@ -57,7 +57,7 @@ def low(count: int) -> int:
     return (1 << count) - 1
 
 
-class VectorForm:
+class _VectorForm:
     """The operands of one vector instruction, by their roles."""
 
     def __init__(self, found: Any) -> None:
@@ -126,7 +126,7 @@ def is_vector(found: Any) -> bool:
 
 def vector_bits(found: Any) -> tuple[Touched, ...]:
     """The bits of each explicit operand that a vector instruction reads and writes."""
-    form = VectorForm(found)
+    form = _VectorForm(found)
     scalar = _scalar(form)
     if not (scalar or _permuted(form)):
         _packed(form)
@@ -138,7 +138,7 @@ def vector_bits(found: Any) -> tuple[Touched, ...]:
 # -- the lowest element
 
 
-def _scalar(form: VectorForm) -> int:
+def _scalar(form: _VectorForm) -> int:
     """Scalar instructions; the width of the element, or 0 for another instruction."""
     name = form.mnemonic
     if match := _COMPARISON.match(name):
@@ -160,7 +160,7 @@ def _scalar(form: VectorForm) -> int:
     return _move(form)
 
 
-def _operation(form: VectorForm, lane: int) -> int:
+def _operation(form: _VectorForm, lane: int) -> int:
     form.read(form.first, low(lane))
     form.read(form.last, low(lane))
     if _OPMASK.match(form.names[form.target]):
@@ -170,7 +170,7 @@ def _operation(form: VectorForm, lane: int) -> int:
     return lane
 
 
-def _merged(form: VectorForm, source: int, lane: int) -> int:
+def _merged(form: _VectorForm, source: int, lane: int) -> int:
     """The last operand is converted; the rest of a vector comes from the first source."""
     if lane and form.is_vector(form.target):
         _write_lane(form, lane)
@@ -180,7 +180,7 @@ def _merged(form: VectorForm, source: int, lane: int) -> int:
     return lane or form.widths[form.target]
 
 
-def _write_lane(form: VectorForm, lane: int) -> None:
+def _write_lane(form: _VectorForm, lane: int) -> None:
     """Write the lowest element; VEX copies the rest of 128 bits from the first source."""
     rest = low(128) & ~low(lane)
     if form.same(form.first, form.target):
@@ -190,7 +190,7 @@ def _write_lane(form: VectorForm, lane: int) -> None:
         form.write(low(128))
 
 
-def _move(form: VectorForm) -> int:
+def _move(form: _VectorForm) -> int:
     match = _LOADED.match(form.mnemonic)
     if match is None or (len(form.sources) == 2 or (match[1] in _LANE and _between(form))):
         return 0
@@ -200,14 +200,14 @@ def _move(form: VectorForm) -> int:
     return lane
 
 
-def _between(form: VectorForm) -> bool:
+def _between(form: _VectorForm) -> bool:
     return form.is_vector(form.target) and form.is_vector(form.last)
 
 
 # -- elements that change their place
 
 
-def _permuted(form: VectorForm) -> bool:
+def _permuted(form: _VectorForm) -> bool:
     """Instructions that move elements; False for another instruction."""
     found = _pieces(form)
     if found is None:
@@ -229,7 +229,7 @@ def _permuted(form: VectorForm) -> bool:
     return True
 
 
-def _pieces(form: VectorForm) -> tuple[int, list[Piece]] | None:
+def _pieces(form: _VectorForm) -> tuple[int, list[Piece]] | None:
     name, imm = form.bare, form.immediate
     width = form.widths[form.target]
     if rule := _MOVES.get(name):
@@ -251,7 +251,7 @@ def _pieces(form: VectorForm) -> tuple[int, list[Piece]] | None:
 
 
 def _inserted(
-    form: VectorForm, name: str, imm: int | None, width: int
+    form: _VectorForm, name: str, imm: int | None, width: int
 ) -> tuple[int, list[Piece]] | None:
     if match := re.match(r"p?broadcast(?:[fi](\d+)x(\d)|[fi](128)|s?([bwdqs]))$", name):
         element = int(match[3] or 0) or (
@@ -377,7 +377,7 @@ _BY_IMMEDIATE = [lane for name, (_, lane) in _SHUFFLES.items() if not re.match("
 # -- whole registers
 
 
-def _packed(form: VectorForm) -> None:
+def _packed(form: _VectorForm) -> None:
     """All other instructions: the whole registers, but for conversions, sign masks and counts."""
     name, width = form.mnemonic, form.widths[form.target]
     alone = form.same(form.first, form.last) and len(form.sources) == 1 + form.vex
@@ -428,7 +428,7 @@ _CONTROLS: dict[str, tuple[str, int, Callable[[int], int]]] = {
 _TWO_TABLES = re.compile(r"vperm([ti])2(ps|pd|[bwdq])$")
 
 
-def _mask(form: VectorForm, lane: int) -> None:
+def _mask(form: _VectorForm, lane: int) -> None:
     """An AVX-512 mask has a bit for each element; without zeroing, masked elements may stay."""
     assert form.writemask is not None
     target = form.touched[form.target]
