@@ -108,13 +108,12 @@ def fly(seed: int, conditions: Conditions, world: str, out: str) -> dict[str, ob
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()
     place = load_world(world, seed=seed)
-    goal = place.goal_enu_m - place.start_enu_m * (1.0, 1.0, 0.0)
     link = f"onboard=udpout:127.0.0.1:{ports[0]}"
     line = [sys.executable, "-m", "sitl", "--world", world, "--seed", str(seed), "--link", link]
     with subprocess.Popen(line, stderr=subprocess.DEVNULL) as process:
         try:
             config = MissionConfig(
-                seed=seed, goal=tuple(goal.tolist()), land=True,
+                seed=seed, goal=tuple(place.goal_enu_m.tolist()), land=True,
                 link=f"udpin:127.0.0.1:{ports[1]}",
             )  # fmt: skip
             result = mavfi.fly(config, out=out).result

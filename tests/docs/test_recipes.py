@@ -1,4 +1,4 @@
-"""The recipes of docs/sitl.md: every line in a terminal of its own, on free ports."""
+"""The recipes of docs/how-to/eyes.md: every line in a terminal of its own, on free ports."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ from test_code_blocks import ROOT, blocks
 pytestmark = pytest.mark.slow
 RECIPES = [
     block.text.splitlines()
-    for block in blocks(ROOT / "docs" / "sitl.md")
+    for block in blocks(ROOT / "docs" / "how-to" / "eyes.md")
     if "test_recipes.py" in block.notes.get("not run", "")
 ]
 QUICK = ["--stack", "hardened", "--no-picture", "--quiet", "--expect", "success"]
