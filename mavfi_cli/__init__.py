@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from mavfi_cli.core.installed import __version__
     from mavfi_cli.fi.value import inject
     from mavfi_cli.library import campaign, fly
-    from mavfi_cli.mission.golden import paired_golden
     from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.mission.repetition import paired_golden
     from mavfi_cli.spec.detector import DetectorConfig
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
     from mavfi_cli.spec.mission import MissionConfig
@@ -48,7 +48,7 @@ _MODULES = {  # name -> module that defines it
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.value",
     "load_run": "mavfi_cli.mission.record.run_folder",
-    "paired_golden": "mavfi_cli.mission.golden",
+    "paired_golden": "mavfi_cli.mission.repetition",
     "run_campaign": "mavfi_cli.campaigns.run",
 }
 

@@ -200,19 +200,12 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     from mavfi_cli.campaigns.begin import folder_of
     from mavfi_cli.campaigns.ledger import Ledger
     from mavfi_cli.core.files import plain
-    from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.top_view import Panel, draw_trajectories, lines
+    from mavfi_cli.report.top_view import draw_trajectories, lines, panels_of
 
     with Ledger(folder_of(what)) as ledger:
         chosen = pair(ledger, number)
-    panels = [
-        Panel(
-            title=panel["title"],
-            flights=[(each["name"], load_run(each["path"])) for each in panel["flights"]],
-        )
-        for panel in chosen["panels"]
-    ]
+    panels = panels_of(chosen)
     write_figure(draw_trajectories(panels), output)
     if as_json:
         told = {**chosen, "picture": output}

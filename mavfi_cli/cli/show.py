@@ -19,8 +19,8 @@ import click
               help="Draw the flight from above into this .svg, .pdf or .png file.")  # fmt: skip
 def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
     """Summarise RUN, a run folder."""
-    from mavfi_cli.mission.golden import kept_golden, paired_golden
     from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.mission.repetition import kept_golden, paired_golden
     from mavfi_cli.report.summary import difference_lines, event_lines, folder_lines, summary_lines
 
     record = load_run(run)

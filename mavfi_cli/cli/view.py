@@ -46,7 +46,7 @@ def view(run: Path, save: Path | None) -> None:
 def _golden(run: Run) -> Run | None:
     """Return the golden flight of the pair; None if it cannot be flown."""
     from mavfi_cli.core.errors import RecordError
-    from mavfi_cli.mission.golden import paired_golden
+    from mavfi_cli.mission.repetition import paired_golden
 
     try:
         return paired_golden(run, _note)

@@ -1,4 +1,4 @@
-"""Flies a recorded mission again."""
+"""Flies a recorded mission again, with its fault or as the golden run of the pair."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import Interrupted
-from mavfi_cli.core.files import file_digest
+from mavfi_cli.core.files import file_digest, writing
 from mavfi_cli.fi.tracer.record import read
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record.run_folder import Run, load_run
 from mavfi_cli.mission.replay import config_of, interrupted
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.spec.mission import MissionConfig
+
+GOLDEN = "golden"  # folder of the golden run in the folder of its pair
 
 
 def fly_again(
@@ -73,3 +75,37 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
         again = fly_again(run, Path(scratch), recorder=recorder)
         same = file_digest(again.folder.trace) == file_digest(run.folder.trace)
     return recorder, same
+
+
+def kept_golden(run: Run) -> Run | None:
+    """The golden pair that is kept in the run's folder; None if none was flown to its end."""
+    folder = run.folder.path / GOLDEN
+    golden = load_run(folder) if folder.is_dir() else None
+    return None if golden is None or interrupted(golden) else golden
+
+
+def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
+    """Return the golden run of a run. It is flown once and kept in the run's folder.
+
+    Args:
+        run: Run with a fault.
+        note: Callback with a message before the golden run is flown.
+
+    Raises:
+        RecordError: The run is not repeatable, or its folder cannot be written.
+        Interrupted: The user ended the golden run. Nothing of it is kept.
+    """
+    config = config_of(run, with_fault=False)
+    if (golden := kept_golden(run)) is not None:
+        return golden
+    kept = run.folder.path / GOLDEN
+    note(f"flying the golden pair: {config.world}, seed {config.seed}")
+    with (
+        writing(kept),
+        tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent,
+    ):
+        flown = fly_to_end(config, Path(parent))
+        if kept.is_dir():
+            shutil.rmtree(kept)
+        shutil.move(flown.folder.path, kept)
+    return load_run(kept)

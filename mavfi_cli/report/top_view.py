@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mavfi_cli.mission.record.measures import FlightRecord
-from mavfi_cli.mission.record.run_folder import Run
+from mavfi_cli.mission.record.run_folder import Run, load_run
 from mavfi_cli.report.drawing import (
     ALARM,
     DETECTORS,
@@ -312,6 +312,24 @@ class Panel:
 
     title: str
     flights: Sequence[tuple[str, Run]]
+
+
+def panels_of(pair: Mapping[str, Any]) -> list[Panel]:
+    """Read the run folders of a pair.
+
+    Args:
+        pair: As `analysis.trajectories.pair`.
+
+    Raises:
+        RecordError: A run folder cannot be read.
+    """
+    return [
+        Panel(
+            title=panel["title"],
+            flights=[(each["name"], load_run(each["path"])) for each in panel["flights"]],
+        )
+        for panel in pair["panels"]
+    ]
 
 
 def draw_trajectories(panels: Sequence[Panel], across: int = _COLUMNS) -> Figure:

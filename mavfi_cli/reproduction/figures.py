@@ -13,7 +13,6 @@ from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.report.paper_figures import (
     SMALLEST,
     WIDTHS_IN,
@@ -25,7 +24,7 @@ from mavfi_cli.report.paper_figures import (
     draw_strips,
 )
 from mavfi_cli.report.tables.paper_table import PaperTable
-from mavfi_cli.report.top_view import Panel, draw_trajectories
+from mavfi_cli.report.top_view import draw_trajectories, panels_of
 from mavfi_cli.reproduction.evidence import item_flights
 from mavfi_cli.reproduction.items import Item
 from mavfi_cli.reproduction.layouts import (
@@ -182,15 +181,14 @@ def _fig13(table: pa.Table, columns: str) -> Figure:
     kept = [Path(path) for path in table["path"].to_pylist() if path]
     if not kept:
         raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
-    with Ledger(kept[0].parents[1]) as ledger:
-        drawn = pair(ledger, among=frozenset(table["number"].to_pylist()))
-    panels = [
-        Panel(
-            title=panel["title"],
-            flights=[(each["name"], load_run(each["path"])) for each in panel["flights"]],
-        )
-        for panel in drawn["panels"]
-    ]
+    folder = kept[0].parents[1]
+    among = frozenset(
+        each["number"]
+        for each in table.select(["number", "path"]).to_pylist()
+        if not each["path"] or Path(each["path"]).parents[1] == folder
+    )
+    with Ledger(folder) as ledger:
+        panels = panels_of(pair(ledger, among=among))
     figure = draw_trajectories(panels, across=1 if columns == "one" else 2)
     for axes in figure.axes:  # room for the legend below the smaller panel
         axes.tick_params(labelsize=SMALLEST, pad=1)

@@ -12,9 +12,9 @@ from mavfi_cli.core.files import write_parquet
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission import run as run_module
-from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.repetition import paired_golden
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 

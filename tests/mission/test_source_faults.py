@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.autonomy.pilot import PilotMode
-from mavfi_cli.mission.golden import paired_golden
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.repetition import paired_golden
 from mavfi_cli.mission.replay import (
     config_of,
     differing_results,
