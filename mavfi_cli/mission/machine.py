@@ -62,7 +62,10 @@ _ALLOW_PTRACE = (
     "allow ptrace: sysctl kernel.yama.ptrace_scope=1; in a container --cap-add SYS_PTRACE"
 )
 _INSTALL = "pip install -e . in the project's folder"
-_EXTRAS = {"train": "torch", "cluster": "distributed", "report": "jinja2"}
+_EXTRAS = {
+    "train": "torch", "cluster": "distributed", "pandas": "pandas", "report": "jinja2",
+    "view": "rerun", "mcap": "mcap",
+}  # fmt: skip
 
 
 def check_machine() -> Iterator[Check]:
