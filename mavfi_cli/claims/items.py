@@ -69,7 +69,7 @@ def shown_items(evidence: Evidence) -> Iterator[ShownItem]:
     summaries = [each.summary for each in evidence.kernels]
     for item in ITEMS:
         if item.source is Source.FLIGHTS:
-            yield from (_flown_item(item, stack, table) for stack, table in tables.items())
+            yield from (_flown_item(item, stack, tables[stack], exports) for stack in STACKS)
         elif item.source is Source.MODEL:
             yield _drawn(item, "performance model", of_model(model_report()))
         elif summaries:
@@ -82,16 +82,23 @@ def _drawn(item: Item, stack: str, table: PaperTable) -> ShownItem:
     return ShownItem(item=item, stack=stack, table=table, figure=draw_table(table, "one"))
 
 
-def _flown_item(item: Item, stack: str, table: pa.Table) -> ShownItem:
+def _flown_item(item: Item, stack: str, table: pa.Table, exports: Sequence[pa.Table]) -> ShownItem:
     mine = _of_kind(item, stack, table)
     struck = mine.filter(pc.is_valid(mine["level"])).num_rows
     if not struck and not (mine.num_rows and item.name in _GOLDEN_ONLY):
         return ShownItem(item=item, stack=stack)
     told = of_flights(item.name, mine)
-    if item.name in _NEED_RUNS and not _kept(mine):
+    drawn = _with_runs(item, stack, exports) if item.name in _NEED_RUNS else mine
+    if drawn is None:
         return ShownItem(item=item, stack=stack, table=told)
-    figure = draw_flights(item.name, told, mine, "one")
+    figure = draw_flights(item.name, told, drawn, "one")
     return ShownItem(item=item, stack=stack, table=told, figure=figure, flights=[*_over_own(mine)])
+
+
+def _with_runs(item: Item, stack: str, exports: Sequence[pa.Table]) -> pa.Table | None:
+    """The item's flights in the first campaign that has kept the run folders of all of them."""
+    each_own = (_of_kind(item, stack, pooled([each], stack)) for each in exports)
+    return next((own for own in each_own if own.num_rows and _kept(own)), None)
 
 
 def _kept(table: pa.Table) -> bool:
