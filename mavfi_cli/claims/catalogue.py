@@ -89,7 +89,7 @@ def _tells(spread: Interval, unit: str, *counts: Count) -> str:
 
 
 def _kernels() -> Iterator[Claim]:
-    runs = f"{_number('fig6', 'runs'):,.0f} runs a kernel tell 2 points"
+    runs = f"{_number('fig6', 'runs'):,.0f} runs a kernel tell differences from 2 points on"
     yield Claim(
         name="fig6-octomap", item="fig6", isolated=True, low=0.0, paper_tells=runs,
         words="Of all isolated kernels, OctoMap most often returns a wrong result silently.",
@@ -129,7 +129,7 @@ def _kernels_in_flight() -> Iterator[Claim]:
         paper="little to negligible",
         effect="success lost by these faults; below 2 points counts as hardly",
         find=find.map_harmless,
-        paper_tells="none lost of 200 would tell less than 2 points",
+        paper_tells="if none of 200 is lost, the loss is below 2 points",
     )  # fmt: skip
     yield Claim(
         name="fig7-check", item="fig7", low=0.0,

@@ -115,8 +115,11 @@ def _judged(
 
 
 def _cell(claim: Claim, found: Finding) -> dict[str, Any]:
+    verdict = judge(found.effect, claim.low, claim.high)
+    if verdict is ClaimVerdict.NOT_FLOWN and found.told:
+        verdict = ClaimVerdict.NOT_JUDGED
     return {
-        "verdict": judge(found.effect, claim.low, claim.high),
+        "verdict": verdict,
         "effect": found.effect,
         "told": found.told,
     }
@@ -152,7 +155,7 @@ def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
     parts = []
     for name in (*STACKS, _ISOLATED):
         found = _counted(claims, name)
-        known = sum(found.values()) - found[ClaimVerdict.NOT_FLOWN]
+        known = sum(found[each] for each, _ in _VERDICTS)
         if known:
             place = f"about {name}" if name == _ISOLATED else f"flown on {name}"
             verdicts = [f"{_are(found[each])} {told}" for each, told in _VERDICTS if found[each]]

@@ -55,10 +55,12 @@ def harm_share(golden: GoldenFlights, flights: Iterable[FlownMission]) -> Share:
 def success_lost(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Finding:
     """Success of the golden flights minus that of the same missions with a fault."""
     pairs = [(own, each) for each in flights if (own := golden.any_of(each)) is not None]
+    if not pairs:
+        return NOTHING
     test = mcnemar([not each.lost for each, _ in pairs], [not each.lost for _, each in pairs])
     change = paired_difference(test)
     return Finding(
-        effect=_turned(change) if test.pairs else None,
+        effect=_turned(change),
         told=f"{count_of(lost_share([each for _, each in pairs]))} lost; golden "
         f"{count_of(lost_share([each for each, _ in pairs]))}",
     )
@@ -140,8 +142,14 @@ class Protected:
         lost = [(own, each) for own, each in self.pairs if own.lost]
         share = wilson(sum(not each.lost for _, each in lost), len(lost))
         if not share.total:
-            return Finding(effect=None, told=f"0 of {len(self.pairs):,} lost without")
+            return self._none("lost")
         return Finding(effect=as_interval(share), told=f"{count_of(share)} lost missions saved")
+
+    def _none(self, what: str) -> Finding:
+        """What is told if none of the faults, flown without the detector, had an effect."""
+        if not self.pairs:
+            return NOTHING
+        return Finding(effect=None, told=f"without it 0 of {len(self.pairs):,} {what}")
 
     def undone(self, *, longer_only: bool = False) -> Share:
         """The share of harmful faults that do no harm with the detector."""
@@ -156,7 +164,7 @@ class Protected:
         """The share of longer flights that the detector brings back within 5 %."""
         share = self.undone(longer_only=True)
         if not share.total:
-            return NOTHING
+            return self._none("over 5 % longer")
         return Finding(
             effect=as_interval(share), told=f"{count_of(share)} longer flights brought back"
         )

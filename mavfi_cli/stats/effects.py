@@ -28,6 +28,7 @@ class ClaimVerdict(Enum):
     NOT_REPRODUCED = "not reproduced"
     OPEN = "not distinguishable"  # at this number of missions
     NOT_FLOWN = "not flown"
+    NOT_JUDGED = "not judged"  # flown, but no number came of it
 
 
 def judge(effect: Interval | None, low: float = -math.inf, high: float = math.inf) -> ClaimVerdict:

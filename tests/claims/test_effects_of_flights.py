@@ -96,7 +96,8 @@ def test_a_detector_saves_lost_missions_and_brings_long_ones_back():
 def test_nothing_to_recover_says_so():
     found = Protected.of(flights(watched(pairs(20.0), "gad", 20.0)), "gad").recovered()
     assert found.effect is None
-    assert found.told == "0 of 1 lost without"
+    assert found.told == "without it 0 of 1 lost"
+    assert Protected.of(flights(pairs(20.0)), "gad").recovered().told == ""
 
 
 def test_what_is_not_of_the_paper_is_marked():

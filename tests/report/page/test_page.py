@@ -16,7 +16,8 @@ from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.shares import wilson
 
 PHONE, DESKTOP = 390, 1280
-VERDICTS = {"✓ reproduced", "✗ not reproduced", "≈ not distinguishable", "· not flown"}
+VERDICTS = {"✓ reproduced", "✗ not reproduced", "≈ not distinguishable", "· not flown",
+            "· not judged"}  # fmt: skip
 
 
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])
