@@ -31,6 +31,8 @@ autodoc_typehints = "description"
 
 html_theme = "furo"
 html_title = f"mavfi {release}"
+html_static_path = ["static"]
+html_css_files = ["tables.css"]
 html_copy_source = False
 html_show_sphinx = False
 html_show_copyright = False
