@@ -19,6 +19,8 @@ FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}
 OWN_AUTOPILOT = "ours"
 _REPEATING = (OWN_AUTOPILOT, "ardupilot")  # autopilots whose flights repeat exactly
 _LOSS_LIMIT_S = 5.0
+_NEEDS_LINK = "needs --link, a link to a foreign autopilot"
+_SIMULATED = "the simulated vehicle, which a flight with --link does not have"
 OF_THE_WORLD = (
     "world", "world_seed", "vehicle", "start", "camera_columns", "camera_rows",
 )  # fmt: skip
@@ -151,21 +153,21 @@ class MissionConfig:
 
     def _check_link(self) -> None:
         if self.eyes and self.link is None:
-            raise ConfigError("are for a foreign autopilot: needs --link", key="eyes")
+            raise ConfigError(_NEEDS_LINK, key="eyes")
         if self.origin is not None and not self.eyes:
-            raise ConfigError("needs --eyes, which know the world", key="origin")
+            raise ConfigError("needs --eyes: without them no world is known", key="origin")
         if self.link is not None:
             self._check_foreign()
             return
         if self.key_file is not None:
-            raise ConfigError("signs a link to a foreign autopilot: needs --link", key="key_file")
+            raise ConfigError(_NEEDS_LINK, key="key_file")
         if self.loss_limit_s != _LOSS_LIMIT_S:
-            raise ConfigError("is for a foreign autopilot: needs --link", key="loss_limit_s")
+            raise ConfigError(_NEEDS_LINK, key="loss_limit_s")
 
     def _check_foreign(self) -> None:
         """Reject what has no meaning for a foreign autopilot."""
         if self.realtime:
-            raise ConfigError("paces the simulated vehicle: without --link", key="realtime")
+            raise ConfigError(f"paces {_SIMULATED}", key="realtime")
         if self.eyes:
             return
         if self.goal is None:
@@ -197,7 +199,7 @@ class MissionConfig:
         if self.autopilot == OWN_AUTOPILOT:
             return
         if self.link is not None:
-            raise ConfigError("flies our vehicle, without --link", key="autopilot")
+            raise ConfigError(f"flies {_SIMULATED}", key="autopilot")
         repeats = self.autopilot in _REPEATING and not self.realtime
         if self.instruction is not None and not repeats:
             paced = " with --realtime" if self.realtime else ""

@@ -119,7 +119,7 @@ def _collect_flown(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], 
     runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
     usable = [run for run in runs if _is_error_free(run, stack)]
     if not usable:
-        told = f"{len(runs)} runs, and no error-free flight of the stack {stack.name!r} among them"
+        told = f"no error-free flight of the stack {stack.name!r} among {len(runs)} runs"
         raise ModelError(told, path=flown)
     flights: dict[tuple[str, int], FlightSamples] = {}
     for run in usable:

@@ -254,7 +254,7 @@ LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
     ("arguments", "said"),
     [
         (["--bits", "3"], "--bits needs --inject"),
-        (["--loss-limit", "3"], "--loss-limit: is for a foreign autopilot: needs --link"),
+        (["--loss-limit", "3"], "--loss-limit: needs --link, a link to a foreign autopilot"),
         (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
         (["--field", "sign"], "--field needs --inject"),
         (["--level", "instruction"], "--level instruction needs --inject NODE"),
@@ -266,7 +266,7 @@ LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
         ([*LINK, "--start", "1,2,0"], "--start has no meaning with --link unless --eyes"),
         ([*LINK, "--world-seed", "4"], "--world-seed has no meaning with --link unless --eyes"),
         ([*LINK, "--eyes", "--realtime"], "--realtime: paces the simulated vehicle"),
-        (["--eyes"], "--eyes: are for a foreign autopilot: needs --link"),
+        (["--eyes"], "--eyes: needs --link, a link to a foreign autopilot"),
         ([*LINK, "--origin", "1,2,0"], "--origin: needs --eyes"),
         (["--inject", "planning", "--site", "flags"], "--site needs --level instruction"),
         (["--level", "instruction", "--inject", "octomap", "--at", "tick=3"], "--at needs --level"),

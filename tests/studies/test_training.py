@@ -124,7 +124,7 @@ def test_a_detector_is_fitted_to_the_error_free_flights_of_a_folder(mavfi, flown
 
 def test_a_folder_without_flights_of_the_stack_is_told(mavfi, flown):
     done = mavfi("train", "--flown", flown, "--stack", "mavbench-release", "--quiet")
-    problem = "13 runs, and no error-free flight of the stack 'mavbench-release' among them"
+    problem = "no error-free flight of the stack 'mavbench-release' among 13 runs"
     assert (done.returncode, done.stderr) == (1, f"error: {flown}: {problem}\n")
 
 
