@@ -113,6 +113,3 @@ class AutoencoderDetector(FittedDetector):
         """Return the reconstruction error: the mean square over the 13 scaled deltas."""
         error: float = _reconstruction_error(self.flat, deltas)
         return error
-
-    def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Do nothing, because the net is trained beforehand."""

@@ -13,8 +13,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from mavfi_cli.core.types import FloatArray, StackMark
+from mavfi_cli.core.types import FloatArray, StackMark, Stage
 from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.preprocess import Codes
 from mavfi_cli.detect.watch import Ranges
 
 Shapes = dict[str, tuple[int, ...]]
@@ -87,6 +88,9 @@ class FittedDetector:
         if threshold is not None:
             detector.flat[0] = model_file.checked_threshold(threshold)
         return detector
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Do nothing, because most models are fixed in flight. See `base.Detector`."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {"flat": self.flat, "stack": self.stack, "extended": self.extended}

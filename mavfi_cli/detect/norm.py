@@ -24,9 +24,6 @@ class NormDetector(FittedDetector):
         length: float = _norm(self.flat, deltas)
         return length
 
-    def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Do nothing, because the scales are fixed."""
-
 
 @compiled
 def _norm(memory: FloatArray, deltas: Codes) -> float:

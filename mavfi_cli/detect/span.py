@@ -26,9 +26,6 @@ class RangeDetector(FittedDetector):
         distance: float = _outside(self.flat, deltas, first, end)
         return distance
 
-    def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Do nothing, because the ranges are fixed."""
-
 
 @compiled
 def _outside(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:

@@ -22,6 +22,9 @@ from mavfi_cli.fi.source.fault import (
 )
 from mavfi_cli.spec.platform import KERNELS
 
+if TYPE_CHECKING:
+    from mavfi_cli.fi.tracer.sampling import Strategy
+
 _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector
 PROCESS = "process"  # target prefix: process of a node
@@ -205,9 +208,6 @@ def _parse_trigger(text: str) -> Trigger:
     except ValueError:
         raise FaultSpecError(f"{text!r}: {kind} needs a number, as in {kind}=12") from None
 
-
-if TYPE_CHECKING:
-    from mavfi_cli.fi.tracer.sampling import Strategy
 
 UNIFORM = "instruction-uniform"  # the one rule whose draws can be repeated
 _NODES = {
