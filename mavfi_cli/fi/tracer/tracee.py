@@ -40,7 +40,7 @@ from mavfi_cli.fi.tracer.linux import ProcessTimer
 
 TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL = 1, 2, 4, 6, 0x80
 
-DETOUR_COST = 20  # to make a detour takes as long as some 15 counted hits
+DETOUR_COST = 20  # counted hits from which a detour is quicker; to make one takes some 15 hits
 _DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # of a detour's pages from the code, bytes
 _PAGES_BYTES = 8192
 _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP_FIXED_NOREPLACE

@@ -41,7 +41,7 @@ _TALLEST_M = 15.0  # towers of generated worlds are 1000 m high, flights at most
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """What is true of one thing from one moment on."""
+    """The state of one thing from a moment on."""
 
     path: str
     stamp_s: float
@@ -242,12 +242,10 @@ def _line(
     width_m: float,
 ) -> Line:
     """Return a line through those points (n, 3) that are numbers."""
-    points = points_enu_m.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)].clip(-_FARTHEST_M, _FARTHEST_M)
     return Line(
         path=f"{flight.name}/{name}",
         stamp_s=stamp_s,
-        points_enu_m=_drawable(points),
+        points_enu_m=_drawable(points_enu_m),
         colour=colour,
         width_m=width_m,
     )
