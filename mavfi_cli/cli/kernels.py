@@ -134,7 +134,7 @@ def _attacked(
     plan: Plan, targets: Sequence[AttackTarget], options: dict[str, Any], folder: Path | None
 ) -> list[TargetRuns]:
     from mavfi_cli.attack.campaign import run_campaign
-    from mavfi_cli.cli.runs_view import runs_view
+    from mavfi_cli.cli.progress import runs_view
 
     with runs_view([target.name for target in targets], plan.runs) as view:
         return run_campaign(
@@ -144,7 +144,7 @@ def _attacked(
             folder=folder,
             progress=view.show,
             stage=view.stage,
-            notice=lambda text: click.echo(f"warning: {text}", err=True),
+            notice=lambda text: view.note(f"warning: {text}"),
         )
 
 

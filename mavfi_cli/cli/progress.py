@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from mavfi_cli.spec.mission import MissionConfig
 
-PLAIN_EVERY_S = 10.0
+PLAIN_EVERY_S, _REDRAW_S = 10.0, 0.05
 _TOLD = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")
 _MOST_SETTINGS = 6  # more settings have no rates here; `campaign status` shows all
 _Part = str | tuple[str, str]  # text, or text and its style on a terminal
@@ -45,7 +46,7 @@ class _LiveLine(_Lines):
     """One line that is rewritten, with notes scrolling above it."""
 
     def __init__(self, live: Live) -> None:
-        self._live = live
+        self._live, self._next_s = live, 0.0
 
     def note(self, *parts: _Part) -> None:
         from rich.text import Text  # no markup: an autopilot may send any text
@@ -53,7 +54,12 @@ class _LiveLine(_Lines):
         self._live.console.print(Text.assemble(*parts))
 
     def update(self, text: str, at_s: float, *, last: bool = False) -> None:
-        self._live.update(text, refresh=True)
+        from rich.text import Text
+
+        now_s = time.monotonic()
+        if now_s >= self._next_s or last:  # to draw takes longer than some of what is told
+            self._next_s = now_s + _REDRAW_S
+            self._live.update(Text(text), refresh=True)
 
 
 @contextmanager
@@ -106,6 +112,44 @@ class _MissionsView(Spectator):
 
     def on_step(self, text: str, elapsed_s: float) -> None:
         self._screen.update(text, elapsed_s)
+
+
+class RunsView:
+    """Runs of isolated kernels: which kernel, how many runs, and the time left."""
+
+    def __init__(self, screen: _Lines, kernels: Sequence[str], runs: int) -> None:
+        self._screen, self._kernels, self._runs = screen, list(kernels), runs
+        self._begun_s, self._kernel = time.monotonic(), ""
+
+    def show(self, kernel: str, done: int) -> None:
+        """Tell the number of completed runs of a kernel."""
+        if kernel != self._kernel:
+            self._kernel = kernel
+            self.note(f"{kernel}: golden run and profile")
+        over = self._kernels.index(kernel) * self._runs + done
+        total, elapsed_s = self._runs * len(self._kernels), self._elapsed_s()
+        text = f"{kernel}: {done}/{self._runs} runs; {over}/{total} in all"
+        if 0 < over < total:
+            text += f", {duration(elapsed_s * (total - over) / over)} to go"
+        self._screen.update(text, elapsed_s, last=over == total)
+
+    def stage(self, what: str) -> None:
+        """Tell the step before the first run of a kernel."""
+        self._screen.update(f"{self._kernel}: {what}", self._elapsed_s())
+
+    def note(self, text: str) -> None:
+        """Tell something at once."""
+        self._screen.note(text)
+
+    def _elapsed_s(self) -> float:
+        return time.monotonic() - self._begun_s
+
+
+@contextmanager
+def runs_view(kernels: Sequence[str], runs: int) -> Iterator[RunsView]:
+    """The view of runs of isolated kernels for stderr."""
+    with _screen(PLAIN_EVERY_S) as screen:
+        yield RunsView(screen, kernels, runs)
 
 
 @contextmanager
