@@ -66,7 +66,8 @@ def draw_flights(name: str, table: PaperTable, flights: pa.Table, columns: str) 
     """Draw the figure of an item from its flights, or the dots of its table.
 
     Args:
-        flights: as `analysis.flights.flights`. `fig13` needs their kept run folders.
+        flights: as `analysis.flights.flights`. `fig13` needs their kept run folders,
+            of one campaign.
 
     Raises:
         RecordError: these are not there.
@@ -181,14 +182,8 @@ def _fig13(table: pa.Table, columns: str) -> Figure:
     kept = [Path(path) for path in table["path"].to_pylist() if path]
     if not kept:
         raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
-    folder = kept[0].parents[1]
-    among = frozenset(
-        each["number"]
-        for each in table.select(["number", "path"]).to_pylist()
-        if not each["path"] or Path(each["path"]).parents[1] == folder
-    )
-    with Ledger(folder) as ledger:
-        panels = panels_of(pair(ledger, among=among))
+    with Ledger(kept[0].parents[1]) as ledger:
+        panels = panels_of(pair(ledger, among=frozenset(table["number"].to_pylist())))
     figure = draw_trajectories(panels, across=1 if columns == "one" else 2)
     for axes in figure.axes:  # room for the legend below the smaller panel
         axes.tick_params(labelsize=SMALLEST, pad=1)
