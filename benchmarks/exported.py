@@ -13,7 +13,6 @@ from mavfi_cli.stats.shares import wilson
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
-LONGER = 1.05  # a flight is longer if it takes more than this times its golden flight
 
 
 def arguments(text: str | None) -> argparse.ArgumentParser:

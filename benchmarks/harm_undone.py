@@ -17,7 +17,9 @@ from __future__ import annotations
 import collections
 import itertools
 
-from exported import LONGER, Key, Row, against, arguments, flown, key, lost, share
+from exported import Key, Row, against, arguments, flown, key, lost, share
+
+from mavfi_cli.claims.flights import LONGER
 
 MISSION = ("world", "world_seed", "seed", "platform")
 FAULT = ("fault_target", "fault_field", "fault_seed")

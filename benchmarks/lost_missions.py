@@ -14,7 +14,9 @@ from __future__ import annotations
 import collections
 from collections.abc import Iterable
 
-from exported import LONGER, Row, arguments, flown, key, lost, share
+from exported import Row, arguments, flown, key, lost, share
+
+from mavfi_cli.claims.flights import LONGER
 
 PAIRED = ("world", "world_seed", "seed", "stack", "platform")
 

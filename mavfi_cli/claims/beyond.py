@@ -47,7 +47,7 @@ def _fate_of(golden: GoldenFlights, flight: FlownMission) -> Fate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KernelFlow:
+class _KernelFlow:
     """Faults in one kernel: what it did, and what became of the missions.
 
     Attributes:
@@ -68,7 +68,7 @@ class KernelFlow:
 
 def kernel_flows(
     flights: Sequence[FlownMission], alone: Mapping[str, tuple[int, int]]
-) -> list[KernelFlow]:
+) -> list[_KernelFlow]:
     """The flow from kernel to mission, for each kernel that instruction-level faults struck.
 
     Args:
@@ -90,13 +90,13 @@ _ORDER = {"point_cloud": 0, "octomap": 1, "collision_check": 2, "rrtstar": 3, "c
 
 def _flow(
     name: str, flights: Sequence[FlownMission], golden: GoldenFlights, alone: tuple[int, int] | None
-) -> KernelFlow:
+) -> _KernelFlow:
     by_fate: dict[Fate, list[FlownMission]] = {fate: [] for fate in Fate}
     for each in flights:
         by_fate[_fate_of(golden, each)].append(each)
     lived = sum(each.lost for fate in (Fate.SAME, Fate.CHANGED) for each in by_fate[fate])
     layers = None if alone is None else cross_layer(*alone, lived, len(flights))
-    return KernelFlow(
+    return _KernelFlow(
         kernel=name,
         fates={fate: lost_share(those) for fate, those in by_fate.items()},
         lost=lost_share(flights),
@@ -165,7 +165,7 @@ def _class(flight: FlownMission) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HourlyFailures:
+class _HourlyFailures:
     """Failures of missions a flight hour, for one kind of fault in one world.
 
     Attributes:
@@ -182,7 +182,7 @@ class HourlyFailures:
 
 def hourly_failures(
     flights: Sequence[FlownMission], upsets_per_hour: float
-) -> list[HourlyFailures]:
+) -> list[_HourlyFailures]:
     """Failures an hour of every kind of fault, by world and detector.
 
     Args:
@@ -196,7 +196,7 @@ def hourly_failures(
     for place, by_detector in sorted(kinds.items()):
         lost = {name: lost_share(those) for name, those in sorted(by_detector.items())}
         hourly = {name: failures_per_hour(upsets_per_hour, each) for name, each in lost.items()}
-        found.append(HourlyFailures(where=place, lost=lost, per_hour=hourly))
+        found.append(_HourlyFailures(where=place, lost=lost, per_hour=hourly))
     return found
 
 

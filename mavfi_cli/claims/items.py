@@ -45,7 +45,7 @@ _KINDS = dict.fromkeys(_TEXTS, pa.string()) | dict.fromkeys(_NUMBERS, pa.float64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShownItem:
+class _ShownItem:
     """A table or figure of the paper, on one stack.
 
     Attributes:
@@ -62,7 +62,7 @@ class ShownItem:
     flights: Sequence[Mapping[str, Any]] = ()
 
 
-def shown_items(evidence: Evidence) -> Iterator[ShownItem]:
+def shown_items(evidence: Evidence) -> Iterator[_ShownItem]:
     """Every item on every stack, in the paper's order."""
     exports = [each.table for each in evidence.campaigns]
     tables = {stack: pooled(exports, stack) for stack in STACKS}
@@ -75,24 +75,24 @@ def shown_items(evidence: Evidence) -> Iterator[ShownItem]:
         elif summaries:
             yield from (_drawn(item, "isolated kernels", of_kernels(each)) for each in summaries)
         else:
-            yield ShownItem(item=item, stack="isolated kernels")
+            yield _ShownItem(item=item, stack="isolated kernels")
 
 
-def _drawn(item: Item, stack: str, table: PaperTable) -> ShownItem:
-    return ShownItem(item=item, stack=stack, table=table, figure=draw_table(table, "one"))
+def _drawn(item: Item, stack: str, table: PaperTable) -> _ShownItem:
+    return _ShownItem(item=item, stack=stack, table=table, figure=draw_table(table, "one"))
 
 
-def _flown_item(item: Item, stack: str, table: pa.Table, exports: Sequence[pa.Table]) -> ShownItem:
+def _flown_item(item: Item, stack: str, table: pa.Table, exports: Sequence[pa.Table]) -> _ShownItem:
     mine = _of_kind(item, stack, table)
     struck = mine.filter(pc.is_valid(mine["level"])).num_rows
     if not struck and not (mine.num_rows and item.name in _GOLDEN_ONLY):
-        return ShownItem(item=item, stack=stack)
+        return _ShownItem(item=item, stack=stack)
     told = of_flights(item.name, mine)
     drawn = _with_runs(item, stack, exports) if item.name in _NEED_RUNS else mine
     if drawn is None:
-        return ShownItem(item=item, stack=stack, table=told)
+        return _ShownItem(item=item, stack=stack, table=told)
     figure = draw_flights(item.name, told, drawn, "one")
-    return ShownItem(item=item, stack=stack, table=told, figure=figure, flights=[*_over_own(mine)])
+    return _ShownItem(item=item, stack=stack, table=told, figure=figure, flights=[*_over_own(mine)])
 
 
 def _with_runs(item: Item, stack: str, exports: Sequence[pa.Table]) -> pa.Table | None:

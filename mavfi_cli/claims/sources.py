@@ -56,7 +56,7 @@ class CampaignSource:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KernelSource:
+class _KernelSource:
     """Attacked kernels: the summary that `mavfi kernels --out` writes."""
 
     path: Path
@@ -72,7 +72,7 @@ class Evidence:
     """
 
     campaigns: Sequence[CampaignSource]
-    kernels: Sequence[KernelSource]
+    kernels: Sequence[_KernelSource]
     problems: Sequence[str]
 
     def missions(self, stack: str | None = None) -> list[FlownMission]:
@@ -95,7 +95,7 @@ def gather(places: Sequence[Path]) -> Evidence:
         RecordError: a place does not exist, or nothing in them can be read.
     """
     campaigns: list[CampaignSource] = []
-    kernels: list[KernelSource] = []
+    kernels: list[_KernelSource] = []
     problems: list[str] = []
     for place in places:
         before = len(campaigns) + len(kernels) + len(problems)
@@ -105,7 +105,7 @@ def gather(places: Sequence[Path]) -> Evidence:
             except (MavfiError, OSError) as error:
                 problems.append(f"Not read: {error}.")
                 continue
-            if isinstance(each, KernelSource):
+            if isinstance(each, _KernelSource):
                 kernels.append(each)
             else:
                 campaigns.append(each)
@@ -139,12 +139,12 @@ def _inside_campaign(path: Path, place: Path) -> bool:
     return any((each / LEDGER).is_file() for each in above)
 
 
-def _read(path: Path) -> CampaignSource | KernelSource:
+def _read(path: Path) -> CampaignSource | _KernelSource:
     if path.name == LEDGER:
         return _from_ledger(path.parent)
     if path.suffix == _EXPORT:
         return _from_export(path)
-    return KernelSource(path=path, summary=kernel_summary(path))
+    return _KernelSource(path=path, summary=kernel_summary(path))
 
 
 def _from_ledger(folder: Path) -> CampaignSource:
