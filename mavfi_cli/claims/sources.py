@@ -172,12 +172,16 @@ def _from_export(path: Path) -> CampaignSource:
     if lacking:
         raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
     spec = _spec_beside(path)
+    try:
+        flown = flights_of(table, path)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise RecordError(f"{path}: not an export of a campaign ({error})") from None
     return CampaignSource(
         path=path,
         name=path.stem,
         spec=spec,
         planned=None,
-        flights=flights_of(table, path),
+        flights=flown,
         errors=table["state"].to_pylist().count("error"),
         digest=file_digest(path),
         table=table,

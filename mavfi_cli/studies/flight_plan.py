@@ -46,7 +46,6 @@ class FlightPlan:
     Attributes:
         mission: configuration without world and seed.
         files: TOML files of the mission, by path.
-        model_velocity_mps: safe velocity of the flights, if the mission allows it.
         braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
         rotors_w: electrical hover power with all boards, by the model.
         boards_w: power of all boards.
@@ -56,7 +55,6 @@ class FlightPlan:
     scheme: Scheme
     mission: MissionConfig
     files: Mapping[Path, str]
-    model_velocity_mps: float
     braking_velocity_mps: float
     rotors_w: float
     boards_w: float
@@ -161,7 +159,6 @@ def flight_plan(
             detector=detector,
         ),
         files=dict((vehicle, computer)),
-        model_velocity_mps=flown.velocity_mps,
         braking_velocity_mps=safe_velocity_mps(
             BRAKE_SHARE * accel_mps2, setting.response_s(scheme.overhead), setting.range_m
         ),

@@ -102,11 +102,12 @@ def test_what_cannot_be_read_is_told_and_the_rest_is_used(tmp_path, campaign):
     (tmp_path / "torn" / "ledger.sqlite").write_bytes(b"SQLite format 3\0 and no more")
     (tmp_path / "other.parquet").write_bytes(b"PAR1")
     pq.write_table(table([row()]).select(["number", "world"]), tmp_path / "foreign.parquet")
+    pq.write_table(table([row() | {"changes": "no json"}]), tmp_path / "odd.parquet")
     (tmp_path / "kernels.json").write_text("[]")
     found = gather([tmp_path])
     assert len(found.campaigns) == 1
     told = "\n".join(found.problems)
-    for name in ("torn", "other.parquet", "foreign.parquet", "kernels.json"):
+    for name in ("torn", "other.parquet", "foreign.parquet", "odd.parquet", "kernels.json"):
         assert name in told
     assert "no column 'pair'" in told
 
