@@ -123,7 +123,7 @@ class Signing:
         """
         if len(data) < 3 or data[0] != _V2 or not data[2] & _SIGNED:
             return False
-        length = _frame_length(data, 0, len(data))
+        length = frame_length(data, 0, len(data))
         return length > 0 and self._is_new(data[:length], _V2_HEADER)
 
     def _is_new(self, frame: bytes, header: int) -> bool:
@@ -348,7 +348,7 @@ class Codec:
                 self.bad_bytes += following - position
                 position = following
                 continue
-            length = _frame_length(buffer, position, end)
+            length = frame_length(buffer, position, end)
             if length == _INCOMPLETE and not datagram:
                 break
             if length > 0 and self._take(buffer, position, position + length, messages):
@@ -396,11 +396,11 @@ class Codec:
 
 def begins_with_frame(data: bytes) -> bool:
     """Return True if data begins with a whole frame of the dialect whose checksum is right."""
-    length = _frame_length(data, 0, len(data)) if data[:1] in (b"\xfd", b"\xfe") else 0
+    length = frame_length(data, 0, len(data)) if data[:1] in (b"\xfd", b"\xfe") else 0
     return length > 0 and bool(Codec(0, 0).decode(data[:length], datagram=True))
 
 
-def _frame_length(buffer: bytes, position: int, end: int) -> int:
+def frame_length(buffer: bytes, position: int, end: int) -> int:
     """Return the length of a frame that starts here, _INCOMPLETE, or 0 if none can start here."""
     if end - position < 3:
         return _INCOMPLETE

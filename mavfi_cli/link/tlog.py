@@ -14,13 +14,32 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.link.codec import Codec, Message, Signing
+from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_length
 from mavfi_cli.link.seat import two_autopilots
 from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
 _FLUSH_BYTES = 1 << 16
 _FLUSH_INTERVAL_S = 1.0  # of the stamps
+
+
+def unix_time_of_stamp_0(path: Path) -> float:
+    """Return the Unix time, s, of stamp 0 of a foreign flight, from the first state in its tlog.
+
+    EPOCH_UNIX_S without a state. Raises RecordError if the file cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{path}: cannot read: {error.strerror or error}") from None
+    codec, start = Codec(0, 0), 0
+    while (length := frame_length(data, start + 8, len(data))) > 0:
+        for message in codec.decode(data[start + 8 : start + 8 + length], datagram=True):
+            if isinstance(message, dialect.MAVLink_local_position_ned_message):
+                time_us, stamp_ms = data[start : start + 8], int(message.time_boot_ms)
+                return int.from_bytes(time_us, "big") / 1e6 - stamp_ms / 1e3
+        start += 8 + length
+    return EPOCH_UNIX_S
 
 
 class TlogWriter:

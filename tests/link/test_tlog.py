@@ -14,7 +14,7 @@ import pytest
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.link.codec import Codec, dialect
-from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter
+from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter, unix_time_of_stamp_0
 
 MAVLOGDUMP = Path(pymavlink.__file__).parent / "tools" / "mavlogdump.py"
 
@@ -139,3 +139,15 @@ def test_a_disk_that_fills_up_keeps_whole_records(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="No such file or directory"):
         TlogWriter(tmp_path / "nowhere" / "log")
+
+
+def test_a_foreign_flight_tells_its_date_by_its_first_state(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    with contextlib.closing(TlogWriter(path, epoch_unix_s=0)) as log:
+        log.write(1_790_000_000.0, Codec(1, 1).encode(dialect.MAVLink_ping_message(0, 0, 0, 0)))
+        log.write(1_790_000_007.5, _frames(3)[4])  # its stamp is 0.04 s
+    assert unix_time_of_stamp_0(path) == pytest.approx(1_790_000_007.46)
+    path.write_bytes(b"")
+    assert unix_time_of_stamp_0(path) == EPOCH_UNIX_S
+    with pytest.raises(RecordError, match="none: cannot read"):
+        unix_time_of_stamp_0(tmp_path / "none")

@@ -13,6 +13,7 @@ import numpy as np
 import pymavlink
 import pytest
 from fake_autopilot import FakeArduCopter, FakePX4
+from mcap.reader import make_reader
 
 from mavfi_cli.autonomy import warm
 from mavfi_cli.core.errors import (
@@ -27,6 +28,8 @@ from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.mission import flight
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.report.view.entries import ViewedFlight
+from mavfi_cli.report.view.mcap_file import write_mcap
 
 MAVLOGDUMP = Path(pymavlink.__file__).parent / "tools" / "mavlogdump.py"
 
@@ -39,12 +42,20 @@ def dumped_stamps(tlog):
     return [each["meta"]["timestamp"] for each in found]
 
 
-def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_event):
+def summary_of(path):
+    with path.open("rb") as stream:
+        return make_reader(stream).get_summary().statistics
+
+
+def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_event, tmp_path):
     watcher = at_event("", None)
     begun = time.time()
     run = load_run(fly_short(watcher, link=sitl_on_udp, start=None, land=True).path)
     dates = dumped_stamps(run.folder.tlog)
     assert begun <= dates[0] < dates[-1] <= time.time()
+    write_mcap([ViewedFlight(name="flight", run=run, recorder=None)], tmp_path / "flight.mcap")
+    told = summary_of(tmp_path / "flight.mcap")
+    assert begun <= told.message_start_time / 1e9 <= time.time()
     assert run.result["outcome"] == "success"
     assert run.result["referee"] is None
     assert run.result["world"] is None

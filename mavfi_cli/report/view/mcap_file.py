@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -36,7 +37,7 @@ from mcap_protobuf.schema import register_schema
 
 from mavfi_cli.core.files import plain, write_atomically
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.link.tlog import EPOCH_UNIX_S
+from mavfi_cli.link.tlog import EPOCH_UNIX_S, unix_time_of_stamp_0
 from mavfi_cli.report.drawing import rgb
 from mavfi_cli.report.view.entries import (
     Boxes,
@@ -63,12 +64,17 @@ _AXES = [
 def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
     """Write flights as an MCAP file, atomically. Equal flights give equal bytes.
 
-    The time of a message is that of the flight's tlog: stamp 0 is EPOCH_UNIX_S.
+    The time of a message is that of the first flight's tlog: stamp 0 is EPOCH_UNIX_S, and for a
+    foreign autopilot the date of the flight counts.
 
     Raises:
-        RecordError: The file could not be written.
+        RecordError: The file could not be written, or the tlog of a foreign flight not be read.
     """
-    write_atomically(path, lambda file: _write(entries_of(flights), file))
+    run, entries = flights[0].run, entries_of(flights)
+    if run.record.config.get("link") is not None:
+        later_s = unix_time_of_stamp_0(run.folder.tlog) - EPOCH_UNIX_S
+        entries = (replace(entry, stamp_s=entry.stamp_s + later_s) for entry in entries)
+    write_atomically(path, lambda file: _write(entries, file))
 
 
 def _write(entries: Iterable[Entry], file: BinaryIO) -> None:
