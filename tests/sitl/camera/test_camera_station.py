@@ -334,3 +334,32 @@ def test_a_second_companion_joins_where_the_first_was(tmp_path: Path) -> None:
             far.close()
         assert heard == [1, 2]
         assert len(list(router.peers)) == 2
+
+
+def test_a_second_autopilot_of_an_endpoint_is_told_and_not_followed() -> None:
+    """Until the first has been silent for 5 s."""
+    now_s, heard = [0.0], []
+    with contextlib.ExitStack() as stack:
+        router = Router(["udpin:127.0.0.1:0"], clock=lambda: now_s[0])
+        stack.enter_context(contextlib.closing(router))
+        router.take = lambda message: bool(heard.append(message.custom_mode))
+        port = router.peers._endpoints[0][1].port  # type: ignore[attr-defined]
+        first, second = (
+            stack.enter_context(contextlib.closing(open_transport(f"udpout:127.0.0.1:{port}")))
+            for _ in range(2)
+        )
+        for far, mode in ((first, 1), (second, 2), (first, 1)):
+            far.send(Codec(7, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0, mode, 4, 3)))
+            router.peers.wait(1.0)
+            router.serve()
+        assert heard == [1, 1]
+        told, codec = "", Codec(255, 190)
+        while data := first.receive(0.1):
+            told += "".join(m.text for m in codec.decode(data) if m.get_type() == "STATUSTEXT")
+        ports = [far._socket.getsockname()[1] for far in (first, second)]  # type: ignore[attr-defined]
+        assert told == "two autopilots send here, 127.0.0.1:{} and 127.0.0.1:{}".format(*ports)
+        now_s[0] = 5.0
+        second.send(Codec(7, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0, 2, 4, 3)))
+        router.peers.wait(1.0)
+        router.serve()
+        assert heard == [1, 1, 2]
