@@ -76,7 +76,7 @@ def test_a_wrong_setting_is_named():
         mavfi.fly(planer="rrt")
     with pytest.raises(UnknownKey, match=r"fault\.bit.*bits"):
         mavfi.fly(fault={"target": "planning", "bit": 3})
-    with pytest.raises(ConfigError, match="expected int"):
+    with pytest.raises(ConfigError, match="expected a whole number"):
         mavfi.fly(seed="3")
 
 

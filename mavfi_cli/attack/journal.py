@@ -109,8 +109,10 @@ def read_plan(folder: Path) -> dict[str, Any]:
     path = folder / PLAN
     try:
         plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RecordError(f"{path}: {error}") from None
+    except OSError as error:
+        raise RecordError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise RecordError(f"{path}: damaged ({error})") from None
     return plan
 
 

@@ -133,13 +133,16 @@ class _Extra(Exception):
         self.key, self.known = key, known
 
 
+_IN_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+
 def _strict(kind: type, *accepted: type) -> Any:
     def hook(value: Any, _cls: Any) -> Any:
         """Raise TypeError for a value of another type and ValueError for one that is not finite."""
         if isinstance(value, bool) is not (kind is bool) or not isinstance(
             value, (kind, *accepted)
         ):
-            raise TypeError(f"expected {kind.__name__}, got {value!r}")
+            raise TypeError(f"expected {_IN_WORDS[kind]}, got {value!r}")
         if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"expected a finite number, got {value!r}")
         return kind(value)

@@ -108,8 +108,8 @@ def test_a_long_name_ends_with_a_digest_of_the_changes():
         (("field=sign",), ConfigError,
          r"field: the campaign has no such factor to replace; it has bits, detector, planner, "),
         (("seed=3",), ConfigError, r"seed: the campaign has no such factor"),
-        (("bits=one",), ConfigError, r"bits: expected int"),
-        (("time_limit_s=long",), ConfigError, r"time_limit_s: expected float"),
+        (("bits=one",), ConfigError, r"bits: expected a whole number"),
+        (("time_limit_s=long",), ConfigError, r"time_limit_s: expected a number"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_replaced_is_refused(changes, error, problem):

@@ -54,9 +54,9 @@ def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name = 3\nbox = []", r"file\.toml:1: name: expected str, got 3"),
-        ('name = "x"\n[[box]]\na = "k"', r"file\.toml:3: box\[0\]\.a: expected float, got 'k'"),
-        ('name = "x"\nbox = []\npair = [1, true]', r"pair\[1\]: expected float, got True"),
+        ("name = 3\nbox = []", r"file\.toml:1: name: expected text, got 3"),
+        ('name = "x"\n[[box]]\na = "k"', r"file\.toml:3: box\[0\]\.a: expected a number, got 'k'"),
+        ('name = "x"\nbox = []\npair = [1, true]', r"pair\[1\]: expected a number, got True"),
         ('name = "x"\n[[box]]\na = nan', "expected a finite number"),
         ('name = "x"\nbox = []\n[sub]\nb = 1', r"sub\.a: is missing"),
         ('name = "x"', "box: is missing"),

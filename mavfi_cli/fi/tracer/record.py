@@ -150,8 +150,10 @@ def read(path: Path) -> dict[str, Any]:
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RecordError(f"{path}: {error}") from None
+    except OSError as error:
+        raise RecordError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise RecordError(f"{path}: not a fault record ({error})") from None
     if not isinstance(record, dict) or "trigger" not in record:
         raise RecordError(f"{path}: not a fault record")
     return record

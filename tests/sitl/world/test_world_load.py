@@ -124,7 +124,7 @@ def test_unusable_places_say_why_in_one_line(arguments: dict[str, tuple[float]],
         ("[8, 9, 10]", "[8, 9]", 6, "expected 3 numbers, got 2"),
         ("[20, 20, 5]", "[20, 20]", 4, "expected 3 numbers, got 2"),
         ("[20, 20, 5]", "[20, 20, nan]", 4, "finite"),
-        ("[5, 5, 0]", '["a", 5, 0]', None, "expected float"),
+        ("[5, 5, 0]", '["a", 5, 0]', None, "expected a number"),
     ],
 )
 def test_a_malformed_file_says_where(
