@@ -80,12 +80,20 @@ class Peers(Generic[P]):
         return iter(list(self._peers))
 
     def open(self, url: str, make: Callable[[Transport], P]) -> None:
-        """Open an endpoint, whose transports `make` turns into peers. Raises EndpointError."""
+        """Open an endpoint, whose transports `make` turns into peers; else close all.
+
+        Raises:
+            EndpointError: It cannot be opened.
+        """
         signing = self._signing
-        listener = open_listener(
-            url, signed=signing is not None, allow_unsigned=self._allow_unsigned,
-            admits=begins_with_frame if signing is None else signing.vouches,
-        )  # fmt: skip
+        try:
+            listener = open_listener(
+                url, signed=signing is not None, allow_unsigned=self._allow_unsigned,
+                admits=begins_with_frame if signing is None else signing.vouches,
+            )  # fmt: skip
+        except BaseException:
+            self.close()
+            raise
         self._endpoints.append((parse_endpoint(url).scheme, listener, make))
 
     def wait(self, timeout_s: float) -> None:

@@ -97,14 +97,9 @@ class Router:
         self.peers: Peers[_Linked] = Peers(
             signing=signing, allow_unsigned=allow_unsigned, clock=clock
         )
-        try:
-            for url in urls:
-                waits = parse_endpoint(url).scheme != "fd"
-                make = partial(_Linked, router=self, seats={}, awaits_frames=waits)
-                self.peers.open(url, make)
-        except BaseException:
-            self.close()
-            raise
+        for url in urls:
+            waits = parse_endpoint(url).scheme != "fd"
+            self.peers.open(url, partial(_Linked, router=self, seats={}, awaits_frames=waits))
 
     def serve(self) -> None:
         """Handle waiting messages, for a bounded time.

@@ -7,6 +7,7 @@ has sent SET_POSITION_TARGET_LOCAL_NED with the same time_boot_ms.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -183,31 +184,25 @@ class _EmbeddedVehicle:
 
 
 class _Realtime:
-    """The clients of a simulation that is paced by the wall clock, any number of them."""
+    """The clients of a simulation that is paced by the wall clock, any number of them.
+
+    Raises:
+        EndpointError: An endpoint cannot be opened.
+        ConfigError: The file of the signing key cannot be read.
+    """
 
     def __init__(self, options: ServerOptions, simulation: Simulation) -> None:
         self._options = options
         self._simulation = simulation
         self._pace = _Pace(options.speed or 1.0)
-        file = options.key_file  # one signing for all clients, so that no frame counts twice
-        self._signing = None if file is None else Signing(key_from_file(file), clock=time.time)
-        self._clients: Peers[Client] = Peers(
-            signing=self._signing, allow_unsigned=options.allow_unsigned
-        )
+        file = options.key_file
+        signing = None if file is None else Signing(key_from_file(file), clock=time.time)
+        self._clients: Peers[Client] = Peers(signing=signing, allow_unsigned=options.allow_unsigned)
+        for preset, url in options.links:  # one signing for all, so that no frame counts twice
+            signs = None if parse_endpoint(url).scheme == "fd" else signing
+            make = partial(Client, simulation, preset=preset, signing=signs)
+            self._clients.open(url, make)
         self._told_collision = False
-
-    def open(self) -> None:
-        """Open every endpoint.
-
-        Raises:
-            EndpointError: One of them cannot be opened.
-        """
-        for preset, url in self._options.links:
-            inherited = parse_endpoint(url).scheme == "fd"
-            signing = None if inherited else self._signing
-            self._clients.open(
-                url, partial(Client, self._simulation, preset=preset, signing=signing)
-            )
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Run until stopped, or until an inherited connection closes."""
@@ -274,13 +269,9 @@ class _Realtime:
 
 
 def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    server = _Realtime(options, simulation)
-    try:
-        server.open()
+    with contextlib.closing(_Realtime(options, simulation)) as server:
         _announce(options, simulation)
         server.run(stopped)
-    finally:
-        server.close()
 
 
 def _brief(simulation: Simulation, folder: Path) -> None:
