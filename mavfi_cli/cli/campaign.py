@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, GroupOfCommands, given_options
+from mavfi_cli.cli.grouped import (
+    CheckedCommand,
+    GroupedCommand,
+    GroupedOption,
+    GroupOfCommands,
+    given_options,
+)
 
 if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
@@ -215,7 +221,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         click.echo("\n".join([*lines(panels), *absent, f"Picture  {output}"]))
 
 
-@campaign.command()
+@campaign.command(cls=CheckedCommand)
 @click.argument("what", metavar="[WHAT]", required=False)
 @click.option("--scale", type=float, help="Fraction of the repetitions to run.")
 @_SET

@@ -8,6 +8,8 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from mavfi_cli.core.errors import ConfigError
+
 
 class GroupedOption(click.Option):
     """An option that the help shows in the section of its group."""
@@ -17,7 +19,21 @@ class GroupedOption(click.Option):
         self.group = group
 
 
-class GroupedCommand(click.Command):
+class CheckedCommand(click.Command):
+    """A command whose errors name options."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Call the command. An invalid value is a usage error that names the option."""
+        try:
+            return super().invoke(ctx)
+        except ConfigError as error:
+            option = "" if error.path or not error.key else spelling(error.key)
+            if not option.startswith("--"):
+                raise
+            raise click.UsageError(f"{option}: {error.problem}") from None
+
+
+class GroupedCommand(CheckedCommand):
     """A command whose help shows its options by group, in the order of declaration."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -59,7 +75,7 @@ def given_options() -> dict[str, Any]:
 def spelling(name: str) -> str:
     """The option of a parameter of the current command, such as `--v-max`; else the name."""
     for param in click.get_current_context().command.params:
-        if param.name == name:
+        if param.name == name or f"--{name}" in param.opts:
             return param.opts[0]
     return name
 

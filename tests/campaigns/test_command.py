@@ -179,7 +179,7 @@ def refused(mavfi, tmp_path):
     def run(*arguments):
         before = sorted(tmp_path.iterdir())
         done = mavfi("campaign", *arguments, cwd=tmp_path)
-        code = 2 if done.stderr.startswith("error: unknown ") else 1
+        code = 2 if done.stderr.startswith(("error: unknown ", "error: --")) else 1
         assert (done.returncode, done.stdout) == (code, ""), done.stderr
         (line,) = done.stderr.splitlines()
         assert sorted(tmp_path.iterdir()) == before
@@ -231,7 +231,7 @@ def test_what_does_not_exist_gets_one_line(refused, tmp_path):
     assert "no campaign was begun there" in refused(
         "run", written(tmp_path), "--missing-only", "--out", tmp_path / "nowhere"
     )
-    assert "scale: must be above 0" in refused("run", "table3", "--scale", "0")
+    assert "--scale: must be above 0" in refused("run", "table3", "--scale", "0")
 
 
 def test_a_ledger_of_another_version_gets_one_line(mavfi, tmp_path):

@@ -306,5 +306,5 @@ def test_a_path_that_is_no_firmware(refused, no_firmware, autopilot, kind, said)
 
 
 def test_a_real_autopilot_without_a_binary(refused, no_firmware):
-    line = refused(*SHORT_LINE[1:], "--quiet", "--autopilot", "px4")
-    assert line.startswith("firmware: px4 needs its SITL binary: --firmware PATH, or PX4_SITL")
+    line = refused(*SHORT_LINE[1:], "--quiet", "--autopilot", "px4", code=2)
+    assert line.startswith("--firmware: px4 needs its SITL binary: --firmware PATH, or PX4_SITL")

@@ -84,7 +84,8 @@ def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
         (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
         (
             ["--autopilot", "px4"],
-            "firmware: px4 needs its SITL binary: --firmware PATH, or PX4_SITL in the environment",
+            "--firmware: px4 needs its SITL binary: --firmware PATH, or PX4_SITL in the "
+            "environment",
         ),
     ],
 )
