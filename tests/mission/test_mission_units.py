@@ -61,7 +61,7 @@ def test_limits_are_inclusive_and_named_where_broken(name):
 
 
 def test_a_limit_on_loss_is_for_a_link_and_in_its_record_only():
-    with pytest.raises(ConfigError, match=r"^loss_limit_s: .* needs --link"):
+    with pytest.raises(ConfigError, match=r"^loss_limit_s: needs --link"):
         MissionConfig(loss_limit_s=10.0)
     assert "loss_limit_s" not in MissionConfig().to_dict()
     config = MissionConfig(link="udpin:127.0.0.1:1", eyes=True, loss_limit_s=10.0)
