@@ -6,6 +6,7 @@ The list supplies the configuration of the missions, the records their results. 
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
@@ -26,12 +27,19 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.mission.record.detection_cost import RECOMPUTED, detection_cost
-from mavfi_cli.mission.record.measures import STRUCK, measures_of
+from mavfi_cli.mission.record.measures import STRUCK, measures_of, record_of
 from mavfi_cli.mission.record.quality import QUALITY
 from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
 FAULT = ("target", "seed", "bits", "field")
+COSTS = ("check_share", *(f"recovery_share_{stage}" for stage in RECOMPUTED))
+EXPORTED = (
+    "number", "pair", *CONFIG, "level", *(f"fault_{name}" for name in FAULT), *STRUCK, "detector",
+    "protect", "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s",
+    "wall_s", *COSTS, "attempts", "path", "changes",
+)  # fmt: skip
+_METADATA = "mavfi"  # key of an export's provenance
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
@@ -66,7 +74,7 @@ def _names(labels: Sequence[str]) -> list[str]:
     own = ("number", "pair", "labels", *(f"label_{name}" for name in labels), *CONFIG, "level")
     asked = (*(f"fault_{name}" for name in FAULT), "detector", "protect", "changes")
     came = ("state", "outcome", "succeeded", "counted", "reason", "injected", "wall_s", "attempts")
-    return [*own, *asked, *came, "path", *measures_of({}), *_costs({})]
+    return [*own, *asked, *came, "path", *measures_of({}), *COSTS]
 
 
 def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
@@ -103,9 +111,9 @@ def _costs(record: Mapping[str, Any]) -> dict[str, float | None]:
     """Shares of the flight time of checks and of each stage's recomputations; None without."""
     cost = detection_cost(record)
     if cost is None:
-        return {"check_share": None, **{f"recovery_share_{stage}": None for stage in RECOMPUTED}}
-    shares = {f"recovery_share_{stage}": s / cost.flight_s for stage, s in cost.recovery_s.items()}
-    return {"check_share": cost.detection_share, **shares}
+        return dict.fromkeys(COSTS)
+    shares = (cost.detection_share, *(cost.recovery_s[s] / cost.flight_s for s in RECOMPUTED))
+    return dict(zip(COSTS, shares, strict=True))
 
 
 def _column(values: Sequence[Any]) -> pa.Array:
@@ -152,16 +160,33 @@ def known(values: FloatArray) -> FloatArray:
 
 
 def exported(ledger: Ledger) -> pa.Table:
-    """Return one row per finished mission, in the order of the list, with the labels as columns."""
+    """Return one row per finished mission, in the order of the list, with the labels as columns.
+
+    The metadata of the table hold its provenance.
+    """
     whole = flights(ledger)
-    return whole.select(
-        [
-            "number", "pair", *(name for name in whole.column_names if name.startswith("label_")),
-            *CONFIG, "level", *(f"fault_{name}" for name in FAULT), *STRUCK, "detector", "protect",
-            "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s", "wall_s",
-            "attempts", "path", "changes",
-        ]
-    )  # fmt: skip
+    labels = [name for name in whole.column_names if name.startswith("label_")]
+    mine = whole.select([*EXPORTED[:2], *labels, *EXPORTED[2:]])
+    return mine.replace_schema_metadata({_METADATA: canonical(provenance(ledger))})
+
+
+def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
+    """Return what built and flew a campaign, from its ledger or from an export; {} if unknown.
+
+    Returns:
+        `name` of the campaign, `planned`: missions on its list, `versions` of the programs, `host`
+        of the first record.
+    """
+    if isinstance(source, pa.Table):
+        return dict(json.loads((source.schema.metadata or {}).get(_METADATA.encode(), b"{}")))
+    first = next(source.results(), None)
+    record = record_of({} if first is None else first.result)
+    return {
+        "name": source.meta("name"),
+        "planned": source.planned(),
+        "versions": json.loads(source.meta("versions") or "{}") or record.versions,
+        "host": record.host,
+    }
 
 
 def paired(first: pa.Table, second: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:

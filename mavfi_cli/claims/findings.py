@@ -349,7 +349,7 @@ def shortened_on(platform: str, detector: str) -> Callable[[Flights], Finding]:
 
 
 _NO_COSTS = Finding(
-    effect=None, told="flown, but an exported file does not hold these times; the folder does"
+    effect=None, told="flown, but this export does not hold these times; a new one does"
 )
 
 

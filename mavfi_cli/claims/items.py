@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import chosen, flown
+from mavfi_cli.analysis.flights import COSTS, chosen, flown
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.claims.sources import STACKS, Evidence
-from mavfi_cli.core.types import Outcome, Stage
+from mavfi_cli.core.types import Outcome
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.reproduction.evidence import model_report
 from mavfi_cli.reproduction.figures import draw_flights, draw_table
@@ -39,8 +39,7 @@ _FAULTS = ("fault", "instruction")
 _TEXTS = ("world", "planner", "platform", "stack", "vehicle", "level", "fault_target",
           "fault_field", "detector", "protect", "state", "outcome", "path", "changes",
           "pair")  # fmt: skip
-_COSTS = ("check_share", *(f"recovery_share_{stage.value}" for stage in Stage))
-_NUMBERS = ("flight_time_s", "distance_m", "energy_regression_j", "replans", *_COSTS)
+_NUMBERS = ("flight_time_s", "distance_m", "energy_regression_j", "replans", *COSTS)
 _KINDS = dict.fromkeys(_TEXTS, pa.string()) | dict.fromkeys(_NUMBERS, pa.float64())
 
 

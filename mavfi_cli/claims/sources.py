@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.flights import flights, provenance
 from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
 from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
@@ -20,7 +19,6 @@ from mavfi_cli.claims.flights import FlownMission, flights_of
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.mission.record.measures import record_of
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
@@ -35,10 +33,11 @@ class CampaignSource:
     Attributes:
         path: the campaign's folder, or the exported file.
         spec: None if a program made the list, or if no specification lies beside an export.
-        planned: missions on its list; None of an export, which does not say.
+        planned: missions on its list; None of an export that does not say.
         flights: the missions that flew.
         errors: missions that could not begin.
-        versions, host: of the first record; empty of an export.
+        versions: of the programs that flew it; empty of an export that does not say.
+        host: of the first record; empty of an export that does not say.
         digest: SHA-256 of an exported file; empty of a folder.
         table: of `analysis.flights.flights`; of an export, its columns.
     """
@@ -149,19 +148,16 @@ def _read(path: Path) -> CampaignSource | _KernelSource:
 
 def _from_ledger(folder: Path) -> CampaignSource:
     with Ledger(folder) as ledger:
-        table = flights(ledger)
-        first = table["number"][:1].to_pylist()
-        record = record_of(next(ledger.results(first)).result) if first else record_of({})
-        versions = json.loads(ledger.meta("versions") or "{}")
+        table, origin = flights(ledger), provenance(ledger)
         return CampaignSource(
             path=folder,
-            name=ledger.meta("name") or folder.name,
+            name=origin["name"] or folder.name,
             spec=stored_spec(ledger),
-            planned=ledger.planned(),
+            planned=origin["planned"],
             flights=flights_of(table, folder),
             errors=sum(ledger.errors_by_cell().values()),
-            versions=versions or record.versions,
-            host=record.host,
+            versions=origin["versions"],
+            host=origin["host"],
             table=table,
         )
 
@@ -173,16 +169,18 @@ def _from_export(path: Path) -> CampaignSource:
         raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
     spec = _spec_beside(path)
     try:
-        flown = flights_of(table, path)
+        flown, origin = flights_of(table, path), provenance(table)
     except (ValueError, TypeError, AttributeError) as error:
         raise RecordError(f"{path}: not an export of a campaign ({error})") from None
     return CampaignSource(
         path=path,
         name=path.stem,
         spec=spec,
-        planned=None,
+        planned=origin.get("planned"),
         flights=flown,
         errors=table["state"].to_pylist().count("error"),
+        versions=origin.get("versions", {}),
+        host=origin.get("host", {}),
         digest=file_digest(path),
         table=table,
     )
@@ -210,10 +208,8 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
         over = len(each.flights) + each.errors
         if each.planned is not None and over < each.planned:
             again = f"mavfi campaign run {each.path}" if each.spec else "the command that began it"
-            yield (
-                f"{each.path}: {over:,} of {each.planned:,} missions have flown; {again} flies "
-                "the rest."
-            )
+            rest = f" {again} flies the rest." if not each.digest else " An export holds no list."
+            yield f"{each.path}: {over:,} of {each.planned:,} missions have flown.{rest}"
         if each.errors:
             yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."
 

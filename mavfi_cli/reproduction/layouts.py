@@ -354,7 +354,7 @@ def _unknown_costs(flights: pa.Table) -> list[str]:
     watched = flights.num_rows > flights["detector"].null_count
     if not watched or len(known(numbers(flights, "check_share"))):
         return []
-    return ["no numbers: an exported file does not hold these times, the campaign's folder does"]
+    return ["no numbers: this export does not hold these times; a new one does"]
 
 
 def _parts(detector: str) -> dict[str, tuple[Sequence[str], Sequence[str]]]:

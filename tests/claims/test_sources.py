@@ -6,12 +6,14 @@ import pyarrow.parquet as pq
 import pytest
 from flown import row, table
 
+from mavfi_cli.analysis.flights import exported
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.claims.items import pooled, shown_items
 from mavfi_cli.claims.sources import gather
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
+from mavfi_cli.report.tables.campaign import write_flights
 from mavfi_cli.spec.mission import MissionConfig
 
 
@@ -58,6 +60,17 @@ def test_a_whole_campaign_has_no_problems(campaign):
     assert (source.name, source.planned, len(source.flights)) == ("whole", 3, 3)
     assert source.host["machine"] == "x86_64"
     assert source.versions == installed_versions()
+
+
+def test_an_export_tells_what_its_campaign_does(campaign, tmp_path):
+    folder = campaign("half", 5, 2)
+    with Ledger(folder) as ledger:
+        write_flights(exported(ledger), tmp_path / "half.parquet")
+    found = [gather([place]) for place in (folder, tmp_path / "half.parquet")]
+    there, here = (each.campaigns[0] for each in found)
+    assert (here.planned, here.versions, here.host) == (there.planned, there.versions, there.host)
+    (problem,) = found[1].problems
+    assert problem.endswith("2 of 5 missions have flown. An export holds no list.")
 
 
 def test_what_has_not_flown_is_told(campaign):

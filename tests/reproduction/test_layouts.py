@@ -105,7 +105,7 @@ def test_table_iii_has_a_row_for_each_number_of_bits():
 
 def test_table_v_says_that_an_export_has_no_times():
     found = of_flights("table5", table(struck("a", 20.0, detector="gad")))
-    assert any(note.startswith("no numbers: an exported file") for note in found.notes)
+    assert any(note.startswith("no numbers: this export") for note in found.notes)
 
 
 def test_table_v_adds_detection_and_recovery():
