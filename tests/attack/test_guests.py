@@ -13,7 +13,7 @@ from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.target import RunLimits
 from mavfi_cli.cli.kernels import kernels
-from mavfi_cli.core.errors import ConfigError, MavfiError, TargetError
+from mavfi_cli.core.errors import MavfiError, TargetError
 from mavfi_cli.fi.tracer.spawn import Program
 
 
@@ -153,4 +153,6 @@ def test_the_environment_is_small_and_recorded(attack, tmp_path, monkeypatch):
     assert plan["environment"]["COLOUR"] == "red=blue"
     assert "SECRET" not in plan["environment"]
     assert "PWD" not in plan["environment"]
-    assert isinstance(attack("says X", "--env", "X").exception, ConfigError)
+    wrong = attack("says X", "--env", "X")
+    assert wrong.exit_code == 2
+    assert "--env" in wrong.output
