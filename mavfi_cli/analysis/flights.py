@@ -39,6 +39,7 @@ EXPORTED = (
     "protect", "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s",
     "wall_s", *COSTS, "attempts", "path", "changes",
 )  # fmt: skip
+_HOST = ("machine", "cores", "started")
 _METADATA = "mavfi"  # key of an export's provenance
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -174,8 +175,8 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
     """Return what built and flew a campaign, from its ledger or from an export; {} if unknown.
 
     Returns:
-        `name` of the campaign, `planned`: missions on its list, `versions` of the programs, `host`
-        of the first record.
+        `name` of the campaign, `planned`: missions on its list, `versions` of the programs, and of
+        the `host` of the first record `machine`, `cores` and `started`.
     """
     if isinstance(source, pa.Table):
         return dict(json.loads((source.schema.metadata or {}).get(_METADATA.encode(), b"{}")))
@@ -185,7 +186,7 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
         "name": source.meta("name"),
         "planned": source.planned(),
         "versions": json.loads(source.meta("versions") or "{}") or record.versions,
-        "host": record.host,
+        "host": {name: record.host[name] for name in _HOST if name in record.host},
     }
 
 
