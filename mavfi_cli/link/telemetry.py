@@ -19,7 +19,7 @@ from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
 from mavfi_cli.core.types import FloatArray, VehicleState
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.seat import TWO_AUTOPILOTS
+from mavfi_cli.link.sender_slot import TWO_AUTOPILOTS
 from mavfi_cli.link.texts import TextCollector
 
 

@@ -16,7 +16,7 @@ from typing import Any, NoReturn, Protocol
 from mavfi_cli.core.errors import EndpointError, LinkLost
 from mavfi_cli.link.codec import begins_with_frame
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, parse_endpoint
-from mavfi_cli.link.seat import Seat, is_autopilots
+from mavfi_cli.link.sender_slot import SenderSlot, is_autopilots
 
 MAX_PEERS = 16  # of one listener
 MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
@@ -471,15 +471,15 @@ class _UdpTransport(_SocketOwner, _Receiver):
     ) -> None:
         super().__init__(opened, url)
         self._admits = admits
-        self._seat: Seat[Any] = Seat()
+        self._slot: SenderSlot[Any] = SenderSlot()
 
     @property
     def rival_address(self) -> str:
-        return _text_of(self._seat.rival)
+        return _text_of(self._slot.rival)
 
     def send(self, data: bytes) -> None:
-        if self._seat.holder is not None or self._admits is None:
-            _send_datagrams(self._socket, data, self._seat.holder)
+        if self._slot.holder is not None or self._admits is None:
+            _send_datagrams(self._socket, data, self._slot.holder)
 
     def _pull(self) -> bytes:
         for _ in range(_PUMPED):
@@ -490,16 +490,16 @@ class _UdpTransport(_SocketOwner, _Receiver):
 
     def _is_peer(self, data: bytes, sender: Any) -> bool:
         assert self._admits is not None
-        if self._seat.hears(sender):
+        if self._slot.hears(sender):
             return True
         if not self._admits(data):
             return False
-        if self._seat.is_free:
-            self._seat.take(sender)
+        if self._slot.is_free:
+            self._slot.take(sender)
             self.address = _text_of(sender)
             return True
         if is_autopilots(data):
-            self._seat.challenge(sender)
+            self._slot.challenge(sender)
         return False
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from mavfi_cli.link.codec import Codec, Signing, dialect
 from mavfi_cli.link.endpoint import parse_endpoint
-from mavfi_cli.link.seat import Seat, is_of_autopilot, two_autopilots
+from mavfi_cli.link.sender_slot import SenderSlot, is_of_autopilot, two_autopilots
 from mavfi_cli.link.texts import text_messages
 from mavfi_cli.link.transport import Transport
 from sitl.camera.component import COMPONENT_ID
@@ -25,7 +25,7 @@ class _Linked(Peer):
     Args:
         transport: Its connection.
         router: Hears its messages.
-        seats: Place of the autopilot of each system at the peer's endpoint.
+        slots: Place of the autopilot of each system at the peer's endpoint.
         awaits_frames: False for a companion that has started the camera, until it speaks.
     """
 
@@ -34,11 +34,11 @@ class _Linked(Peer):
         transport: Transport,
         *,
         router: Router,
-        seats: dict[int, Seat[_Linked]],
+        slots: dict[int, SenderSlot[_Linked]],
         awaits_frames: bool,
     ) -> None:
         super().__init__(transport)
-        self.seats, self.awaits_frames, self._router = seats, awaits_frames, router
+        self.slots, self.awaits_frames, self._router = slots, awaits_frames, router
         self._codec = Codec(0, 0, signing=router.signing)
 
     def take(self, data: bytes) -> list[Any]:
@@ -57,8 +57,8 @@ class _Linked(Peer):
     def close(self) -> None:
         """Close the connection and leave every place."""
         super().close()
-        for seat in self.seats.values():
-            seat.leave(self)
+        for slot in self.slots.values():
+            slot.leave(self)
 
 
 class Router:
@@ -99,7 +99,7 @@ class Router:
         )
         for url in urls:
             waits = parse_endpoint(url).scheme != "fd"
-            self.peers.open(url, partial(_Linked, router=self, seats={}, awaits_frames=waits))
+            self.peers.open(url, partial(_Linked, router=self, slots={}, awaits_frames=waits))
 
     def serve(self) -> None:
         """Handle waiting messages, for a bounded time.
@@ -121,23 +121,23 @@ class Router:
         """Return False for the frame of a second autopilot."""
         if not is_of_autopilot(message):
             return True
-        seat = source.seats.setdefault(message.get_srcSystem(), Seat(self._clock))
-        if seat.hears(source):
-            self._tell_rival(seat)
-        elif seat.is_free:
-            seat.take(source)
+        slot = source.slots.setdefault(message.get_srcSystem(), SenderSlot(self._clock))
+        if slot.hears(source):
+            self._tell_rival(slot)
+        elif slot.is_free:
+            slot.take(source)
         else:
             if isinstance(message, dialect.MAVLink_heartbeat_message):  # once a second
-                seat.challenge(source)
+                slot.challenge(source)
             return False
         return True
 
-    def _tell_rival(self, seat: Seat[_Linked]) -> None:
+    def _tell_rival(self, slot: SenderSlot[_Linked]) -> None:
         """Send the addresses of two autopilots, if both speak."""
-        if seat.holder is None or seat.rival is None:
+        if slot.holder is None or slot.rival is None:
             return
-        text = two_autopilots(seat.holder.transport.address, seat.rival.transport.address)
-        seat.rival = None
+        text = two_autopilots(slot.holder.transport.address, slot.rival.transport.address)
+        slot.rival = None
         severity = dialect.MAV_SEVERITY_CRITICAL
         self.send(list(text_messages(severity, text.encode(), _TEXT_ID)))
 

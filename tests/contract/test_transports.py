@@ -362,7 +362,7 @@ def test_a_udp_port_keeps_its_first_valid_sender_until_that_is_silent(
         near.send(b"answer")
         assert first.receive(1.0) == b"answer"
         assert second.receive(0.0) == stranger.receive(0.0) == b""
-        monkeypatch.setattr(near._seat, "_silent_from_s", 0.0)  # type: ignore[attr-defined]
+        monkeypatch.setattr(near._slot, "_silent_from_s", 0.0)  # type: ignore[attr-defined]
         second.send(frame[1])
         assert near.receive(1.0) == frame[1]
         near.send(b"answer")

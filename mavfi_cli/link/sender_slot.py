@@ -28,7 +28,7 @@ def two_autopilots(address: str, rival_address: str) -> str:
     return f"{TWO_AUTOPILOTS}, {address} and {rival_address}"
 
 
-class Seat(Generic[Sender]):
+class SenderSlot(Generic[Sender]):
     """The place of one sender. Another one may take it after 5 s of silence.
 
     Args:
