@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import json
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -13,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.autonomy import canonical_planner
-from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Spec
+from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Setting, Spec
 from mavfi_cli.core.config import (
     Shipped,
     read_text,
     structure,
     syntax_error,
+    toml_text,
 )
 from mavfi_cli.core.errors import ConfigError, UnknownKey, named_member
 
@@ -145,42 +145,25 @@ class _Reader:
 
 def to_toml(spec: Spec) -> str:
     """Write TOML from which `parse_spec` makes an equal specification."""
-    lines = _pairs(
-        {
-            "name": spec.name,
-            "about": spec.about,
-            "seed": spec.seed,
-            "first_seed": spec.first_seed,
-            "repetitions": spec.repetitions,
-            "keep": spec.keep.value,
-        }
-    )
-    lines += _table("[mission]", spec.fixed)
-    lines += _table("[factors]", spec.axes)
-    for setting in spec.settings:
-        own: dict[str, Any] = {"name": setting.name} if setting.name else {}
-        if setting.repetitions is not None:
-            own["repetitions"] = setting.repetitions
-        lines += ["", "[[setting]]", *_pairs({**own, **setting.axes})]
-    if spec.stop is not None:
-        lines += _table("[stop]", asdict(spec.stop))
-    if spec.fixed_world is not None:
-        rule = asdict(spec.fixed_world)
-        inner = {key: rule.pop(key) for key in ("world_seed", "flown")}
-        lines += _table("[fixed_world]", rule)
-        for key, values in inner.items():
-            quoted = {json.dumps(each, ensure_ascii=False): values[each] for each in values}
-            lines += _table(f"[fixed_world.{key}]", quoted)  # worlds may not be bare keys of TOML
-    return "\n".join(lines) + "\n"
+    return toml_text(_values_of(spec))
 
 
-def _table(head: str, values: Mapping[str, Any]) -> list[str]:
-    return ["", head, *_pairs(values)] if values else []
+def _values_of(spec: Spec) -> dict[str, Any]:
+    """The tables of the specification's file."""
+    names = ("name", "about", "seed", "first_seed", "repetitions")
+    tables = {
+        "mission": spec.fixed,
+        "factors": spec.axes,
+        "setting": [_setting_values(each) for each in spec.settings],
+        "stop": asdict(spec.stop) if spec.stop else {},
+        "fixed_world": asdict(spec.fixed_world) if spec.fixed_world else {},
+    }
+    return {**{name: getattr(spec, name) for name in names}, "keep": spec.keep.value, **tables}
 
 
-def _pairs(values: Mapping[str, Any]) -> list[str]:
-    # Strings, numbers, booleans and arrays are written in TOML as in JSON.
-    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()]
+def _setting_values(setting: Setting) -> dict[str, Any]:
+    own = {"name": setting.name or None, "repetitions": setting.repetitions}
+    return {key: value for key, value in own.items() if value is not None} | dict(setting.axes)
 
 
 _ODD = re.compile(r"[^\w.+=-]+")  # not in a folder's name

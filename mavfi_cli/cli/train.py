@@ -71,8 +71,8 @@ def train(
     from mavfi_cli.report.detector_plots import draw_loss_curve
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
-    from mavfi_cli.studies.train import WORLDS, TrainingPlan
     from mavfi_cli.studies.train import train as run
+    from mavfi_cli.studies.training_flights import WORLDS, TrainingPlan
 
     if autopilot == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")

@@ -175,8 +175,8 @@ def _flown(
 ) -> dict[str, Any]:
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
-    from mavfi_cli.studies.flight_plan import WORLDS, RedundancyPlan
     from mavfi_cli.studies.redundancy import fly_and_report
+    from mavfi_cli.studies.redundancy_plan import WORLDS, RedundancyPlan
 
     plan = RedundancyPlan(
         vehicles=vehicles,

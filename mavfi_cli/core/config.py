@@ -1,9 +1,11 @@
-"""Load TOML into frozen dataclasses with strict types. An unknown key is an error."""
+"""Load TOML into frozen dataclasses with strict types, and write it. An unknown key is an error."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -43,6 +45,40 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
         raise syntax_error(error, path) from None
+
+
+_BARE = re.compile(r"[A-Za-z0-9_-]+")  # a key that needs no quotes
+
+
+def toml_text(values: Mapping[str, Any]) -> str:
+    """Write TOML that reads back as equal values; empty tables are left out.
+
+    Args:
+        values: Texts, finite numbers, truth values, arrays of them, tables, and arrays of tables.
+    """
+    return "\n".join(_toml_lines(values, ())) + "\n"
+
+
+def _toml_lines(table: Mapping[str, Any], name: Sequence[str]) -> list[str]:
+    lines, inner = [], []
+    for key, value in table.items():
+        own = key if _BARE.fullmatch(key) else _toml_value(key)
+        path = (*name, own)
+        if isinstance(value, Mapping):
+            body = _toml_lines(value, path) if value else []
+            head = [] if body[:1] in ([], [""]) else ["", f"[{'.'.join(path)}]"]
+            inner += head + body
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            for each in value:
+                inner += ["", f"[[{'.'.join(path)}]]", *_toml_lines(each, path)]
+        else:
+            lines.append(f"{own} = {_toml_value(value)}")
+    return lines + inner
+
+
+def _toml_value(value: Any) -> str:
+    """Texts, numbers, truth values and arrays are written as in JSON, which leaves out DEL."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

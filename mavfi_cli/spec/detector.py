@@ -59,6 +59,20 @@ class DetectorConfig:
             raise UnknownName("watch", self.watch, WATCHES)
 
 
+def detector_with_model(
+    name: str, models: Path | None, protect: tuple[str, ...] = STAGES
+) -> DetectorConfig:
+    """Return a detector with its model from a folder of files `NAME.json`; None: the shipped one.
+
+    Raises:
+        ModelError: The folder has no such file.
+    """
+    path = None if models is None else models.absolute() / f"{name}.json"
+    if path is not None and not path.is_file():
+        raise ModelError("no such model file", path=path)
+    return DetectorConfig(name=name, protect=protect, model=None if path is None else str(path))
+
+
 def model_path(config: DetectorConfig, stack: str) -> Path | None:
     """Return the model file of a mission's detector; None if it has no model.
 

@@ -6,43 +6,26 @@ import itertools
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from mavfi_cli.analysis.detector_pairs import ERROR_FREE, FAULT, NONE
 from mavfi_cli.analysis.scores import model_digest
 from mavfi_cli.campaigns.missions import Label, PlannedMission, changes_of
-from mavfi_cli.core.errors import ConfigError, ModelError
-from mavfi_cli.core.seeds import Stream, derive
-from mavfi_cli.core.states import DType
-from mavfi_cli.core.types import Stage
 from mavfi_cli.detect.base import detector_names
-from mavfi_cli.fi.bits import Field
-from mavfi_cli.spec.detector import STAGES, DetectorConfig, detector_of
-from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.spec.detector import STAGES, DetectorConfig, detector_of, detector_with_model
 from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.studies.evaluation_sites import (
+    FIELDS,
+    INSTRUCTION,
+    SOURCE,
+    InjectionSite,
+    fault_at,
+    sites,
+)
 from mavfi_cli.studies.flying import require_named
 
 WORLDS = ("sparse", "dense", "factory", "farm")
 DETECTORS = (NONE, "range", "l2", "gad", "aad")
-INTEGER = "integer"  # all bits of states that have no sign, exponent and mantissa
-FIELDS = (Field.SIGN.value, Field.EXPONENT.value, Field.MANTISSA.value, INTEGER)
-NODES = {
-    "octomap": Stage.PERCEPTION,
-    "collision_check": Stage.PERCEPTION,
-    "point_cloud": Stage.PERCEPTION,
-    "planner": Stage.PLANNING,
-    "control": Stage.CONTROL,
-}
-SOURCE, INSTRUCTION = "source", "instruction"
-_DRAWS = 1000  # number of fault seeds to try until one draws a state of the required type
-
-
-class _InjectionSite(NamedTuple):
-    """Injection site of one kind of fault."""
-
-    stage: str  # of the corrupted kernel or of its output
-    target: str  # a stage, or a node
-    field: str  # a bit field, `integer`, or `any`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,12 +89,7 @@ class EvaluationPlan:
         Raises:
             ModelError: the folder of models has no such file.
         """
-        path = None if self.models is None else self.models.absolute() / f"{detector}.json"
-        if path is not None and not path.is_file():
-            raise ModelError("no such model file", path=path)
-        return DetectorConfig(
-            name=detector, protect=self.protect, model=None if path is None else str(path)
-        )
+        return detector_with_model(detector, self.models, self.protect)
 
     def told(self) -> dict[str, Any]:
         """The plan, with descriptions of the detectors, as plain values."""
@@ -132,15 +110,9 @@ class EvaluationPlan:
                                                       "golden_flights", "first_seed", "seed")},
         }  # fmt: skip
 
-    def places(self) -> list[_InjectionSite]:
+    def places(self) -> list[InjectionSite]:
         """Injection sites: stages by bit field, or nodes."""
-        if self.level == INSTRUCTION:
-            return [_InjectionSite(NODES[node].value, node, Field.ANY.value) for node in NODES]
-        return [
-            _InjectionSite(stage.value, stage.value, name)
-            for stage, name in itertools.product(Stage, self.fields)
-            if stage is not Stage.CONTROL or name != INTEGER  # its states are all float64
-        ]
+        return sites(self.level, self.fields)
 
     def missions(
         self, detector: str = NONE, harmful: Collection[tuple[Any, ...]] = ()
@@ -160,7 +132,7 @@ class EvaluationPlan:
         ]
 
     def _mission(
-        self, world: str, seed: int, place: _InjectionSite | None, detector: str
+        self, world: str, seed: int, place: InjectionSite | None, detector: str
     ) -> PlannedMission:
         kind = ERROR_FREE if place is None else FAULT
         labels: dict[str, Label] = {
@@ -168,24 +140,9 @@ class EvaluationPlan:
         }  # fmt: skip
         config = replace(self.base, world=world, seed=seed)
         if place is not None:
-            config = replace(config, **self._fault(world, seed, place))
+            fault = fault_at(place, self.level, self.seed, world, seed)
+            config = replace(config, **fault)
             labels |= {"level": self.level, **place._asdict()}
         if detector != NONE:
             config = replace(config, detector=self.detector_config(detector))
         return PlannedMission(config=config, labels=labels)
-
-    def _fault(self, world: str, seed: int, place: _InjectionSite) -> dict[str, Any]:
-        drawn = (self.seed, Stream.FAULT, "evaluation", world, seed, place.target, place.field)
-        if self.level == INSTRUCTION:
-            return {"instruction": InstructionConfig(target=place.target, seed=derive(*drawn))}
-        whole = place.field == INTEGER
-        for number in range(_DRAWS):
-            fault = FaultConfig(
-                target=place.target,
-                field=Field.ANY.value if whole else place.field,
-                seed=derive(*drawn, number),
-            )
-            # Draw again until the state has the required type: all of them are equally likely.
-            if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:
-                return {"fault": fault}
-        raise ConfigError(f"no state of {place.target} has a bit field {place.field}")

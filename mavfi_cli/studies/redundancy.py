@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.analysis.beside_model import BASE, Beside, Key, side_by_side
 from mavfi_cli.analysis.flights import chosen, errors, flown
 from mavfi_cli.analysis.overhead import compute_overheads
 from mavfi_cli.campaigns.begin import ask_vehicle, check_names
@@ -16,15 +17,15 @@ from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
+from mavfi_cli.core.errors import CannotLift, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies.beside_model import BASE, Beside, Key, side_by_side
-from mavfi_cli.studies.flight_plan import FlightPlan, RedundancyPlan, flight_plan, write_files
-from mavfi_cli.studies.flying import fly, require_named
-from mavfi_cli.studies.train import WORLDS as TRAINING_WORLDS
-from mavfi_cli.studies.train import TrainingPlan, train
+from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan, write_files
+from mavfi_cli.studies.flying import fly
+from mavfi_cli.studies.redundancy_plan import RedundancyPlan
+from mavfi_cli.studies.train import train
+from mavfi_cli.studies.training_flights import TrainingPlan
 from mavfi_cli.vpm.model import DETECTORS, Scheme, schemes_with
 from mavfi_cli.vpm.report import CHAINS, report, setting_of
 from mavfi_cli.vpm.vehicle import ModelVehicle
@@ -86,17 +87,6 @@ def fitted(
     return folder
 
 
-def _require_held_out(plan: RedundancyPlan) -> None:
-    """Reject missions with the seeds of training flights, in any world."""
-    first = TrainingPlan().first_seed
-    last = first + plan.train * len(TRAINING_WORLDS) - 1
-    if plan.first_seed <= last and first <= plan.first_seed + plan.missions - 1:
-        raise ConfigError(
-            f"seeds {first} to {last} are for training: choose another --first-seed",
-            key="first seed",
-        )
-
-
 def fly_and_report(
     plan: RedundancyPlan,
     overheads: Mapping[str, tuple[float, str]],
@@ -114,9 +104,6 @@ def fly_and_report(
     Raises:
         MavfiError: as `run_campaign`; a world or vehicle that does not exist.
     """
-    require_named("world", plan.worlds)
-    if plan.train:
-        _require_held_out(plan)
     for world in plan.worlds:
         check_names(MissionConfig(world=world, seed=plan.first_seed, stack=plan.stack))
     schemes = schemes_with(overheads)
@@ -134,7 +121,11 @@ def fly_and_report(
             each.result for numbers in watched for each in ledger.results(numbers)
         )
     beside = {
-        key: Beside(plan=each, flights=flown(arms[key]), errors=errors(arms[key], "{reason}"))
+        key: Beside(
+            limits=each.limits if isinstance(each, FlightPlan) else each,
+            flights=flown(arms[key]),
+            errors=errors(arms[key], "{reason}"),
+        )
         for key, each in plans.items()
     }
     found = {name: (100.0 * each.share, each.told("--fly")) for name, each in measured.items()}

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.core.config import read_toml, structure
+from mavfi_cli.core.config import read_toml, structure, toml_text
 from mavfi_cli.core.errors import ConfigError, UnknownName, WorldError
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream, generator
@@ -258,25 +258,13 @@ def _is_clear(boxes: Vector, bounds: Vector, place: Vector) -> bool:
 
 def scene_toml(world: World) -> str:
     """Return a world as the text of a world file, which reads back as the same world."""
-    lines = [
-        f"name = {_quoted(world.name)}",
-        f"bounds_enu_m = {_numbers(world.bounds_enu_m)}",
-        f"start_enu_m = {_numbers(world.start_enu_m)}",
-        f"goal_enu_m = {_numbers(world.goal_enu_m)}",
+    boxes = [
+        {"min_enu_m": box[:3].tolist(), "max_enu_m": box[3:].tolist()} for box in world.boxes_enu_m
     ]
-    for box in world.boxes_enu_m:
-        lines += [
-            "",
-            "[[box]]",
-            f"min_enu_m = {_numbers(box[:3])}",
-            f"max_enu_m = {_numbers(box[3:])}",
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def _numbers(values: Vector) -> str:
-    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    values = {
+        "name": world.name,
+        "bounds_enu_m": world.bounds_enu_m.tolist(),
+        "start_enu_m": world.start_enu_m.tolist(),
+        "goal_enu_m": world.goal_enu_m.tolist(),
+    }
+    return toml_text({**values, "box": boxes} if boxes else values)

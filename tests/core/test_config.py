@@ -1,9 +1,10 @@
+import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
-from mavfi_cli.core.config import load_toml
+from mavfi_cli.core.config import load_toml, toml_text
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 
 
@@ -92,3 +93,16 @@ def test_a_file_that_is_no_text(tmp_path):
     (tmp_path / "file.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="UTF-8"):
         load_toml(tmp_path / "file.toml", Outer)
+
+
+def test_what_is_written_as_toml_reads_back_equal():
+    values = {
+        "name": 'odd "text" \\ \x7f \x1b é',
+        "whole": 3,
+        "tiny": 5e-324,
+        "truth": True,
+        "rows": [[1.5, 2.0], []],
+        "sub": {"a b": 1, "deep": {"x": {"y": "z"}}},
+        "box": [{"a": 1.0, "in": {"b": 2}}, {"a": 3.0}],
+    }
+    assert tomllib.loads(toml_text({**values, "empty": {}})) == values

@@ -16,7 +16,8 @@ from mavfi_cli.detect.model import Model, training_flights
 from mavfi_cli.detect.watch import EXTENDED
 from mavfi_cli.spec.stack import load_stack
 from mavfi_cli.studies.evaluate import require_held_out
-from mavfi_cli.studies.evaluation_plan import INTEGER, EvaluationPlan
+from mavfi_cli.studies.evaluation_plan import EvaluationPlan
+from mavfi_cli.studies.evaluation_sites import INTEGER
 
 PLAN = EvaluationPlan(
     worlds=("dense", "farm"), detectors=(NONE, "gad"), flights=2, harmless_flights=1,

@@ -5,7 +5,7 @@ import pytest
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies import redundancy
+from mavfi_cli.studies import redundancy, redundancy_plan
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.model import SCHEMES, named
 from mavfi_cli.vpm.report import Choices, setting_of
@@ -15,7 +15,7 @@ from mavfi_cli.vpm.vehicle import ModelVehicle
 @pytest.fixture
 def ask(tmp_path):
     def of(train):
-        return redundancy.RedundancyPlan(
+        return redundancy_plan.RedundancyPlan(
             vehicles=[ModelVehicle.load("spark")], choices=Choices(), worlds=("sparse",),
             missions=1, first_seed=1, folder=tmp_path, train=train,
         )  # fmt: skip
@@ -53,6 +53,8 @@ def test_they_are_fitted_once_to_the_bare_vehicle_s_flights(ask, bare, monkeypat
 
 
 def test_flights_name_the_fitted_models(tmp_path):
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "aad.json").touch()
     setting = setting_of(ModelVehicle.load("spark"), Choices())
     planned = flight_plan(
         setting, named(SCHEMES, "aad"), load_platform("x86"), 0.39, tmp_path, tmp_path / "models"

@@ -8,7 +8,7 @@ import pytest
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.flight_plan import flight_plan, write_files
-from mavfi_cli.studies.redundancy import RedundancyPlan
+from mavfi_cli.studies.redundancy_plan import RedundancyPlan
 from mavfi_cli.vpm.model import SCHEMES, hover_power_w, named, outcome
 from mavfi_cli.vpm.report import Choices, setting_of
 from mavfi_cli.vpm.vehicle import Board, ModelVehicle
@@ -45,9 +45,9 @@ def test_mass_pull_and_velocity_are_the_model_s(plan, scheme):
     assert planned.mission.map_range_m == 7.0
     assert planned.mission.camera_rate_hz == 30.0
     assert planned.mission.detector is None
-    assert planned.boards_w == 10.0 * flown.scheme.copies
-    assert planned.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, flown.mass_kg))
-    assert vehicle["avionics_w"] == planned.boards_w
+    assert planned.limits.boards_w == 10.0 * flown.scheme.copies
+    assert planned.limits.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, flown.mass_kg))
+    assert vehicle["avionics_w"] == planned.limits.boards_w
 
 
 def test_the_stack_is_the_mission_s(tmp_path):
@@ -59,12 +59,12 @@ def test_the_stack_is_the_mission_s(tmp_path):
 
 def test_what_a_mission_cannot_take_is_told(plan):
     planned, _ = plan("spark", "none")
-    assert planned.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
-    assert plan("spark", "tmr")[0].cut == ()
+    assert planned.limits.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
+    assert plan("spark", "tmr")[0].limits.cut == ()
     fast, _ = plan("cal20", "none", Choices(response_s=0.01, board=Board.load("ncs")))
     assert fast.mission.v_max_mps == 12.0
-    assert fast.cut[0].startswith("velocity 12 m/s instead of ")
-    assert fast.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
+    assert fast.limits.cut[0].startswith("velocity 12 m/s instead of ")
+    assert fast.limits.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
 
 
 @pytest.mark.parametrize("scheme", ["none", "tmr", "gad", "aad"])

@@ -12,10 +12,10 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.flights import changed, chosen, flags, known, numbers, paired
 from mavfi_cli.analysis.overhead import ComputeOverhead
+from mavfi_cli.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import Interval, interval
 from mavfi_cli.stats.shares import rate
-from mavfi_cli.studies.flight_plan import NOT_SCALED, FlightPlan
 from mavfi_cli.vpm.model import REFERENCE, SCHEMES, named
 
 BASE = "none"  # reference of ratios: one board without protection
@@ -23,6 +23,38 @@ MODEL = {"velocity": "velocity_mps", "flight_time": "flight_time_s", "energy": "
 PLACE = ("world", "seed")  # columns that identify a mission in all schemes
 _BY_PLACE = [(name, "ascending") for name in PLACE]
 Key = tuple[str, str]  # vehicle and scheme
+# Parts of the model that the simulation omits; printed with every report of flights.
+NOT_SCALED = (
+    "size, propellers and drag are those of the simulated vehicle; boards weigh, but have no "
+    "size: inertia and drag do not grow with them",
+    "the model's acceleration is pull / mass - g; here it is the companion's limit, of which "
+    f"planning uses {100.0 * BRAKE_SHARE:g} % to speed up and to brake",
+    "the simulated companion plans with 90 % of the safe velocity, flies round obstacles, stops to "
+    "plan, and speeds up and slows down; the model flies straight at one velocity",
+    "flights begin at take-off height and end within the goal's tolerance; climbing there is not "
+    "counted, as in the model; a turn before departure, where the stack has one, is counted",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SchemeLimits:
+    """The values of the model that the flights of a scheme have.
+
+    Attributes:
+        v_max_mps: speed limit of the missions.
+        a_max_mps2: acceleration limit of the missions.
+        braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
+        rotors_w: electrical hover power with all boards.
+        boards_w: power of all boards.
+        cut: values of the model that exceed the limits of a mission, in words.
+    """
+
+    v_max_mps: float
+    a_max_mps2: float
+    braking_velocity_mps: float
+    rotors_w: float
+    boards_w: float
+    cut: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,12 +62,12 @@ class Beside:
     """The flights of a scheme.
 
     Attributes:
-        plan: plan of its flights, or the reason why it cannot be flown.
+        limits: the model's values in them, or the reason why they cannot be flown.
         flights: ended flights, as in `analysis.flights`.
         errors: why missions could not be flown.
     """
 
-    plan: FlightPlan | str
+    limits: SchemeLimits | str
     flights: pa.Table | None = None
     errors: Sequence[str] = ()
 
@@ -51,9 +83,10 @@ class Beside:
         time_s = numbers(flights, "flight_time_s")
         if name == "flight_time":
             return time_s
-        assert isinstance(self.plan, FlightPlan)
+        limits = self.limits
+        assert isinstance(limits, SchemeLimits)
         shaft_j, hover_w = (numbers(flights, n) for n in ("energy_propeller_j", "hover_shaft_w"))
-        return np.asarray(shaft_j * self.plan.rotors_w / hover_w + self.plan.boards_w * time_s)
+        return np.asarray(shaft_j * limits.rotors_w / hover_w + limits.boards_w * time_s)
 
 
 def side_by_side(
@@ -97,20 +130,20 @@ def _overhead(measured: ComputeOverhead) -> dict[str, Any]:
 
 
 def _scheme(row: Mapping[str, Any], beside: Beside) -> dict[str, Any]:
-    plan = beside.plan
+    limits = beside.limits
     told: dict[str, Any] = {
         "scheme": row["scheme"], "title": row["title"], "boards": row["boards"],
         "overhead_percent": row["overhead_percent"], "mass_kg": row["mass_kg"], "problem": None,
         "errors": [], "cut": [],
     }  # fmt: skip
-    if isinstance(plan, str):
-        return {**told, "problem": plan}
+    if isinstance(limits, str):
+        return {**told, "problem": limits}
     return {
         **told,
-        "v_max_mps": plan.mission.v_max_mps,
-        "a_max_mps2": plan.mission.a_max_mps2,
-        "braking_velocity_mps": plan.braking_velocity_mps,
-        "cut": list(plan.cut),
+        "v_max_mps": limits.v_max_mps,
+        "a_max_mps2": limits.a_max_mps2,
+        "braking_velocity_mps": limits.braking_velocity_mps,
+        "cut": list(limits.cut),
         "errors": list(beside.errors),
         **_success(beside.flights),
         **_numbers(row, beside),
@@ -128,7 +161,7 @@ def _over(
         (REFERENCE, f"_over_{REFERENCE}", ("flight_time",)),
     ):
         sides = [flown[one["vehicle"], name] for name in (over, row["scheme"])]
-        if any(isinstance(side.plan, str) for side in sides):
+        if any(isinstance(side.limits, str) for side in sides):
             continue
         pairs = paired(sides[0].flights, sides[1].flights, PLACE)
         both = pa.array(np.logical_and(*(flags(each, "succeeded") for each in pairs)))

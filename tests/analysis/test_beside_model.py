@@ -7,6 +7,7 @@ import re
 import pyarrow as pa
 import pytest
 
+from mavfi_cli.analysis.beside_model import Beside, side_by_side
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.record.measures import measures_of
@@ -14,7 +15,6 @@ from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model_plots import draw_flight_plot
 from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies.beside_model import Beside, side_by_side
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report, setting_of
@@ -26,7 +26,7 @@ STRAIGHT_M = 40.0 - 1.0
 
 def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
     """What a flight as the model has it records; or a slower one, or one of a longer path."""
-    hover_w = HOVER_SHAFT_W * plan.rotors_w
+    hover_w = HOVER_SHAFT_W * plan.limits.rotors_w
     velocity = row["velocity_mps"] / slower
     time_s = longer * STRAIGHT_M / velocity
     return {
@@ -76,10 +76,10 @@ def spark(tmp_path):
 
     def beside(change=None, refused=(), count=3):
         flown = {
-            key: Beside(plan="too heavy to fly")
+            key: Beside(limits="too heavy to fly")
             if key[1] in refused
             else Beside(
-                plan=plan,
+                limits=plan.limits,
                 flights=flights_of(
                     [
                         flight(rows[key[1]], plan, **(change or {}).get(key[1], {}))
