@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from mavfi_cli.report.view.entries import (
 
 _TIME = "simulated_time"
 _BODY_M = (0.25, 0.25, 0.08)  # half sizes of the box that stands for the vehicle
+_WIDTH, _FAULTY_WIDTH = 1.5, 4.0  # of lines in plots, where golden flights are drawn on top
 _VEHICLE = {  # plots of columns that are no states
     "position": ("x_m", "y_m", "z_m"),
     "velocity": ("vx_mps", "vy_mps", "vz_mps"),
@@ -80,11 +81,17 @@ def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
     for flight in flights:
         body = rr.Boxes3D(half_sizes=[_BODY_M], colors=[rgb(flight.colour)], fill_mode="solid")
         recording.log(f"{flight.name}/vehicle", body, static=True)
-    _log_entries(recording, entries_of(flights))
+    _log_entries(recording, entries_of(flights), {f"{each.name}/states": each for each in flights})
 
 
-def _log_entries(recording: Any, entries: Iterable[Entry]) -> None:
-    """Log entries one by one, but the numbers of all ticks at the end: a column at a time."""
+def _log_entries(
+    recording: Any, entries: Iterable[Entry], drawn: Mapping[str, ViewedFlight]
+) -> None:
+    """Log entries one by one, but the numbers of all ticks at the end: a column at a time.
+
+    Args:
+        drawn: The flight of each path of numbers; its colour is that of the lines.
+    """
     import rerun as rr
 
     numbers: dict[str, list[Values]] = {}
@@ -101,6 +108,12 @@ def _log_entries(recording: Any, entries: Iterable[Entry]) -> None:
             known = [(stamp_s, float(value)) for stamp_s, value in told if value is not None]
             if known:
                 stamps, values = zip(*known, strict=True)
+                flight = drawn[path]
+                width = _FAULTY_WIDTH if flight.run.record.fault else _WIDTH
+                line = rr.SeriesLines(
+                    colors=[rgb(flight.colour)], widths=[width], names=[f"{flight.name} {name}"]
+                )
+                recording.log(f"{path}/{name}", line, static=True)
                 time = rr.TimeColumn(_TIME, duration=stamps)
                 recording.send_columns(f"{path}/{name}", [time], rr.Scalars.columns(scalars=values))
 
@@ -187,7 +200,7 @@ def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
         rrb.Horizontal(
             rrb.Vertical(
                 rrb.Spatial3DView(name="world", eye_controls=_eye(flights[0])),
-                rrb.Horizontal(*cameras, events),
+                rrb.Horizontal(*cameras, events, column_shares=[1.0] * len(cameras) + [2.0]),
                 row_shares=[3, 1],
             ),
             rrb.Tabs(*tabs, rrb.Vertical(*plots(dict(_VEHICLE)), name="vehicle")),

@@ -61,6 +61,18 @@ def test_states_are_those_of_the_trace_infinities_too(columns, pair):
             np.testing.assert_array_equal(scalars, np.array(told, float))
 
 
+def test_lines_in_plots_have_the_colours_and_names_of_the_flights(columns, pair):
+    told = [columns[f"/{flight.name}/states/collision"] for flight in pair]
+    golden, faulty = (each["SeriesLines:colors"] for each in told)
+    assert golden != faulty
+    assert golden == columns["/golden/states/command_yaw"]["SeriesLines:colors"]
+    assert [each["SeriesLines:names"] for each in told] == [
+        [["golden collision"]],
+        [["faulty collision"]],
+    ]
+    assert told[0]["SeriesLines:widths"] < told[1]["SeriesLines:widths"]  # equal lines both show
+
+
 def test_depth_frames_are_in_metres_and_what_is_out_of_range_has_no_depth(columns, pair):
     frames = pair[0].recorder.orders["point_cloud"]
     path = columns["/golden/camera/depth"]
