@@ -16,7 +16,6 @@ from mavfi_cli.campaigns.missions import (
     PlannedMission,
     canonical,
     changes_of,
-    golden_of,
     label_text,
     naming,
 )
@@ -267,7 +266,7 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
     for mission in missions:
         config = mission.config
         key = canonical(_kind(changes_of(config)))
-        simple = changes_of(replace(golden_of(config), seed=0))
+        simple = changes_of(replace(config.golden, seed=0))
         vehicle = canonical({**simple, "planner": None, "platform": None, "stack": None})
         if key in seen and vehicle in seen:
             continue

@@ -7,7 +7,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
 from operator import attrgetter
 from pathlib import Path
@@ -79,14 +79,6 @@ def _plain(value: Any) -> Any:
         return [_plain(each) for each in value]
     names = getattr(value, "__dataclass_fields__", None)
     return value if names is None else {name: _plain(getattr(value, name)) for name in names}
-
-
-def golden_of(config: MissionConfig) -> MissionConfig:
-    """The same mission without fault and without protection."""
-    bare: dict[str, Any] = {
-        each.name: each.default for each in fields(MissionConfig) if each.name in _TREATMENT
-    }
-    return replace(config, **bare)
 
 
 def label_text(labels: Mapping[str, Any]) -> str:

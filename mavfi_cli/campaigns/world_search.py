@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.campaigns.missions import PlannedMission, golden_of
+from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec
@@ -49,7 +49,7 @@ def with_worlds(
     for mission in missions:
         config = mission.config
         if config.world_seed is None and rule.rules(config.world):
-            judged.setdefault(config.world, golden_of(config))
+            judged.setdefault(config.world, config.golden)
     for world, config in judged.items():
         flown = _search(rule, config, spec.first_seed, folder / SEARCH, options, spectator)
         rule = replace(

@@ -95,7 +95,7 @@ def _replay_mission(
     from mavfi_cli.studies.again import mission_of
 
     mission = mission_of(campaign, number)
-    config = mission.golden if without_fault else mission.config
+    config = mission.config.golden if without_fault else mission.config
     click.echo(f"flying mission {number}: {config.world}, seed {config.seed}", err=True)
     again = fly_to_end(config, out)
     differing = mission.differing(again.result)

@@ -51,9 +51,8 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
         if file_digest(name) != digest:
             how = "has changed since this flight" if Path(name).exists() else "does not exist"
             raise RecordError(f"{run.folder.path}: {name} {how}, so the flight does not repeat")
-    if not with_fault:
-        values["fault"] = values["instruction"] = values["detector"] = None
-    return structure(values, MissionConfig, path=run.folder.result)
+    config = structure(values, MissionConfig, path=run.folder.result)
+    return config if with_fault else config.golden
 
 
 def interrupted(run: Run) -> bool:

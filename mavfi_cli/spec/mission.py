@@ -222,6 +222,11 @@ class MissionConfig:
         return values
 
     @property
+    def golden(self) -> MissionConfig:
+        """The same mission without fault and without protection."""
+        return replace(self, fault=None, instruction=None, detector=None, isolate=())
+
+    @property
     def seed_of_world(self) -> int:
         """Seed of the world."""
         return self.seed if self.world_seed is None else self.world_seed

@@ -11,7 +11,6 @@ from typing import Any
 import pyarrow.compute as pc
 
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import golden_of
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import read_parquet
@@ -27,11 +26,6 @@ class _CampaignMission:
 
     config: MissionConfig
     row: Mapping[str, Any]
-
-    @property
-    def golden(self) -> MissionConfig:
-        """The same mission without fault and detector."""
-        return golden_of(self.config)
 
     def differing(self, result: Mapping[str, Any]) -> list[str]:
         """The columns in which a repetition differs; mixed columns of an export are text."""

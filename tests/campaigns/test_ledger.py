@@ -12,7 +12,6 @@ from mavfi_cli.campaigns.missions import (
     PlannedMission,
     ResultState,
     changes_of,
-    golden_of,
     injected_of,
 )
 from mavfi_cli.core.config import structure
@@ -61,7 +60,7 @@ def test_a_mission_comes_back_as_it_was(tmp_path, config):
 def test_a_pair_is_named_by_its_golden_flight(config):
     flown, golden, bare, other = (
         PlannedMission(config=each).pair
-        for each in (config, golden_of(config), MissionConfig(), MissionConfig(seed=4))
+        for each in (config, config.golden, MissionConfig(), MissionConfig(seed=4))
     )
     assert flown == golden == bare
     assert other != flown

@@ -46,7 +46,7 @@ def test_a_faulty_mission_repeats_from_both(folder, export, mavfi, tmp_path):
 
 
 def test_without_the_fault_it_is_the_golden_one(folder, export):
-    assert mission_of(folder, 1).golden == mission_of(export, 0).config
+    assert mission_of(folder, 1).config.golden == mission_of(export, 0).config
     assert mission_of(export, 1).config.fault == FAULT
 
 
