@@ -75,8 +75,7 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--picture", type=Path, help="where to draw, as SVG")
     given = parser.parse_args()
-    evidence = gather([Path(each) for each in given.parts])
-    found = arms([flight for each in evidence.campaigns for flight in each.flights])
+    found = arms(gather([Path(each) for each in given.parts]).flights())
     print("\n".join(lines(found)))
     if given.picture is not None:
         draw(found, given.picture)

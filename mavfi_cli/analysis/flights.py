@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -126,10 +127,13 @@ def _column(values: Sequence[Any]) -> pa.Array:
 
 
 def chosen(table: pa.Table, **values: Any) -> pa.Table:
-    """The rows whose columns have these values; None means empty."""
+    """The rows whose columns have these values; None means empty, and a tuple allows several."""
     for name, value in values.items():
-        column = table[name]
-        table = table.filter(pc.is_null(column) if value is None else pc.equal(column, value))
+        allowed = value if isinstance(value, tuple) else (value,)
+        equal = (
+            pc.is_null(table[name]) if v is None else pc.equal(table[name], v) for v in allowed
+        )
+        table = table.filter(reduce(pc.or_kleene, equal))
     return table
 
 

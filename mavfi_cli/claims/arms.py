@@ -6,14 +6,19 @@ has read, so all arms are counted on the same faults in the same scenes.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from mavfi_cli.claims.effects import lost_share
-from mavfi_cli.claims.flights import FlownMission
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.stats.paired import holm, mcnemar
-from mavfi_cli.stats.shares import Share
+from mavfi_cli.stats.shares import Share, wilson
 
+Row = Mapping[str, Any]  # one flight
 PLAIN = "unprotected"
 _BASE = "mavbench"
 _NAMES = {  # what a variant of mavbench switches
@@ -66,47 +71,37 @@ class Arm:
     corrected_p: float | None
 
 
-def arm_of(flight: FlownMission) -> str:
-    """The name of a flight's arm; empty if its stack is no variant of mavbench."""
-    base, _, changes = flight.stack.partition(":")
-    if base not in (_BASE, f"{_BASE}-protected"):
-        return ""
-    name = "all four checks" if base != _BASE else _NAMES.get(changes, changes)
-    detector = (flight.detector or "").upper()
-    if not detector:
-        return name
-    return detector if name == PLAIN else f"{name} and {detector}"
+def arms(flights: pa.Table) -> list[Arm]:
+    """The arms of a campaign, the unprotected one first; none unless it flew several stacks.
 
-
-def arms(flights: Sequence[FlownMission]) -> list[Arm]:
-    """The arms of a campaign, the unprotected one first; none unless it flew several stacks."""
-    if len({each.stack for each in flights}) < 2:
+    Args:
+        flights: of `reproduction.flights.flown_missions`.
+    """
+    if pc.count_distinct(flights["stack"]).as_py() < 2:
         return []
-    named = [(arm_of(each), each) for each in flights]
-    faulty: dict[str, dict[tuple[str, str], FlownMission]] = {}
-    for name, each in named:
-        if name and not each.golden:
-            faulty.setdefault(name, {})[each.scene, each.fault] = each
-    if PLAIN not in faulty:
-        return []
-    active = {key for key, each in faulty[PLAIN].items() if each.activation == "read"}
-    shared = sorted(active.intersection(*faulty.values()))
+    golden: dict[str, list[Row]] = {}
+    trials: dict[str, dict[str, Row]] = {}
+    for flight in flights.select(_READ).to_pylist():
+        name = _arm_of(flight)
+        if flight["level"] is None:
+            golden.setdefault(name, []).append(flight)
+        elif name:
+            trials.setdefault(name, {})[_trial_of(flight)] = flight
+    read = (each for each, x in trials.get(PLAIN, {}).items() if x["activation"] == "read")
+    shared = sorted(set(read).intersection(*trials.values()))
     if not shared:
         return []
-    order = sorted(faulty, key=lambda name: name != PLAIN)
-    kept = {name: [faulty[name][key] for key in shared] for name in order}
-    tests = {
-        name: mcnemar([not x.lost for x in kept[PLAIN]], [not x.lost for x in those]).p_value
-        for name, those in kept.items()
-        if name != PLAIN
-    }
+    order = sorted(trials, key=lambda name: name != PLAIN)
+    kept = {name: [trials[name][trial] for trial in shared] for name in order}
+    won = {name: [not each["lost"] for each in those] for name, those in kept.items()}
+    tests = {name: mcnemar(won[PLAIN], won[name]).p_value for name in order if name != PLAIN}
     corrected = dict(zip(tests, holm([*tests.values()]), strict=True))
     return [
         Arm(
             name=name,
-            golden=lost_share([each for own, each in named if own == name and each.golden]),
+            golden=_lost(golden.get(name, [])),
             by_site=_by_site(those),
-            lost=lost_share(those),
+            lost=_lost(those),
             p_value=tests.get(name),
             corrected_p=corrected.get(name),
         )
@@ -114,10 +109,39 @@ def arms(flights: Sequence[FlownMission]) -> list[Arm]:
     ]
 
 
-def _by_site(flights: Sequence[FlownMission]) -> dict[str, Share]:
-    found: dict[str, list[FlownMission]] = {}
+_READ = ["stack", "detector", "level", "fault", "fault_target", "activation", "lost", "changes"]
+
+
+def _arm_of(flight: Row) -> str:
+    """The name of a flight's arm; empty if its stack is no variant of mavbench."""
+    base, _, changes = flight["stack"].partition(":")
+    if base not in (_BASE, f"{_BASE}-protected"):
+        return ""
+    name = "all four checks" if base != _BASE else _NAMES.get(changes, changes)
+    detector = (flight["detector"] or "").upper()
+    if not detector:
+        return name
+    return detector if name == PLAIN else f"{name} and {detector}"
+
+
+def _trial_of(flight: Row) -> str:
+    """Fault, world, start, noise and computer as text: what the flights of all arms share."""
+    config = json.loads(flight["changes"])
+    scene = {name: value for name, value in config.items() if name not in _APART}
+    return canonical([scene, flight["fault"]])
+
+
+_APART = ("fault", "instruction", "detector", "isolate", "stack")
+
+
+def _lost(flights: Sequence[Row]) -> Share:
+    return wilson(sum(each["lost"] for each in flights), len(flights))
+
+
+def _by_site(flights: Sequence[Row]) -> dict[str, Share]:
+    found: dict[str, list[Row]] = {}
     for each in flights:
-        target = str(each.fault_target)
+        target = str(each["fault_target"])
         found.setdefault(_SITES.get(target, target), []).append(each)
-    ordered = [name for name in _SITES.values() if name in found]
-    return {name: lost_share(found[name]) for name in (*ordered, *(found.keys() - {*ordered}))}
+    order = dict.fromkeys((*_SITES.values(), *sorted(found)))
+    return {name: _lost(found[name]) for name in order if name in found}

@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
-from mavfi_cli.claims.effects import harm_share, lost_share, struck
-from mavfi_cli.claims.flights import FlownMission, GoldenFlights, comparable, where
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import chosen, flags
 from mavfi_cli.core.states import BY_NAME, DType
-from mavfi_cli.stats.shares import Share, cross_layer, failures_per_hour
+from mavfi_cli.reproduction.flights import (
+    by_value,
+    comparable,
+    golden,
+    share,
+    struck,
+    with_columns,
+)
+from mavfi_cli.stats.shares import Share, cross_layer, failures_per_hour, wilson
+
+Row = Mapping[str, Any]  # one flight
 
 
 class Fate(Enum):
@@ -29,21 +43,17 @@ _MEASURES = (
 )  # fmt: skip
 
 
-def _fate_of(golden: GoldenFlights, flight: FlownMission) -> Fate:
+def _fate_of(flight: Row, own: Row) -> Fate:
     """What a kernel did after an instruction-level fault struck it.
 
     Missions repeat to the byte, so a flight that differs from its golden one does so by the fault.
     """
-    ended = set((flight.node_ended or "").split(";")) - {""}
+    ended = set((flight["node_ended"] or "").split(";")) - {""}
     if ended:
         return Fate.HANG if ended == {"hang"} else Fate.CRASH
-    own = golden.of(flight)
-    changed = own is not None and any(
-        getattr(own, name) != getattr(flight, name) for name in _MEASURES
-    )
-    if changed:
+    if any(own[name] != flight[name] for name in _MEASURES):
         return Fate.CHANGED
-    return Fate.SAME if flight.activation == "read" else Fate.UNREAD
+    return Fate.SAME if flight["activation"] == "read" else Fate.UNREAD
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,21 +76,18 @@ class _KernelFlow:
     given_silent: tuple[float, float, float] | None = None
 
 
-def kernel_flows(
-    flights: Sequence[FlownMission], alone: Mapping[str, tuple[int, int]]
-) -> list[_KernelFlow]:
+def kernel_flows(flights: pa.Table, alone: Mapping[str, tuple[int, int]]) -> list[_KernelFlow]:
     """The flow from kernel to mission, for each kernel that instruction-level faults struck.
 
     Args:
+        flights: of `reproduction.flights.beside_golden`.
         alone: silent corruptions and faults of each isolated kernel.
     """
-    golden = GoldenFlights(flights)
-    kernels: dict[str, list[FlownMission]] = {}
-    for each in golden.paired(struck(flights)):
-        if each.level == "instruction" and each.struck_kernel:
-            kernels.setdefault(each.struck_kernel, []).append(each)
+    own = {row["pair"]: row for row in golden(flights).select(["pair", *_MEASURES]).to_pylist()}
+    hit = by_value(struck(flights, level="instruction", own_lost=False), "struck_kernel")
+    kernels = {name: those for (name,), those in hit.items() if name}
     return [
-        _flow(name, kernels[name], golden, alone.get(name))
+        _flow(name, kernels[name], own, alone.get(name))
         for name in sorted(kernels, key=lambda each: (_ORDER.get(each, 9), each))
     ]
 
@@ -89,18 +96,17 @@ _ORDER = {"point_cloud": 0, "octomap": 1, "collision_check": 2, "rrtstar": 3, "c
 
 
 def _flow(
-    name: str, flights: Sequence[FlownMission], golden: GoldenFlights, alone: tuple[int, int] | None
+    name: str, flights: pa.Table, own: Mapping[str, Row], alone: tuple[int, int] | None
 ) -> _KernelFlow:
-    by_fate: dict[Fate, list[FlownMission]] = {fate: [] for fate in Fate}
-    for each in flights:
-        by_fate[_fate_of(golden, each)].append(each)
-    lived = sum(each.lost for fate in (Fate.SAME, Fate.CHANGED) for each in by_fate[fate])
-    layers = None if alone is None else cross_layer(*alone, lived, len(flights))
+    fates = [_fate_of(each, own[each["pair"]]) for each in flights.to_pylist()]
+    lost = {fate: flags(flights, "lost")[np.array(fates) == fate] for fate in Fate}
+    lived = int(lost[Fate.SAME].sum() + lost[Fate.CHANGED].sum())
+    layers = None if alone is None else cross_layer(*alone, lived, flights.num_rows)
     return _KernelFlow(
         kernel=name,
-        fates={fate: lost_share(those) for fate, those in by_fate.items()},
-        lost=lost_share(flights),
-        harmed=harm_share(golden, flights),
+        fates={fate: wilson(int(each.sum()), len(each)) for fate, each in lost.items()},
+        lost=share(flights),
+        harmed=share(flights, "harmed"),
         silent=None if layers is None else Share(**layers["corruption"]),
         given_silent=None if layers is None else layers["failure_given_corruption"],
     )
@@ -129,34 +135,44 @@ class StateCell:
     lost: Share
 
 
-def state_map(flights: Sequence[FlownMission]) -> list[StateCell]:
+def state_map(flights: pa.Table) -> list[StateCell]:
     """The map, for source-level faults without a detector whose golden flights succeed.
 
     A fault in several components is told by its group, and by the highest bit that it flips.
+
+    Args:
+        flights: of `reproduction.flights.beside_golden`.
     """
-    golden = GoldenFlights(flights)
-    cells: dict[tuple[str, str, str], list[FlownMission]] = {}
-    for each in golden.paired(struck(flights)):
-        if each.level == "source" and each.struck_state and each.struck_bits:
-            place = (_state(each), _class(each), each.strike_phase or "")
-            cells.setdefault(place, []).append(each)
+    hit = struck(flights, level="source", own_lost=False)
+    hit = hit.filter(
+        pc.and_(pc.not_equal(hit["struck_state"], ""), pc.is_valid(hit["struck_bits"]))
+    )
+    rows = hit.to_pylist()
+    cells = by_value(
+        with_columns(
+            hit,
+            name=pa.array(map(_state, rows), pa.string()),
+            bits=pa.array(map(_class, rows), pa.string()),
+            phase=pc.fill_null(hit["strike_phase"], ""),
+        ),
+        "name", "bits", "phase",
+    )  # fmt: skip
     return [
         StateCell(
-            state=state, bits=bits, phase=phase, harmed=harm_share(golden, those),
-            lost=lost_share(those),
+            state=state, bits=bits, phase=phase, harmed=share(those, "harmed"), lost=share(those)
         )
         for (state, bits, phase), those in sorted(cells.items())
-    ]  # fmt: skip
+    ]
 
 
-def _state(flight: FlownMission) -> str:
-    states = str(flight.struck_state).split(";")
-    return states[0] if len(states) == 1 else str(flight.fault_target)
+def _state(flight: Row) -> str:
+    states = str(flight["struck_state"]).split(";")
+    return states[0] if len(states) == 1 else str(flight["fault_target"])
 
 
-def _class(flight: FlownMission) -> str:
-    name = str(flight.struck_state).split(";")[0]
-    bits = max(map(int, str(flight.struck_bits).replace(";", " ").split()))
+def _class(flight: Row) -> str:
+    name = str(flight["struck_state"]).split(";")[0]
+    bits = max(map(int, str(flight["struck_bits"]).replace(";", " ").split()))
     kinds = _BITS[BY_NAME[name].dtype if name in BY_NAME else DType.FLOAT64]
     return next(each for each, lowest in kinds if bits >= lowest)
 
@@ -180,38 +196,34 @@ class _HourlyFailures:
     per_hour: Mapping[str, tuple[float, float, float]]
 
 
-def hourly_failures(
-    flights: Sequence[FlownMission], upsets_per_hour: float
-) -> list[_HourlyFailures]:
+def hourly_failures(flights: pa.Table, upsets_per_hour: float) -> Iterator[_HourlyFailures]:
     """Failures an hour of every kind of fault, by world and detector.
 
     Args:
+        flights: of `reproduction.flights.beside_golden`.
         upsets_per_hour: bit flips that reach the injection sites in an hour of flight.
     """
-    golden = GoldenFlights(flights)
-    kinds: dict[str, dict[str, list[FlownMission]]] = {}
-    for each in golden.paired(where(comparable(flights), struck=True)):
-        kinds.setdefault(_kind(each), {}).setdefault(each.detector or "", []).append(each)
-    found = []
-    for place, by_detector in sorted(kinds.items()):
-        lost = {name: lost_share(those) for name, those in sorted(by_detector.items())}
+    hit = chosen(comparable(flights), struck=True, own_lost=False)
+    hit = with_columns(hit, kind=pa.array(map(_kind, hit.to_pylist()), pa.string()))
+    for (place,), those in sorted(by_value(hit, "kind").items()):
+        by_detector = by_value(those, "detector").items()
+        lost = dict(sorted((name or "", share(each)) for (name,), each in by_detector))
         hourly = {name: failures_per_hour(upsets_per_hour, each) for name, each in lost.items()}
-        found.append(_HourlyFailures(where=place, lost=lost, per_hour=hourly))
-    return found
+        yield _HourlyFailures(where=place, lost=lost, per_hour=hourly)
 
 
 _COMPONENTS = Counter(state.group for state in BY_NAME.values())
 
 
-def _kind(flight: FlownMission) -> str:
+def _kind(flight: Row) -> str:
     """What is struck, how unless it is one bit of any field, and where it flies."""
-    level = "instruction" if flight.level == "instruction" else "state"
-    components = _COMPONENTS[str(flight.fault_target).rpartition(".")[2]]
+    level = "instruction" if flight["level"] == "instruction" else "state"
+    components = _COMPONENTS[str(flight["fault_target"]).rpartition(".")[2]]
     how = [
-        None if flight.fault_field == "any" else flight.fault_field,
-        None if flight.fault_bits == 1 else f"{flight.fault_bits} bits",
-        "all components" if flight.together and components > 1 else None,
+        None if flight["fault_field"] == "any" else flight["fault_field"],
+        None if flight["fault_bits"] == 1 else f"{flight['fault_bits']} bits",
+        "all components" if flight["together"] and components > 1 else None,
     ]
-    computer = None if flight.platform == "x86" else flight.platform
-    parts = (flight.fault_target, *how, flight.world, computer)
+    computer = None if flight["platform"] == "x86" else flight["platform"]
+    parts = (flight["fault_target"], *how, flight["world"], computer)
     return f"{level}: {', '.join(part for part in parts if part)}"

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from mavfi_cli.claims import findings as find
-from mavfi_cli.claims.effects import Finding
+from mavfi_cli.claims import effects as measure
+from mavfi_cli.claims.effects import Finding, Where
+from mavfi_cli.reproduction.flights import EVERY_STAGE, STAGES
 from mavfi_cli.reproduction.layouts import WORLDS
 from mavfi_cli.reproduction.paper import printed
 from mavfi_cli.stats.bootstrap import Interval
@@ -32,6 +33,15 @@ POINTS, PERCENT, NUMBER = "points", "percent", "number"  # units of an effect
 _LIKELY = 0.05  # probability from which a longest flight is no surprise
 _HARDLY = 0.02  # a loss of success that counts as none
 _DETECTORS = {"gad": "Gaussian", "aad": "autoencoder"}
+# Which flights a claim is about.
+_KERNELS = {"level": "instruction", "platform": "x86", "world": "sparse"}
+_MAP, _CHECK = ("point_cloud", "octomap"), "collision_check"
+_LATER = ("planner", "rrtstar", "rrt", "rrtconnect", "control")  # kernels after perception
+_STATES = {"level": "source", "platform": "x86", "world": "sparse", "fault_bits": 1,
+           "fault_field": "any", "together": True}  # fmt: skip
+_IN_STAGES = {"level": "instruction", "platform": "x86", "fault_target": STAGES}
+_TX2 = {"level": "source", "platform": "tx2", "world": "sparse", "fault_field": "any",
+        "fault_target": STAGES}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,20 +104,21 @@ def _kernels() -> Iterator[Claim]:
         name="fig6-octomap", item="fig6", isolated=True, low=0.0, paper_tells=runs,
         words="Of all isolated kernels, OctoMap most often returns a wrong result silently.",
         effect="share of silent corruption in OctoMap minus the largest of the other kernels",
-        find=find.octomap_most_silent,
+        find=partial(measure.outcome_beside, name="octomap", outcome="sdc", choose=max),
     )  # fmt: skip
     yield Claim(
         name="fig6-benign", item="fig6", isolated=True, low=0.25, unit=PERCENT, paper_tells=runs,
         words="Every kernel but OctoMap survives more than a quarter of all faults unchanged.",
         paper="benign in more than 25 %, PID in about 25 %",
         effect="least share of benign runs among the other kernels",
-        find=find.least_benign,
+        find=partial(measure.least_benign, but="octomap"),
     )  # fmt: skip
     yield Claim(
         name="fig6-rrtstar", item="fig6", isolated=True, high=0.0, paper_tells=runs,
         words="Of the three planners, RRT* has the least silent corruption.",
         effect="share of silent corruption in RRT* minus the smaller of the other planners",
-        find=find.rrtstar_least_silent,
+        find=partial(measure.outcome_beside, name="rrtstar", outcome="sdc", choose=min,
+                     others=("rrt", "rrtconnect")),
     )  # fmt: skip
 
 
@@ -121,39 +132,45 @@ def _kernels_in_flight() -> Iterator[Claim]:
         name="fig7-stages", item="fig7", low=0.0,
         words="In flight, faults in planning and control do more harm than faults in perception.",
         effect="share of harmful faults in planning and control minus that in perception",
-        find=find.later_stages_worse,
+        find=partial(measure.harm_difference, groups={
+            "planning and control": {**_KERNELS, "struck_kernel": _LATER},
+            "perception": {**_KERNELS, "struck_kernel": (*_MAP, _CHECK)},
+        }),
     )  # fmt: skip
     yield Claim(
         name="fig7-map", item="fig7", high=_HARDLY,
         words="Faults in point cloud and OctoMap hardly affect the mission.",
         paper="little to negligible",
         effect="success lost by these faults; below 2 points counts as hardly",
-        find=find.map_harmless,
+        find=partial(measure.success_lost, **_KERNELS, struck_kernel=_MAP),
         paper_tells="if none of 200 is lost, the loss is below 2 points",
     )  # fmt: skip
     yield Claim(
         name="fig7-check", item="fig7", low=0.0,
         words="Within perception, the collision check is the critical kernel.",
         effect="share of harmful faults in the check minus that in point cloud and OctoMap",
-        find=find.check_critical,
+        find=partial(measure.harm_difference, groups={
+            "collision check": {**_KERNELS, "struck_kernel": _CHECK},
+            "point cloud and OctoMap": {**_KERNELS, "struck_kernel": _MAP},
+        }),
     )  # fmt: skip
     yield _longest(
         "fig7-time", "fig7", f"A fault in a kernel lengthens the flight by up to {worst:g} %.",
-        find.longest_kernel_flight, 1.0 + worst / 100.0, 7 * runs,
+        _KERNELS, 1.0 + worst / 100.0, 7 * runs,
     )  # fmt: skip
     yield Claim(
         name="fig7-success", item="fig7", low=0.0, high=loss.high,
         words=f"Faults in the most critical kernel cost up to {points:g} points of success.",
         paper=f"{points:g} points",
         effect="success lost by faults in the kernel that loses most",
-        find=find.most_lost_kernel,
+        find=partial(measure.most_lost_kernel, **_KERNELS),
         paper_tells=_tells(loss, "points if no golden flight is lost", *counts),
     )  # fmt: skip
     yield Claim(
         name="fig7-energy", item="fig7", low=0.0, unit=NUMBER,
         words="Flight energy grows with flight time.",
         effect="correlation of the two over golden flights",
-        find=find.energy_follows_time,
+        find=partial(measure.energy_follows_time, world="sparse", platform="x86"),
     )  # fmt: skip
 
 
@@ -161,7 +178,7 @@ def _longest(
     name: str,
     item: str,
     words: str,
-    of: Callable[[float, int], Callable[[Any], Finding]],
+    where: Where,
     ratio: float,
     missions: float,
 ) -> Claim:
@@ -172,7 +189,7 @@ def _longest(
         paper=f"{told}, the longest of {missions:.0f}",
         effect=f"probability that the longest of {missions:.0f} flights is at least as long, each "
         "over its own golden flight",
-        find=of(ratio, round(missions)),
+        find=partial(measure.worst_as_long, ratio=ratio, missions=round(missions), **where),
         paper_tells="one flight; over which golden flight is not said",
     )  # fmt: skip
 
@@ -182,7 +199,10 @@ def _states() -> Iterator[Claim]:
         name="fig8-seq", item="fig8", low=0.0,
         words="future_collision_seq is much more robust than time_to_collision.",
         effect="share of harmful faults in time_to_collision minus that in future_collision_seq",
-        find=find.collision_states,
+        find=partial(measure.harm_difference, groups={
+            state: {**_STATES, "fault_target": state}
+            for state in ("time_to_collision", "future_collision_seq")
+        }),
     )  # fmt: skip
     for state, words in (
         ("position", "A corrupted position of a waypoint leads astray or into an obstacle."),
@@ -192,19 +212,39 @@ def _states() -> Iterator[Claim]:
         yield Claim(
             name=f"fig8-{state}", item="fig8", low=0.0, unit=PERCENT, words=words,
             effect=f"share of harmful faults in the {state}; one is enough",
-            find=find.state_harm(f"waypoint_{state}"),
+            find=partial(measure.harmful, **_STATES, fault_target=f"waypoint_{state}"),
         )  # fmt: skip
+    position = {**_STATES, "fault_target": "waypoint_position"}
     yield Claim(
         name="fig9-fields", item="fig9", low=0.0,
         words="Flips in sign and exponent do more harm than flips in the mantissa.",
         effect="share of harmful faults in sign and exponent minus that in the mantissa",
-        find=find.fields_that_matter,
+        find=partial(measure.harm_difference, groups={
+            "sign and exponent": {**position, "fault_field": ("sign", "exponent")},
+            "mantissa": {**position, "fault_field": "mantissa"},
+        }),
     )  # fmt: skip
     runs = _number("table3", "runs")
     names = {0: "golden", 1: "1 bit", 5: "5 bits"}
+    acceleration = {**_STATES, "fault_target": "waypoint_acceleration"}
     for other, bits, words, finder in (
-        (0, 1, "One flipped bit in each acceleration lowers the success rate.", find.one_bit),
-        (1, 5, "Five flipped bits cost only slightly more than one.", find.five_bits),
+        (
+            0,
+            1,
+            "One flipped bit in each acceleration lowers the success rate.",
+            partial(measure.success_lost, **acceleration),
+        ),
+        (
+            1,
+            5,
+            "Five flipped bits cost only slightly more than one.",
+            partial(
+                measure.loss_difference,
+                first={**acceleration, "fault_bits": 5},
+                second=acceleration,
+                told="{} with 5 bits, {} with 1",
+            ),
+        ),
     ):
         success = [_number("table3", "success_percent", each) for each in (other, bits)]
         counts = _wins(success[0], runs), _wins(success[1], runs)
@@ -240,7 +280,7 @@ def _worlds() -> Iterator[Claim]:
             words=f"In {world.capitalize()}, faults in instructions lower the success rate.",
             paper=f"{success[0]:g} % to {success[1]:g} %: {success[0] - success[1]:.1f} points",
             effect="success of golden flights minus that of the same missions with a fault",
-            find=find.success_lost_in(world),
+            find=partial(measure.success_lost, **_IN_STAGES, world=world),
             paper_tells=_tells(loss, "points", golden, faulty),
         )  # fmt: skip
     losses = [
@@ -253,7 +293,10 @@ def _worlds() -> Iterator[Claim]:
         words="Faults cost more missions where obstacles are dense than where there are none.",
         paper=f"{100 * losses[0].value:.1f} points in Dense, {100 * losses[1].value:.1f} in Farm",
         effect="share of lost missions in Dense minus that in Farm, where golden flights succeed",
-        find=find.dense_worse,
+        find=partial(
+            measure.loss_difference, first={"world": "dense"}, second={"world": "farm"},
+            told="dense {}, farm {}", **_IN_STAGES, own_lost=False,
+        ),
         paper_tells=f"{100 * more.low:z.0f} to {100 * more.high:z.0f} points more",
     )  # fmt: skip
 
@@ -269,7 +312,7 @@ def _recovery() -> Iterator[Claim]:
             "that faults lose.",
             paper=f"{best} at best, {100 * own.value:.0f} % over all worlds",
             effect="share of lost missions that the detector saves",
-            find=find.recovered_by(detector),
+            find=partial(measure.recovered, detector=detector, **_IN_STAGES),
             paper_tells=f"{ends} over all worlds; a ratio of differences",
         )  # fmt: skip
     counts = _table4_counts("aad"), _table4_counts("gad")
@@ -279,7 +322,7 @@ def _recovery() -> Iterator[Claim]:
         words="The autoencoder consistently does better than the Gaussian detector.",
         paper=f"{100 * gain.value:.1f} points more success over all worlds",
         effect="success with the autoencoder minus success with the Gaussian, on the same faults",
-        find=find.autoencoder_better,
+        find=partial(measure.autoencoder_better, **_IN_STAGES),
         paper_tells=_tells(gain, "points", *counts),
     )  # fmt: skip
 
@@ -291,7 +334,7 @@ def _long_flights() -> Iterator[Claim]:
         yield _longest(
             f"fig12-{world}", "fig12",
             f"In {world.capitalize()}, the longest flight with a fault takes {worst:g} % longer.",
-            partial(find.worst_in, world),
+            {**_IN_STAGES, "world": world},
             1.0 + worst / 100.0, runs,
         )  # fmt: skip
     for detector, name in _DETECTORS.items():
@@ -301,7 +344,7 @@ def _long_flights() -> Iterator[Claim]:
             words=f"The {name} detector recovers most of the long flights.",
             paper=f"{min(points):.1f} to {max(points):.1f} points of the longest",
             effect="share of flights over 5 % longer than golden that it brings back within 5 %",
-            find=find.shortened_by(detector),
+            find=partial(measure.shortened, detector=detector, **_IN_STAGES),
             paper_tells="differences of single longest flights",
         )  # fmt: skip
     for stage in ("perception", "planning"):
@@ -311,33 +354,33 @@ def _long_flights() -> Iterator[Claim]:
             words=f"In Dense, a fault in {stage} can cause a detour of {longer:g} % more time.",
             paper=f"+{longer:g} %, one flight",
             effect=f"share of faults in {stage} whose flight is at least as long; one is enough",
-            find=find.detour(stage, 1.0 + longer / 100.0),
+            find=partial(measure.as_long, ratio=1.0 + longer / 100.0,
+                         **{**_IN_STAGES, "fault_target": stage, "world": "dense"}),
             paper_tells="one chosen flight",
         )  # fmt: skip
 
 
 def _stages() -> Iterator[Claim]:
-    every = "+".join(find.STAGES)
     for detector, name in _DETECTORS.items():
         told = {
             stages: _number("fig14", "recovered_percent", detector, "factory", stages)
-            for stages in (*find.STAGES, every)
+            for stages in (*STAGES, EVERY_STAGE)
         }
-        single = ", ".join(f"{told[stage]:g}" for stage in find.STAGES)
+        single = ", ".join(f"{told[stage]:g}" for stage in STAGES)
         yield Claim(
             name=f"fig14-control-{detector}", item="fig14", low=0.0,
             words=f"Of single stages, watching control recovers most ({name}).",
             paper=f"Factory: {single} % of the longest",
             effect="share of harm undone by watching control minus the better of the others",
-            find=find.control_recovers_most(detector),
+            find=partial(measure.control_recovers_most, detector=detector, **_IN_STAGES),
             paper_tells="differences of single longest flights",
         )  # fmt: skip
         yield Claim(
             name=f"fig14-all-{detector}", item="fig14", low=0.0,
             words=f"Watching all stages recovers more than watching control alone ({name}).",
-            paper=f"Factory: {told[every]:g} % against {told['control']:g} %",
+            paper=f"Factory: {told[EVERY_STAGE]:g} % against {told['control']:g} %",
             effect="share of harm undone by watching all stages minus that by watching control",
-            find=find.all_stages_best(detector),
+            find=partial(measure.all_stages_best, detector=detector, **_IN_STAGES),
             paper_tells="differences of single longest flights",
         )  # fmt: skip
 
@@ -351,7 +394,7 @@ def _costs() -> Iterator[Claim]:
             "of the flight time.",
             paper=f"{min(sums):g} to {max(sums):g} %",
             effect="mean share of the flight time, all worlds",
-            find=find.overhead_of(detector),
+            find=partial(measure.overhead_of, detector=detector, **_IN_STAGES),
             paper_tells="printed without spread",
         )  # fmt: skip
     yield Claim(
@@ -360,7 +403,7 @@ def _costs() -> Iterator[Claim]:
         "perception and planning.",
         paper="2 % against 0.005 %",
         effect="cost of the Gaussian detector minus that of the autoencoder, on the same faults",
-        find=find.gaussian_dearer,
+        find=partial(measure.gaussian_dearer, **_IN_STAGES),
         paper_tells="printed without spread",
     )  # fmt: skip
     ratios = [_number("fig15", "time_ratio", "tmr", vehicle) for vehicle in ("airsim", "spark")]
@@ -370,14 +413,14 @@ def _costs() -> Iterator[Claim]:
         f"and {ratios[1]:g} times on the DJI Spark.",
         paper=f"{ratios[0]:g} and {ratios[1]:g} times",
         effect="nothing here (mavfi vpm --fly flies it)",
-        find=find.calibrated,
+        find=measure.calibrated,
         paper_tells="a model, not flown",
     )  # fmt: skip
     worst = _number("fig16", "worst_ratio", "tx2")
     yield _longest(
         "fig16-worst", "fig16",
         f"On the TX2, the longest flight with a fault takes {worst:g} times as long.",
-        partial(find.worst_on, "tx2"), worst, 300,
+        _TX2, worst, 300,
     )  # fmt: skip
     for detector, name in _DETECTORS.items():
         share = _number("fig16", "recovered_percent", detector, "tx2")
@@ -386,7 +429,7 @@ def _costs() -> Iterator[Claim]:
             words=f"On the TX2, too, the {name} detector recovers most of the long flights.",
             paper=f"{share:g} % of the longest",
             effect="share of flights over 5 % longer than golden that it brings back within 5 %",
-            find=find.shortened_on("tx2", detector),
+            find=partial(measure.shortened, detector=detector, **_TX2),
             paper_tells="differences of single longest flights",
         )  # fmt: skip
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.analysis.kernel_runs import silent_of_all
 from mavfi_cli.campaigns.specification_file import to_toml
 from mavfi_cli.claims.arms import arms
@@ -19,33 +23,37 @@ from mavfi_cli.claims.beyond import (
     state_map,
 )
 from mavfi_cli.claims.catalogue import CLAIMS, Claim
-from mavfi_cli.claims.effects import Finding, Protected, lost_share, struck, worst_flights
-from mavfi_cli.claims.findings import Kernels, instruction_faults
-from mavfi_cli.claims.flights import FlownMission, GoldenFlights, comparable, where
+from mavfi_cli.claims.effects import Finding, Kernels, protected
+from mavfi_cli.claims.items import shown_items
 from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.report.tables.paper_table import count_of
+from mavfi_cli.reproduction.flights import (
+    LONGER,
+    beside_golden,
+    by_value,
+    comparable,
+    ratios,
+    share,
+    struck,
+)
 from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT, printed_name
-from mavfi_cli.stats.effects import ClaimVerdict, judge
-from mavfi_cli.stats.shares import wilson
+from mavfi_cli.stats.effects import ClaimVerdict, excess_over_mean, judge
+from mavfi_cli.stats.shares import Share, wilson
 
 _DETECTORS = (None, "gad", "aad")
 _LONGEST = 5  # flights of a campaign that are listed although they succeed
 _ISOLATED = "isolated kernels"
 
 
-def document(
-    evidence: Evidence, items: Iterable[Any], upsets_per_hour: float = 1.0
-) -> dict[str, Any]:
+def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]:
     """All parts of the report.
 
     Args:
-        items: the paper's tables and figures, as `claims.items.shown_items`.
         upsets_per_hour: bit flips that reach the injection sites in an hour of flight.
     """
-    flights = {
-        stack: [each for each in evidence.missions(stack) if each.as_paper] for stack in STACKS
-    }
+    flown = {stack: evidence.flights(stack) for stack in STACKS}
+    flights = {stack: chosen(those, as_paper=True) for stack, those in flown.items()}
     kernels = _kernels(evidence)
     silent = {name: silent_of_all(each) for name, each in kernels.items()}
     claims = [_judged(claim, flights, kernels) for claim in CLAIMS]
@@ -57,18 +65,18 @@ def document(
         "problems": evidence.problems,
         "claims": claims,
         "verdicts": {where: _counted(claims, where) for where in (*STACKS, _ISOLATED)},
-        "worst": [row for stack in STACKS for row in _worst(stack, flights[stack])],
+        "worst": [row for stack in STACKS for row in worst_flights(stack, flights[stack])],
         "spreads": [row for stack in STACKS for row in _spreads(stack, flights[stack])],
         "flows": {stack: kernel_flows(flights[stack], silent) for stack in STACKS},
         "fates": [*Fate],
         "maps": [part for stack in STACKS for part in _matrices(stack, maps[stack])],
         "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
         "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
-        "items": _items(items),
+        "items": _items(shown_items(evidence, flown)),
         "left_out": {printed_name(name): why for name, why in LEFT_OUT.items()},
         "detectors": ("", "gad", "aad"),
         "upsets_per_hour": upsets_per_hour,
-        "hourly": {stack: hourly_failures(flights[stack], upsets_per_hour) for stack in STACKS},
+        "hourly": {s: [*hourly_failures(flights[s], upsets_per_hour)] for s in STACKS},
         "arms": [
             {"campaign": each.name, "arms": found}
             for each in evidence.campaigns
@@ -78,7 +86,7 @@ def document(
         "kernel_sources": [
             {"path": each.path, "summary": each.summary} for each in evidence.kernels
         ],
-        "missions": [_worth_a_look(each) for each in evidence.campaigns if each.flights],
+        "missions": [_worth_a_look(each) for each in evidence.campaigns if each.flights.num_rows],
     }
 
 
@@ -103,9 +111,7 @@ def _kernels(evidence: Evidence) -> Kernels:
 # Claims -------------------------------------------------------------------------------------------
 
 
-def _judged(
-    claim: Claim, flights: Mapping[str, Sequence[FlownMission]], kernels: Kernels
-) -> dict[str, Any]:
+def _judged(claim: Claim, flights: Mapping[str, pa.Table], kernels: Kernels) -> dict[str, Any]:
     if claim.isolated:
         found = {_ISOLATED: claim.find(kernels)}
     else:
@@ -135,11 +141,11 @@ def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdi
 
 def _summary(
     evidence: Evidence,
-    flights: Mapping[str, Sequence[FlownMission]],
+    flights: Mapping[str, pa.Table],
     kernels: Kernels,
     claims: Sequence[Mapping[str, Any]],
 ) -> list[str]:
-    missions = len(evidence.missions())
+    missions = evidence.flights().num_rows
     runs = sum(each["runs"] for each in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
     return [
@@ -182,16 +188,17 @@ def _listed_in_words(parts: Sequence[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
+def _cost_sentence(flights: Mapping[str, pa.Table]) -> str:
     parts = []
     for stack, those in flights.items():
-        faulty = instruction_faults(those) or struck(where(those, level="source"))
-        kind = "an instruction" if instruction_faults(those) else "a state"
-        golden = GoldenFlights(those)
-        faulty = golden.paired(faulty)
-        if faulty:
+        instructions = _instruction_faults(those)
+        kind = "an instruction" if instructions.num_rows else "a state"
+        hit = chosen(
+            instructions if instructions.num_rows else struck(those, level="source"), own_lost=False
+        )
+        if hit.num_rows:
             parts.append(
-                f"on {stack}, a bit flip in {kind} loses {_rate(lost_share(faulty))} of the "
+                f"on {stack}, a bit flip in {kind} loses {_rate(share(hit))} of the "
                 "missions whose golden flight succeeds"
             )
     if not parts:
@@ -199,16 +206,20 @@ def _cost_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
     return _sentence(parts)
 
 
-def _saved_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
+def _instruction_faults(flights: pa.Table) -> pa.Table:
+    """Unprotected flights on the host's computer with a fault in an instruction."""
+    return struck(flights, level="instruction", platform="x86")
+
+
+def _saved_sentence(flights: Mapping[str, pa.Table]) -> str:
     parts = []
     for stack, those in flights.items():
         for level, kind in (("instruction", "an instruction"), ("source", "a state")):
             saved = []
             for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
-                pairs = Protected.of(those, detector).pairs
-                lost = [each for own, each in pairs if own.lost and own.level == level]
-                share = wilson(sum(not each.lost for each in lost), len(lost))
-                saved += [f"{name} saves {_rate(share)}"] if lost else []
+                lost = protected(those, detector, level=level, bare_lost=True)
+                found = share(lost, value=False)
+                saved += [f"{name} saves {_rate(found)}"] if found.total else []
             if saved:
                 place = f"on {stack}, of the missions that a fault in {kind} loses"
                 parts.append(f"{place}, {_listed_in_words(saved)}")
@@ -217,11 +228,12 @@ def _saved_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
     return _sentence(parts)
 
 
-def _crash_sentence(flights: Mapping[str, Sequence[FlownMission]]) -> str:
-    lost = [each for those in flights.values() for each in instruction_faults(those) if each.lost]
-    if not lost:
+def _crash_sentence(flights: Mapping[str, pa.Table]) -> str:
+    lost = [chosen(_instruction_faults(those), lost=True) for those in flights.values()]
+    nodes = [each for those in lost for each in those["node_ended"].to_pylist()]
+    if not nodes:
         return "No fault in an instruction has lost a mission."
-    ended = wilson(sum(bool(each.node_ended) for each in lost), len(lost))
+    ended = wilson(sum(map(bool, nodes)), len(nodes))
     if ended.count == ended.total:
         return (
             f"All {ended.total:,} missions that a fault in an instruction loses follow a node that "
@@ -238,41 +250,50 @@ def _sentence(parts: Sequence[str]) -> str:
     return text[0].upper() + text[1:]
 
 
-def _rate(share: Any) -> str:
-    ends = f"{100 * share.low:.0f} to {100 * share.high:.0f}"
-    return f"{100 * share.share:.0f} % ({count_of(share)}; 95 % interval {ends} %)"
+def _rate(found: Share) -> str:
+    ends = f"{100 * found.low:.0f} to {100 * found.high:.0f}"
+    return f"{100 * found.share:.0f} % ({count_of(found)}; 95 % interval {ends} %)"
 
 
 # Worst cases and spreads --------------------------------------------------------------------------
 
 
-def _worst(stack: str, flights: Sequence[FlownMission]) -> list[dict[str, Any]]:
-    rows = []
-    golden = GoldenFlights(flights)
-    faulty = where(comparable(flights), struck=True)
-    kinds = sorted({(str(each.level), each.world, str(each.platform)) for each in faulty})
-    for level, world, platform in kinds:
-        for detector in _DETECTORS:
-            those = where(faulty, level=level, world=world, platform=platform, detector=detector)
-            if golden.ratios(those):
-                rows.append(
-                    {"stack": stack, "level": level, "world": world, "platform": platform,
-                     "detector": detector, "longest": worst_flights(golden, those)}
-                )  # fmt: skip
-    return rows
+def worst_flights(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
+    """The longest flights of each setting, paired and unpaired, as the paper may have read them."""
+    faulty = chosen(comparable(flights), struck=True, detector=_DETECTORS)
+    groups = by_value(faulty, "level", "world", "platform", "detector")
+    for (*kind, detector), those in sorted(groups.items(), key=_by_detector):
+        known = those.filter(pc.is_valid(those["over_own"]))
+        if not known.num_rows:
+            continue
+        found, times = ratios(known), known["flight_time_s"].to_pylist()
+        own = dict(
+            zip(known["pair"].to_pylist(), known["own_flight_time_s"].to_pylist(), strict=True)
+        )
+        reference, longest = excess_over_mean([*own.values()], times)
+        yield {
+            **dict(zip(("stack", "level", "world", "platform"), (stack, *kind), strict=True)),
+            "detector": detector,
+            "flights": len(found),
+            "longer": float((found > LONGER).mean()),
+            "paired": found.max() - 1.0,
+            "unpaired": longest,
+            "golden": reference,
+        }
 
 
-def _spreads(stack: str, flights: Sequence[FlownMission]) -> list[dict[str, Any]]:
+def _by_detector(group: tuple[tuple[Any, ...], pa.Table]) -> tuple[Any, ...]:
+    (*kind, detector), _ = group
+    return *map(str, kind), _DETECTORS.index(detector)
+
+
+def _spreads(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
     """Every flight with a fault in a state over its own golden one, by world and detector."""
-    golden = GoldenFlights(flights)
-    found: dict[tuple[str, str | None], list[FlownMission]] = {}
-    for each in where(comparable(flights), level="source", platform="x86", struck=True):
-        found.setdefault((each.world, each.detector), []).append(each)
-    return [
-        {"stack": stack, "world": world, "detector": detector, "ratios": golden.ratios(those)}
-        for (world, detector), those in sorted(found.items(), key=str)
-        if golden.ratios(those)
-    ]
+    faulty = chosen(comparable(flights), level="source", platform="x86", struck=True)
+    groups = by_value(faulty, "world", "detector")
+    for world, detector in sorted(groups, key=str):
+        if len(found := ratios(groups[world, detector])):
+            yield {"stack": stack, "world": world, "detector": detector, "ratios": found}
 
 
 # Where a bit hurts --------------------------------------------------------------------------------
@@ -309,17 +330,17 @@ def _map_rows(stack: str, cells: Sequence[StateCell]) -> list[dict[str, Any]]:
 
 def _source(source: CampaignSource) -> dict[str, Any]:
     spec = source.spec
-    seeds = sorted({each.seed for each in source.flights})
+    seeds = pc.min_max(source.flights["seed"]).as_py()
     return {
         "name": source.name,
         "path": source.path,
         "about": spec.about if spec else "",
         "toml": to_toml(spec) if spec else "",
         "planned": source.planned,
-        "flown": len(source.flights),
+        "flown": source.flights.num_rows,
         "errors": source.errors,
-        "stacks": sorted({each.stack for each in source.flights}),
-        "seeds": (seeds[0], seeds[-1]) if seeds else None,
+        "stacks": sorted(pc.unique(source.flights["stack"]).to_pylist()),
+        "seeds": (seeds["min"], seeds["max"]) if source.flights.num_rows else None,
         "root": spec.seed if spec else None,
         "versions": source.versions,
         "host": {name: source.host.get(name) for name in ("machine", "cores", "started")},
@@ -329,34 +350,27 @@ def _source(source: CampaignSource) -> dict[str, Any]:
 
 def _worth_a_look(source: CampaignSource) -> dict[str, Any]:
     """The lost missions of a campaign, and the longest of the others."""
-    golden = GoldenFlights(source.flights)
-    lost = [each for each in source.flights if each.lost]
-    longer = sorted(
-        (each for each in source.flights if not each.golden and golden.ratio(each)),
-        key=lambda each: -(golden.ratio(each) or 0.0),
-    )[:_LONGEST]
+    flights = beside_golden(source.flights)
+    faulty = flights.filter(
+        pc.and_(pc.is_valid(flights["level"]), pc.is_valid(flights["over_own"]))
+    )
+    longest = sorted(faulty.to_pylist(), key=lambda each: -each["over_own"])[:_LONGEST]
     return {
         "name": source.name,
-        "lost": [_listed(each, golden) for each in lost],
-        "longest": [_listed(each, golden) for each in longer],
+        "lost": [_listed(each, source.path) for each in chosen(flights, lost=True).to_pylist()],
+        "longest": [_listed(each, source.path) for each in longest],
     }
 
 
-def _listed(flight: FlownMission, golden: GoldenFlights) -> dict[str, Any]:
+def _listed(flight: Mapping[str, Any], source: Path) -> dict[str, Any]:
     """One line of the list; the command repeats the flight."""
-    struck_state = f"{flight.fault_target}, {flight.fault_field or 'any'}"
-    what = "golden" if flight.golden else struck_state
-    kept = flight.path is not None and Path(flight.path).is_dir()
-    place = flight.path if kept else f"{flight.source} --mission {flight.number}"
+    struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
+    what = "golden" if flight["level"] is None else struck_state
+    kept = flight["path"] is not None and Path(flight["path"]).is_dir()
+    place = flight["path"] if kept else f"{source} --mission {flight['number']}"
     return {
-        "number": flight.number,
-        "what": " + ".join(filter(None, (what, flight.detector))),
-        "world": flight.world,
-        "seed": flight.seed,
-        "stack": flight.stack,
-        "outcome": flight.outcome,
-        "reason": flight.reason,
-        "flight_time_s": flight.flight_time_s,
-        "ratio": golden.ratio(flight),
+        **flight,
+        "what": " + ".join(filter(None, (what, flight["detector"]))),
+        "ratio": flight["over_own"],
         "command": f"mavfi replay {place}",
     }

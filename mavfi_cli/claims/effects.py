@@ -1,23 +1,48 @@
-"""Lost, longer and recovered missions as numbers with intervals."""
+"""What missions say about a claim: the number that decides it with its interval, and the counts.
+
+Every measure takes a stack's flights, as `reproduction.flights.pooled`, and the values of columns
+that choose some of them. Of faults without a detector it counts those that flipped a bit.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from mavfi_cli.claims.flights import EVERY_STAGE, LONGER, FlownMission, GoldenFlights, where
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import COSTS, chosen, flags, numbers
+from mavfi_cli.analysis.groups import RESAMPLES
+from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.tables.paper_table import count_of
-from mavfi_cli.stats.bootstrap import Interval
+from mavfi_cli.reproduction.flights import (
+    EVERY_STAGE,
+    STAGES,
+    by_value,
+    faults_of,
+    golden,
+    ratios,
+    share,
+    struck,
+)
+from mavfi_cli.stats.bootstrap import Interval, interval
 from mavfi_cli.stats.effects import (
     as_interval,
-    excess_over_mean,
+    correlation,
     longest_reaches,
     paired_difference,
     rate_difference,
 )
-from mavfi_cli.stats.paired import McNemar, mcnemar
+from mavfi_cli.stats.paired import mcnemar
 from mavfi_cli.stats.shares import Share, wilson
+
+Where = Mapping[str, Any]  # values of columns; a tuple allows several
+Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
+FEWEST = 4  # flights for a correlation with an interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,191 +54,252 @@ class Finding:
         told: the counts behind it.
     """
 
-    effect: Interval | None
-    told: str
+    effect: Interval | None = None
+    told: str = ""
 
 
-NOTHING = Finding(effect=None, told="")
+def _of_share(found: Share, what: str) -> Finding:
+    if not found.total:
+        return Finding()
+    return Finding(effect=as_interval(found), told=f"{count_of(found)} {what}")
 
 
-def struck(flights: Iterable[FlownMission], *, detector: str | None = None) -> list[FlownMission]:
-    """The flights with a flipped bit, without a detector or with this one."""
-    return where(flights, struck=True, detector=detector)
+def _difference(shares: Sequence[Share], told: str) -> Finding:
+    """The first minus the second of two shares; nothing unless both have flights."""
+    first, second = shares
+    if not (first.total and second.total):
+        return Finding()
+    return Finding(effect=rate_difference(first, second), told=told)
 
 
-def lost_share(flights: Sequence[FlownMission]) -> Share:
-    """The share of lost missions."""
-    return wilson(sum(each.lost for each in flights), len(flights))
+# Faults without a detector ------------------------------------------------------------------------
 
 
-def harm_share(golden: GoldenFlights, flights: Iterable[FlownMission]) -> Share:
-    """The share of missions that a fault loses or makes more than 5 % longer."""
-    paired = golden.paired(flights)
-    return wilson(sum(map(golden.harmed, paired)), len(paired))
-
-
-def success_lost(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Finding:
+def success_lost(flights: pa.Table, **where: Any) -> Finding:
     """Success of the golden flights minus that of the same missions with a fault."""
-    pairs = [(own, each) for each in flights if (own := golden.any_of(each)) is not None]
-    if not pairs:
-        return NOTHING
-    test = mcnemar([not each.lost for each, _ in pairs], [not each.lost for _, each in pairs])
-    change = paired_difference(test)
-    return Finding(
-        effect=_turned(change),
-        told=f"{count_of(lost_share([each for _, each in pairs]))} lost; golden "
-        f"{count_of(lost_share([each for each, _ in pairs]))}",
-    )
+    hit = struck(flights, **where)
+    both = hit.filter(pc.is_valid(hit["own_lost"]))
+    if not both.num_rows:
+        return Finding()
+    found = paired_difference(mcnemar(~flags(both, "lost"), ~flags(both, "own_lost")))
+    told = f"{count_of(share(both))} lost; golden {count_of(share(both, 'own_lost'))}"
+    return Finding(effect=found, told=told)
 
 
-def _turned(change: Interval) -> Interval:
-    return Interval(value=-change.value, low=-change.high, high=-change.low, count=change.count)
+def most_lost_kernel(flights: pa.Table, **where: Any) -> Finding:
+    """Success lost by faults in the kernel that loses most."""
+    hit = by_value(struck(flights, **where), "struck_kernel")
+    kernels = {name: share(those).share for (name,), those in hit.items() if name}
+    if not kernels:
+        return Finding()
+    most = max(kernels, key=lambda name: kernels[name])
+    found = success_lost(flights, **where, struck_kernel=most)
+    return Finding(effect=found.effect, told=f"most in {most}: {found.told}")
 
 
-def harm_difference(
-    golden: GoldenFlights,
-    first: Sequence[FlownMission],
-    second: Sequence[FlownMission],
-    names: tuple[str, str],
-) -> Finding:
-    """Share of harmful faults among the first minus that among the second."""
-    shares = harm_share(golden, first), harm_share(golden, second)
-    if not all(each.total for each in shares):
-        return NOTHING
-    told = "; ".join(f"{name} {count_of(each)}" for name, each in zip(names, shares, strict=True))
-    return Finding(effect=rate_difference(*shares), told=f"harmful: {told}")
+def harm_difference(flights: pa.Table, groups: Mapping[str, Where]) -> Finding:
+    """Share of harmful faults in the first of two groups minus that in the second."""
+    shares = [share(struck(flights, **where), "harmed") for where in groups.values()]
+    told = (f"{name} {count_of(each)}" for name, each in zip(groups, shares, strict=True))
+    return _difference(shares, f"harmful: {'; '.join(told)}")
 
 
-def harmful(golden: GoldenFlights, flights: Sequence[FlownMission]) -> Finding:
+def harmful(flights: pa.Table, **where: Any) -> Finding:
     """The share of harmful faults."""
-    share = harm_share(golden, flights)
-    if not share.total:
-        return NOTHING
-    return Finding(effect=as_interval(share), told=f"{count_of(share)} harmful")
+    return _of_share(share(struck(flights, **where), "harmed"), "harmful")
 
 
-def worst_as_long(
-    golden: GoldenFlights, flights: Sequence[FlownMission], ratio: float, missions: int
+def loss_difference(
+    flights: pa.Table, first: Where, second: Where, told: str, **where: Any
 ) -> Finding:
+    """Share of lost missions in one group of faults minus that in another.
+
+    Args:
+        told: the counts, as a format of two texts.
+    """
+    shares = [share(struck(flights, **where, **each)) for each in (first, second)]
+    return _difference(shares, f"lost: {told.format(*map(count_of, shares))}")
+
+
+def as_long(flights: pa.Table, ratio: float, **where: Any) -> Finding:
+    """The share of flights that take at least so many times as long as their golden flights."""
+    return _of_share(_at_least(ratio, ratios(struck(flights, **where))), "as long")
+
+
+def _at_least(ratio: float, found: FloatArray) -> Share:
+    return wilson(int((found >= ratio).sum()), len(found))
+
+
+def worst_as_long(flights: pa.Table, ratio: float, missions: int, **where: Any) -> Finding:
     """The probability that the longest of so many flights reaches a ratio to its golden flight."""
-    ratios = golden.ratios(flights)
-    if not ratios:
-        return NOTHING
-    beyond = wilson(sum(each >= ratio for each in ratios), len(ratios))
+    found = ratios(struck(flights, **where))
+    if not len(found):
+        return Finding()
+    beyond = _at_least(ratio, found)
+    longest = 100.0 * (found.max() - 1.0)
     return Finding(
         effect=longest_reaches(beyond, missions),
-        told=f"{count_of(beyond)} as long; longest {100.0 * (max(ratios) - 1.0):+.1f} %",
+        told=f"{count_of(beyond)} as long; longest {longest:+.1f} %",
     )
 
 
-# Protection: the same faults without and with a detector ------------------------------------------
+def energy_follows_time(flights: pa.Table, **where: Any) -> Finding:
+    """Correlation of energy with flight time over successful golden flights."""
+    won = chosen(golden(flights), lost=False, **where)
+    pairs = np.stack([numbers(won, name) for name in ("flight_time_s", "energy_regression_j")], 1)
+    pairs = pairs[(pairs > 0.0).all(axis=1)]
+    if len(pairs) < FEWEST:
+        return Finding()
+    return Finding(effect=correlation(pairs.tolist()), told=f"{len(pairs):,} golden flights")
 
 
-@dataclass(frozen=True, slots=True)
-class Protected:
-    """Faults that were flown without and with a detector, and their golden flights."""
-
-    golden: GoldenFlights
-    pairs: Sequence[tuple[FlownMission, FlownMission]]  # without, with
-
-    @classmethod
-    def of(
-        cls, flights: Sequence[FlownMission], detector: str, protect: str = EVERY_STAGE
-    ) -> Protected:
-        """The faults of these flights that a detector has seen.
-
-        Args:
-            protect: the protected stages.
-        """
-        golden = GoldenFlights(flights)
-        bare = {(each.pair, each.fault): each for each in struck(flights)}
-        pairs = [
-            (own, each)
-            for each in flights
-            if each.detector == detector
-            and each.protect == protect
-            and (own := bare.get((each.pair, each.fault))) is not None
-            and golden.of(own) is not None
-        ]
-        return cls(golden, pairs)
-
-    def recovered(self) -> Finding:
-        """The share of lost missions that the detector saves."""
-        lost = [(own, each) for own, each in self.pairs if own.lost]
-        share = wilson(sum(not each.lost for _, each in lost), len(lost))
-        if not share.total:
-            return self._none("lost")
-        return Finding(effect=as_interval(share), told=f"{count_of(share)} lost missions saved")
-
-    def _none(self, what: str) -> Finding:
-        """What is told if none of the faults, flown without the detector, had an effect."""
-        if not self.pairs:
-            return NOTHING
-        return Finding(effect=None, told=f"without it 0 of {len(self.pairs):,} {what}")
-
-    def undone(self, *, longer_only: bool = False) -> Share:
-        """The share of harmful faults that do no harm with the detector."""
-        harmed = [
-            (own, each)
-            for own, each in self.pairs
-            if self.golden.harmed(own) and not (longer_only and own.lost)
-        ]
-        return wilson(sum(not self.golden.harmed(each) for _, each in harmed), len(harmed))
-
-    def shortened(self) -> Finding:
-        """The share of longer flights that the detector brings back within 5 %."""
-        share = self.undone(longer_only=True)
-        if not share.total:
-            return self._none("over 5 % longer")
-        return Finding(
-            effect=as_interval(share), told=f"{count_of(share)} longer flights brought back"
-        )
+# The same faults without and with a detector ------------------------------------------------------
 
 
-def compared(first: Protected, second: Protected) -> McNemar:
-    """Success with the first and with the second detector, of the faults that both have seen."""
-    ones, others = (
-        {(own.pair, own.fault): not each.lost for own, each in one.pairs} for one in (first, second)
+def protected(
+    flights: pa.Table, detector: str, protect: str = EVERY_STAGE, **where: Any
+) -> pa.Table:
+    """The flights with a detector of these stages, whose fault struck without it as well."""
+    seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
+    return chosen(flights, **seen, **where)
+
+
+def recovered(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """The share of lost missions that a detector saves."""
+    seen = protected(flights, detector, **where)
+    lost = chosen(seen, bare_lost=True)
+    return _of_some(lost, "lost", "lost missions saved") or _none_of(seen, "lost")
+
+
+def shortened(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """The share of longer flights that a detector brings back within 5 %."""
+    seen = protected(flights, detector, **where)
+    longer = chosen(seen, bare_lost=False, bare_harmed=True)
+    told = "longer flights brought back"
+    return _of_some(longer, "harmed", told) or _none_of(seen, "over 5 % longer")
+
+
+def _of_some(flights: pa.Table, column: str, told: str) -> Finding | None:
+    return _of_share(share(flights, column, value=False), told) if flights.num_rows else None
+
+
+def _none_of(seen: pa.Table, what: str) -> Finding:
+    """What is told if none of the faults, flown without the detector, had an effect."""
+    return Finding(told=f"without it 0 of {seen.num_rows:,} {what}") if seen.num_rows else Finding()
+
+
+def _undone(flights: pa.Table, detector: str, protect: str, where: Where) -> Share:
+    """The share of harmful faults that do no harm with a detector of these stages."""
+    seen = protected(flights, detector, protect, **where)
+    return share(chosen(seen, bare_harmed=True), "harmed", value=False)
+
+
+def control_recovers_most(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """Harm undone by watching control minus that by the better single other stage."""
+    shares = {stage: _undone(flights, detector, stage, where) for stage in STAGES}
+    if not all(each.total for each in shares.values()):
+        return Finding()
+    *others, control = shares.values()
+    told = ", ".join(f"{name} {count_of(each)}" for name, each in shares.items())
+    best = max(others, key=lambda each: each.share)
+    return _difference((control, best), f"harm undone: {told}")
+
+
+def all_stages_best(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """Harm undone by watching all stages minus that by watching control."""
+    shares = [_undone(flights, detector, each, where) for each in (EVERY_STAGE, "control")]
+    told = "harm undone: all stages {}, control {}".format(*map(count_of, shares))
+    return _difference(shares, told)
+
+
+def autoencoder_better(flights: pa.Table, **where: Any) -> Finding:
+    """Success with the autoencoder minus success with the Gaussian detector."""
+    seen = [protected(flights, name, **where) for name in ("gad", "aad")]
+    gad, aad = (dict(zip(faults_of(x), ~flags(x, "lost"), strict=True)) for x in seen)
+    both = sorted(gad.keys() & aad.keys())
+    if not both:
+        return Finding()
+    test = mcnemar([gad[key] for key in both], [aad[key] for key in both])
+    told = f"{test.only_second} missions by AAD only, {test.only_first} by GAD only"
+    return Finding(effect=paired_difference(test), told=f"{told}, of {test.pairs:,}")
+
+
+# Costs of detectors -------------------------------------------------------------------------------
+
+_NO_COSTS = Finding(told="flown, but this export does not hold these times; a new one does")
+
+
+def overhead_of(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """The mean share of the flight time that detection and recovery take."""
+    seen, shares = _overheads(flights, detector, where)
+    told = "time of the computer that flew, and simulated recovery"
+    return _mean_cost(seen, shares, told)
+
+
+def gaussian_dearer(flights: pa.Table, **where: Any) -> Finding:
+    """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
+    gad, aad = (
+        dict(zip(*_overheads(flights, name, where), strict=True)) for name in ("gad", "aad")
     )
-    both = sorted(ones.keys() & others.keys())
-    return mcnemar([ones[key] for key in both], [others[key] for key in both])
+    more = [gad[key] - aad[key] for key in sorted(gad.keys() & aad.keys())]
+    return _mean_cost(gad, more, "the same faults with either detector")
 
 
-# The worst case, paired and unpaired ----------------------------------------------------------
+def _overheads(
+    flights: pa.Table, detector: str, where: Where
+) -> tuple[list[tuple[str, str]], list[float]]:
+    """The faults with a detector, and its share of each flight time; NaN if unknown."""
+    seen = struck(flights, detector=detector, protect=EVERY_STAGE, **where)
+    return faults_of(seen), np.sum([numbers(seen, name) for name in COSTS], axis=0).tolist()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _WorstFlights:
-    """The longest flights of a setting.
+def _mean_cost(seen: Collection[Any], costs: Sequence[float], told: str) -> Finding:
+    known = [each for each in costs if not math.isnan(each)]
+    if not known:
+        return _NO_COSTS if seen else Finding()
+    return Finding(effect=interval(known, resamples=RESAMPLES), told=told)
 
-    Attributes:
-        flights: successful ones whose golden flight succeeds.
-        longer: share of them that take more than 5 % longer than their own golden flight.
-        paired: the largest flight time over that of its own golden flight, minus 1.
-        unpaired: the longest flight over the mean golden one, minus 1.
-        golden: the longest golden flight over the mean golden one, minus 1.
+
+def calibrated(_: pa.Table) -> Finding:
+    """No finding: the model takes this number from the paper."""
+    return Finding(told="our model is calibrated with this number, so it tells nothing")
+
+
+# Isolated kernels ---------------------------------------------------------------------------------
+
+
+def outcome_beside(
+    kernels: Kernels,
+    name: str,
+    outcome: str,
+    choose: Callable[..., str],
+    others: Sequence[str] = (),
+) -> Finding:
+    """The share of an outcome in one kernel minus that in the most extreme of others.
+
+    Args:
+        choose: `max` or `min`.
+        others: none mean all.
     """
+    there = [each for each in others or kernels if each in kernels and each != name]
+    if name not in kernels or not there:
+        return Finding()
+    extreme = choose(there, key=lambda each: _outcome(kernels, each, outcome).share)
+    shares = {each: _outcome(kernels, each, outcome) for each in (name, extreme)}
+    told = (f"{kernels[each]['title']} {100 * found.share:.1f} %" for each, found in shares.items())
+    return Finding(effect=rate_difference(*shares.values()), told=", ".join(told))
 
-    flights: int
-    longer: Share
-    paired: float
-    unpaired: float
-    golden: float
+
+def least_benign(kernels: Kernels, but: str) -> Finding:
+    """The least share of benign runs of all kernels but one."""
+    shares = {each: _outcome(kernels, each, "benign") for each in kernels if each != but}
+    if not shares:
+        return Finding()
+    least = min(shares, key=lambda each: shares[each].share)
+    told = f"least: {kernels[least]['title']}, {count_of(shares[least])}"
+    return Finding(effect=as_interval(shares[least]), told=told)
 
 
-def worst_flights(golden: GoldenFlights, flights: Sequence[FlownMission]) -> _WorstFlights:
-    """The worst case of a setting, as the paper may have read it in either way."""
-    ratios = golden.ratios(flights)
-    used = [each for each in flights if golden.ratio(each) is not None]
-    own = {each.pair: each for each in map(golden.of, used) if each is not None}
-    reference, longest = excess_over_mean(
-        [each.flight_time_s or math.nan for each in own.values()],
-        [each.flight_time_s or math.nan for each in used],
-    )
-    return _WorstFlights(
-        flights=len(ratios),
-        longer=wilson(sum(each > LONGER for each in ratios), len(ratios)),
-        paired=max(ratios) - 1.0 if ratios else math.nan,
-        unpaired=longest,
-        golden=reference,
-    )
+def _outcome(kernels: Kernels, name: str, outcome: str) -> Share:
+    told = kernels[name]["outcomes"][outcome]
+    return wilson(told["count"], told["of"])

@@ -15,10 +15,10 @@ from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.campaigns.specification_file import load_spec, presets
-from mavfi_cli.claims.flights import FlownMission, flights_of
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
 from mavfi_cli.core.installed import installed_versions, version_differences
+from mavfi_cli.reproduction.flights import flown_missions, pooled
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
@@ -34,20 +34,18 @@ class CampaignSource:
         path: the campaign's folder, or the exported file.
         spec: None if a program made the list, or if no specification lies beside an export.
         planned: missions on its list; None of an export that does not say.
-        flights: the missions that flew.
+        flights: the missions that flew, as `reproduction.flights.flown_missions`.
         errors: missions that could not begin.
         versions: of the programs that flew it; empty of an export that does not say.
         host: of the first record; empty of an export that does not say.
         digest: SHA-256 of an exported file; empty of a folder.
-        table: of `analysis.flights.flights`; of an export, its columns.
     """
 
     path: Path
     name: str
     spec: Spec | None
     planned: int | None
-    flights: Sequence[FlownMission]
-    table: pa.Table
+    flights: pa.Table
     errors: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
     host: Mapping[str, Any] = field(default_factory=dict)
@@ -74,14 +72,12 @@ class Evidence:
     kernels: Sequence[_KernelSource]
     problems: Sequence[str]
 
-    def missions(self, stack: str | None = None) -> list[FlownMission]:
-        """The flights of a stack, each mission once; None means all stacks."""
-        once: dict[str, FlownMission] = {}
-        for campaign in self.campaigns:
-            for each in campaign.flights:
-                if stack in (None, each.stack):
-                    once.setdefault(each.changes, each)
-        return list(once.values())
+    def flights(self, stack: str | None = None) -> pa.Table:
+        """The flights of a stack, each mission once and beside its golden flight; None means all.
+
+        They are those of `reproduction.flights.pooled`.
+        """
+        return pooled([each.flights for each in self.campaigns], stack)
 
 
 def gather(places: Sequence[Path]) -> Evidence:
@@ -110,7 +106,7 @@ def gather(places: Sequence[Path]) -> Evidence:
                 campaigns.append(each)
         if len(campaigns) + len(kernels) + len(problems) == before:
             problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
-    if not any(each.flights for each in campaigns) and not kernels:
+    if not any(each.flights.num_rows for each in campaigns) and not kernels:
         raise RecordError("; ".join(each.rstrip(".") for each in problems) or _nothing(campaigns))
     problems += _incomplete(campaigns)
     return Evidence(campaigns=campaigns, kernels=kernels, problems=[*problems, *_mixed(campaigns)])
@@ -154,11 +150,10 @@ def _from_ledger(folder: Path) -> CampaignSource:
             name=origin["name"] or folder.name,
             spec=stored_spec(ledger),
             planned=origin["planned"],
-            flights=flights_of(table, folder),
+            flights=flown_missions(table),
             errors=sum(ledger.errors_by_cell().values()),
             versions=origin["versions"],
             host=origin["host"],
-            table=table,
         )
 
 
@@ -169,8 +164,8 @@ def _from_export(path: Path) -> CampaignSource:
         raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
     spec = _spec_beside(path)
     try:
-        flown, origin = flights_of(table, path), provenance(table)
-    except (ValueError, TypeError, AttributeError) as error:
+        flown, origin = flown_missions(table), provenance(table)
+    except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
         raise RecordError(f"{path}: not an export of a campaign ({error})") from None
     return CampaignSource(
         path=path,
@@ -182,7 +177,6 @@ def _from_export(path: Path) -> CampaignSource:
         versions=origin.get("versions", {}),
         host=origin.get("host", {}),
         digest=file_digest(path),
-        table=table,
     )
 
 
@@ -205,7 +199,7 @@ def _nothing(campaigns: Sequence[CampaignSource]) -> str:
 
 def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     for each in campaigns:
-        over = len(each.flights) + each.errors
+        over = each.flights.num_rows + each.errors
         if each.planned is not None and over < each.planned:
             again = f"mavfi campaign run {each.path}" if each.spec else "the command that began it"
             rest = f" {again} flies the rest." if not each.digest else " An export holds no list."

@@ -159,6 +159,7 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
     from mavfi_cli.core.files import require_output
     from mavfi_cli.report.drawing import PICTURES, write_figure
     from mavfi_cli.report.tables.paper_table import FORMATS
+    from mavfi_cli.reproduction.evidence import item_flights
     from mavfi_cli.reproduction.figures import draw
     from mavfi_cli.reproduction.status import asked_item, table_of
 
@@ -169,7 +170,8 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
         table = table_of(ledger, shown)
         click.echo(FORMATS[form](table), nl=False)
         if output is not None:
-            write_figure(draw(table, ledger, shown, columns), output)
+            flights = None if shown is None else item_flights(shown, ledger)
+            write_figure(draw(table, flights, columns), output)
             click.echo(f"figure: {output}", err=True)
 
 

@@ -26,14 +26,13 @@ def report(places: tuple[Path, ...], output: Path, upsets: float) -> None:
 
     require_page(output)  # before what takes long, and before what needs scipy
     from mavfi_cli.claims.document import document
-    from mavfi_cli.claims.items import shown_items
     from mavfi_cli.claims.sources import gather
     from mavfi_cli.core.files import write_text
 
     evidence = gather(places)
     for problem in evidence.problems:
         click.echo(f"note: {problem}", err=True)
-    page = render(document(evidence, shown_items(evidence), upsets))
+    page = render(document(evidence, upsets))
     write_text(output, page)
-    missions = len(evidence.missions())
+    missions = evidence.flights().num_rows
     click.echo(f"{missions:,} missions in {output} ({len(page.encode()) / 1e6:.1f} MB)")

@@ -14,6 +14,7 @@ from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.report.tables.paper_table import PaperTable
+from mavfi_cli.reproduction.flights import beside_golden, flown_missions
 from mavfi_cli.reproduction.flying import KERNELS_FOLDER, FlightsPlan, stored_plan
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
@@ -29,7 +30,7 @@ def flights_of(item: Item, plan: FlightsPlan, table: pa.Table) -> pa.Table:
     """The flights of an item among those of a reproduction.
 
     Args:
-        table: all flights of the reproduction, as `analysis.flights.flights`.
+        table: all flights of the reproduction, as `reproduction.flights.beside_golden`.
     """
     keys = [key_of(each) for each in missions_of([item], plan.stack, plan.scale)]
     return table.filter(pc.is_in(table["changes"], value_set=pa.array(keys, pa.string())))
@@ -49,7 +50,7 @@ def model_report() -> Mapping[str, Any]:
 
 def item_flights(item: Item, ledger: Ledger) -> pa.Table:
     """The flights of an item in a campaign: a reproduction, or one with the item's missions."""
-    table, plan = flights(ledger), stored_plan(ledger)
+    table, plan = beside_golden(flown_missions(flights(ledger))), stored_plan(ledger)
     return table if plan is None else flights_of(item, plan, table)
 
 
@@ -77,7 +78,7 @@ def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
             continue
         if table is None:
             with Ledger(plan.folder) as ledger:
-                table = flights(ledger)
+                table = beside_golden(flown_missions(flights(ledger)))
         yield of_flights(item.name, flights_of(item, plan, table))
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import chosen, flown
+from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.paper_figures import (
     SMALLEST,
     WIDTHS_IN,
@@ -25,59 +24,59 @@ from mavfi_cli.report.paper_figures import (
 )
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.report.top_view import draw_trajectories, panels_of
-from mavfi_cli.reproduction.evidence import item_flights
-from mavfi_cli.reproduction.items import Item
+from mavfi_cli.reproduction.flights import STAGES, by_value, comparable, faulty, golden
 from mavfi_cli.reproduction.layouts import (
     DETECTORS,
     KERNELS_FLOWN,
     PROTECTED,
-    STAGES,
     values_and_deltas,
-    whole,
     worlds_of,
 )
-from mavfi_cli.reproduction.measures import PERCENT, faulty, golden, over_own
+from mavfi_cli.reproduction.measures import PERCENT, increases
 from mavfi_cli.reproduction.paper import printed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _QUANTITY = "flight time over the golden flight of the same mission, %"
-_SETTINGS = {None: "fault", "gad": "fault, GAD", "aad": "fault, AAD"}
+_Row = tuple[str, str | None, pa.Table]  # of a panel: label, detector, flights
+_STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
 
 
-def draw(table: PaperTable, ledger: Ledger, item: Item | None, columns: str) -> Figure:
-    """Draw the figure of an item, or the dots of another table.
-
-    Args:
-        columns: width, `one` or `two`.
-    """
-    if item is None or item.name not in DRAWN:
-        return draw_table(table, columns)
-    return draw_flights(item.name, table, item_flights(item, ledger), columns)
-
-
-def draw_table(table: PaperTable, columns: str) -> Figure:
-    """Draw a table whose item has no figure of its flights."""
-    return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)
-
-
-def draw_flights(name: str, table: PaperTable, flights: pa.Table, columns: str) -> Figure:
+def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
     """Draw the figure of an item from its flights, or the dots of its table.
 
     Args:
-        flights: as `analysis.flights.flights`. `fig13` needs their kept run folders,
-            of one campaign.
+        flights: as `reproduction.flights.beside_golden`; None of what was not flown. `fig13` needs
+            their kept run folders, of one campaign.
+        columns: width, `one` or `two`.
 
     Raises:
         RecordError: these are not there.
     """
-    drawn = DRAWN.get(name)
-    return draw_table(table, columns) if drawn is None else drawn(flown(flights), columns)
+    if flights is None or table.name not in DRAWN:
+        return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)
+    return DRAWN[table.name](flights, columns)
 
 
-def _increase(bare: pa.Table, struck: pa.Table) -> FloatArray:
-    return PERCENT * (over_own(bare, struck) - 1.0)
+def _panel(title: str, rows: Iterable[_Row], paper: float | None = None) -> StripPanel:
+    """Distributions of flights over their golden ones.
+
+    Args:
+        paper: the largest increase without a detector.
+    """
+    return StripPanel(
+        title=title,
+        strips=[
+            Strip(
+                label=label,
+                values=increases(flights),
+                style=_STYLES[detector],
+                paper=None if detector else paper,
+            )
+            for label, detector, flights in rows
+        ],
+    )
 
 
 def _number(name: str, *keys: object) -> float | None:
@@ -85,73 +84,54 @@ def _number(name: str, *keys: object) -> float | None:
     return found if isinstance(found, float) else None
 
 
-def _fig7(table: pa.Table, columns: str) -> Figure:
-    strips = []
-    for title, (node, planner) in KERNELS_FLOWN.items():
-        struck = faulty(table, level="instruction", fault_target=node, planner=planner)
-        bare = chosen(golden(table), planner=planner)
-        strips.append(Strip(label=title, values=_increase(bare, struck), style=1))
-    return draw_strips([StripPanel(title="fault in", strips=strips)], _QUANTITY, columns)
+def _fig7(flights: pa.Table, columns: str) -> Figure:
+    rows = (
+        (title, None, faulty(flights, fault_target=node, planner=planner, level="instruction"))
+        for title, (node, planner) in KERNELS_FLOWN.items()
+    )
+    return draw_strips([_panel("fault in", rows)], _QUANTITY, columns)
 
 
 def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
-    def draw_values(table: pa.Table, columns: str) -> Figure:
-        bare, struck = golden(table), faulty(table)
-        strips = [
-            Strip(
-                label=str(value), values=_increase(bare, chosen(struck, **{column: value})), style=1
-            )
-            for value in dict.fromkeys(struck[column].to_pylist())
-        ]
-        return draw_strips([StripPanel(title="fault in", strips=strips)], _QUANTITY, columns)
+    def draw_values(flights: pa.Table, columns: str) -> Figure:
+        groups = by_value(faulty(flights), column).items()
+        rows = ((str(value), None, those) for (value,), those in groups)
+        return draw_strips([_panel("fault in", rows)], _QUANTITY, columns)
 
     return draw_values
 
 
-def _beside_detectors(title: str, table: pa.Table, paper: float | None) -> StripPanel:
-    """A row for the flights with faults, and one for those with each detector.
+def _beside_detectors(title: str, flights: pa.Table, paper: float | None) -> StripPanel:
+    """A row for the flights with faults, and one for those with each detector."""
+    rows: list[_Row] = [("fault", None, faulty(flights))]
+    rows += [(f"fault, {name.upper()}", name, faulty(flights, name)) for name in DETECTORS]
+    return _panel(title, rows, paper)
 
-    Args:
-        paper: the largest increase without a detector.
-    """
-    strips = [
-        Strip(
-            label=label,
-            values=_increase(golden(table), faulty(table, name)),
-            style=style,
-            paper=None if name else paper,
+
+def _fig12(flights: pa.Table, columns: str) -> Figure:
+    flights = comparable(flights)
+    panels = [
+        _beside_detectors(
+            world,
+            chosen(flights, world=world),
+            _number("fig12", "worst_increase_percent", world),
         )
-        for style, (name, label) in enumerate(_SETTINGS.items(), start=1)
+        for world in worlds_of(flights)
     ]
-    return StripPanel(title=title, strips=strips)
-
-
-def _fig12(table: pa.Table, columns: str) -> Figure:
-    table = whole(table)
-    panels = []
-    for world in worlds_of(table):
-        here = chosen(table, world=world)
-        worst = _number("fig12", "worst_increase_percent", world)
-        panels.append(_beside_detectors(world, here, worst))
     return draw_strips(panels, _QUANTITY, columns)
 
 
-def _fig14(table: pa.Table, columns: str) -> Figure:
+def _fig14(flights: pa.Table, columns: str) -> Figure:
     panels = []
-    for world in worlds_of(table):
-        here = chosen(table, world=world)
-        bare = golden(here)
-        strips = [Strip(label="no protection", values=_increase(bare, faulty(here)), style=1)]
-        for style, detector in enumerate(DETECTORS, start=2):
-            strips += [
-                Strip(
-                    label=f"{detector.upper()} {_short(stages)}",
-                    values=_increase(bare, faulty(here, detector, protect=stages)),
-                    style=style,
-                )
-                for stages in PROTECTED
-            ]
-        panels.append(StripPanel(title=world, strips=strips))
+    for world in worlds_of(flights):
+        here = chosen(flights, world=world)
+        rows: list[_Row] = [("no protection", None, faulty(here))]
+        rows += [
+            (f"{name.upper()} {_short(stages)}", name, faulty(here, name, protect=stages))
+            for name in DETECTORS
+            for stages in PROTECTED
+        ]
+        panels.append(_panel(world, rows))
     return draw_strips(panels, _QUANTITY, columns)
 
 
@@ -162,10 +142,9 @@ def _short(stages: str) -> str:
     return "".join(stage[0].upper() for stage in stages.split("+"))
 
 
-def _fig16(table: pa.Table, columns: str) -> Figure:
+def _fig16(flights: pa.Table, columns: str) -> Figure:
     panels = []
-    for platform in dict.fromkeys(table["platform"].to_pylist()):
-        here = chosen(table, platform=platform)
+    for (platform,), here in by_value(flights, "platform").items():
         ratio = _number("fig16", "worst_ratio", platform)
         worst = None if ratio is None else PERCENT * (ratio - 1.0)
         panels.append(_beside_detectors(platform, here, worst))

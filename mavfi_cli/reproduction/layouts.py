@@ -1,6 +1,6 @@
 """The layout of each item: from flown missions, or from another source, to the paper's table.
 
-A layout of flights takes the table of `analysis.flights.flights` with the item's missions. It reads
+A layout of flights takes the item's missions as `reproduction.flights.beside_golden`. It reads
 configuration and record only, never labels, so that it serves any campaign with such missions.
 """
 
@@ -15,34 +15,37 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import chosen, flown, known, numbers
+from mavfi_cli.analysis.flights import chosen, known, numbers
 from mavfi_cli.core.files import read_parquet
-from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.record.run_folder import TRACE
 from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
+from mavfi_cli.reproduction.flights import (
+    EVERY_STAGE,
+    STAGES,
+    comparable,
+    faulty,
+    golden,
+    ratios,
+)
 from mavfi_cli.reproduction.items import BY_NAME
 from mavfi_cli.reproduction.measures import (
     PERCENT,
-    faulty,
-    golden,
+    increases,
     maximum,
     mean,
     mean_cell,
-    over_own,
     recovered,
     share_cell,
     success,
-    with_own,
     worst_mean,
-    worst_own,
 )
 from mavfi_cli.reproduction.paper import printed, source
 from mavfi_cli.stats.shares import Share
 
 DETECTORS = {"gad": "Gaussian", "aad": "autoencoder"}
-STAGES = tuple(stage.value for stage in Stage)
 WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
-PROTECTED = (*STAGES, "planning+control", "perception+planning+control")
+PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
 EVERY_MISSION = "success: all flown missions, as in the paper, 95 % Wilson interval"
 MAXIMUM = "worst: longest flight over the golden one of its mission; a maximum has no interval"
 _SUCCESS = PaperColumn(title="success, %", ends=0)
@@ -112,8 +115,8 @@ def _golden_row(label: str, table: pa.Table, *more: str) -> PaperRow:
     return _row(label, *more, cells=cells)
 
 
-def _struck_row(label: str, bare: pa.Table, flights: pa.Table, *more: str) -> PaperRow:
-    cells = [success(flights), mean(flights, "flight_time_s"), worst_own(bare, flights)]
+def _struck_row(label: str, flights: pa.Table, *more: str) -> PaperRow:
+    cells = [success(flights), mean(flights, "flight_time_s"), maximum(increases(flights))]
     return _row(label, *more, cells=cells)
 
 
@@ -146,7 +149,7 @@ def _fig7(flights: pa.Table) -> PaperTable:
     for title, (node, planner) in KERNELS_FLOWN.items():
         hit = faulty(flights, level="instruction", fault_target=node, planner=planner)
         if hit.num_rows:
-            struck.append(_with_energy(_struck_row(title, bare[planner], hit), hit))
+            struck.append(_with_energy(_struck_row(title, hit), hit))
     worst = printed("fig7", "worst_increase_percent")
     lost = printed("fig7", "success_lost_points")
     return _table(
@@ -162,7 +165,7 @@ def _by_value(name: str, column: str, heading: str, flights: pa.Table) -> PaperT
     values = list(dict.fromkeys(struck[column].to_pylist()))
     rows = [
         _struck_row(
-            str(value), bare, chosen(struck, **{column: value}),
+            str(value), chosen(struck, **{column: value}),
             str(printed(name, "critical", value) or "-"),
         )
         for value in values
@@ -225,12 +228,6 @@ def worlds_of(flights: pa.Table) -> list[str]:
     return [*(world for world in WORLDS if world in found), *sorted(found - set(WORLDS))]
 
 
-def whole(flights: pa.Table) -> pa.Table:
-    """Flights whose detector, if any, protects all stages."""
-    every = [each in (None, PROTECTED[-1]) for each in flights["protect"].to_pylist()]
-    return flights.filter(pa.array(every, pa.bool_()))
-
-
 def _settings(flights: pa.Table) -> dict[str, tuple[str, pa.Table]]:
     """The paper's four rows: key of the paper's numbers, and flights."""
     return {
@@ -242,7 +239,7 @@ def _settings(flights: pa.Table) -> dict[str, tuple[str, pa.Table]]:
 
 def _table4(flights: pa.Table) -> PaperTable:
     """Success in each world: golden, with faults, with each detector."""
-    flights = whole(flights)
+    flights = comparable(flights)
     worlds = worlds_of(flights)
     rows = [
         _row(title, cells=[
@@ -261,7 +258,7 @@ def _table4(flights: pa.Table) -> PaperTable:
 
 def _fig12(flights: pa.Table) -> PaperTable:
     """Worst flight time with faults, and what each detector recovers of it, in points."""
-    flights = whole(flights)
+    flights = comparable(flights)
     rows = []
     for world in worlds_of(flights):
         here = chosen(flights, world=world)
@@ -269,10 +266,9 @@ def _fig12(flights: pa.Table) -> PaperTable:
         increase = printed("fig12", "worst_increase_percent", world)
         rows.append(_row(world, cells=[
             mean(bare, "flight_time_s"),
-            worst_own(bare, struck, increase),
+            maximum(increases(struck), increase),
             worst_mean(bare, struck, increase),
-            *(recovered(bare, struck, faulty(here, name),
-                        printed("fig12", "recovered_points", name, world),
+            *(recovered(faulty(here, name), printed("fig12", "recovered_points", name, world),
                         lambda case: case.recovered) for name in DETECTORS),
         ]))  # fmt: skip
     columns = (
@@ -298,17 +294,17 @@ def _fig14(flights: pa.Table) -> PaperTable:
     rows = []
     for detector, told in DETECTORS.items():
         for stages in PROTECTED:
-            cells = []
-            for world in worlds:
-                here = chosen(flights, world=world)
-                cells.append(recovered(
-                    golden(here), faulty(here), faulty(here, detector, protect=stages),
+            cells = [
+                recovered(
+                    faulty(flights, detector, protect=stages, world=world),
                     printed("fig14", "recovered_percent", detector, world, stages),
                     lambda case: case.recovered_share,
-                ))  # fmt: skip
+                )
+                for world in worlds
+            ]
             rows.append(_row(told, stages, cells=cells))
     column = PaperColumn(title="")
-    protected = [row for row in rows if row.labels[1] == PROTECTED[-1] and row.cells]
+    protected = [row for row in rows if row.labels[1] == EVERY_STAGE and row.cells]
     return _table(
         "fig14", ["recovered, %", "protected stages"],
         [PaperColumn(title=world) for world in worlds], rows,
@@ -323,7 +319,7 @@ def _fig14(flights: pa.Table) -> PaperTable:
 
 def _table5(flights: pa.Table) -> PaperTable:
     """Shares of the flight time that detection and recovery take."""
-    flights = whole(flights)
+    flights = comparable(flights)
     worlds = worlds_of(flights)
     rows = []
     for detector in DETECTORS:
@@ -388,7 +384,7 @@ def values_and_deltas(flights: pa.Table) -> dict[str, tuple[FloatArray, FloatArr
 
     Reads the traces of the successful flights whose run folders are there.
     """
-    runs = [Path(each) for each in chosen(flights, succeeded=True)["path"].to_pylist() if each]
+    runs = [Path(each) for each in chosen(flights, lost=False)["path"].to_pylist() if each]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
     found = {}
     for state in SHOWN_STATES:
@@ -443,14 +439,12 @@ def _reduction(values: float, deltas: float) -> float:
 def _fig13(flights: pa.Table) -> PaperTable:
     """The flight that a fault prolongs most, of each stage, and the same with the autoencoder."""
     rows = []
-    bare = golden(flights)
     for stage in dict.fromkeys(faulty(flights)["fault_target"].to_pylist()):
         struck = faulty(flights, fault_target=stage)
-        ratios = over_own(bare, struck)
         cells = [
-            worst_own(bare, struck, printed("fig13", "increase_percent", stage)),
-            maximum(_with(bare, struck, faulty(flights, "aad", fault_target=stage))),
-            mean_cell(PERCENT * (ratios - 1.0)),
+            maximum(increases(struck), printed("fig13", "increase_percent", stage)),
+            maximum(_with(struck, faulty(flights, "aad", fault_target=stage))),
+            mean_cell(increases(struck)),
         ]
         rows.append(_row(stage, cells=cells))
     columns = (
@@ -467,13 +461,12 @@ def _fig13(flights: pa.Table) -> PaperTable:
     )  # fmt: skip
 
 
-def _with(bare: pa.Table, struck: pa.Table, protected: pa.Table) -> FloatArray:
+def _with(struck: pa.Table, protected: pa.Table) -> FloatArray:
     """Increase of the protected flight whose unprotected one is prolonged most, (1,) or (0,)."""
-    both, ratios = with_own(bare, struck)
-    if not both.num_rows:
+    if not len(ratios(struck)):
         return np.zeros(0)
-    pair = both["pair"][int(np.argmax(ratios))].as_py()
-    return PERCENT * (over_own(bare, chosen(protected, pair=pair)) - 1.0)
+    pair = struck["pair"][int(np.nanargmax(numbers(struck, "over_own")))].as_py()
+    return increases(chosen(protected, pair=pair))
 
 
 # Platforms: Fig. 16 ------------------------------------------------------------------------------
@@ -485,13 +478,11 @@ def _fig16(flights: pa.Table) -> PaperTable:
     for platform in dict.fromkeys(flights["platform"].to_pylist()):
         here = chosen(flights, platform=platform)
         bare, struck = golden(here), faulty(here)
-        own = over_own(bare, struck)
         rows.append(_row(platform, cells=[
             mean(bare, "flight_time_s"),
             success(struck),
-            maximum(own, printed("fig16", "worst_ratio", platform)),
-            *(recovered(bare, struck, faulty(here, name),
-                        printed("fig16", "recovered_percent", name, platform),
+            maximum(ratios(struck), printed("fig16", "worst_ratio", platform)),
+            *(recovered(faulty(here, name), printed("fig16", "recovered_percent", name, platform),
                         lambda case: case.recovered_share) for name in DETECTORS),
         ]))  # fmt: skip
     columns = (
@@ -519,9 +510,9 @@ def of_flights(name: str, flights: pa.Table) -> PaperTable:
     """The table of an item that is flown.
 
     Args:
-        flights: the item's missions as `analysis.flights.flights` tells them.
+        flights: the item's missions, as `reproduction.flights.beside_golden`.
     """
-    return OF_FLIGHTS[name](flown(flights))
+    return OF_FLIGHTS[name](flights)
 
 
 # Isolated kernels: Fig. 6 ------------------------------------------------------------------------

@@ -1,17 +1,15 @@
 """Flights that nobody flew: a row of an export each."""
 
 from dataclasses import asdict
-from pathlib import Path
 
 import pyarrow as pa
 
 from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
-from mavfi_cli.claims.flights import flights_of
+from mavfi_cli.reproduction.flights import beside_golden, flown_missions
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
-SOURCE = Path("campaign")
 COLUMNS = (
     "number", "pair", "world", "seed", "world_seed", "planner", "platform", "stack", "vehicle",
     "level", "fault_target", "fault_field", "fault_bits", "detector", "protect", "state",
@@ -61,4 +59,4 @@ def table(rows):
 
 def flights(rows):
     """The flights of these rows."""
-    return flights_of(table(rows), SOURCE)
+    return beside_golden(flown_missions(table(rows)))

@@ -32,7 +32,7 @@ def test_a_claim_is_a_sentence_with_a_range_inside_which_something_lies(claim):
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
 def test_nothing_flown_is_no_verdict(claim):
-    found = claim.find({} if claim.isolated else [])
+    found = claim.find({} if claim.isolated else flights([]))
     assert judge(found.effect, claim.low, claim.high) is ClaimVerdict.NOT_FLOWN
 
 

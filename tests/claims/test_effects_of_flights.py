@@ -3,16 +3,17 @@
 import pytest
 from flown import flights, row
 
+from mavfi_cli.analysis.flights import chosen
+from mavfi_cli.claims.document import worst_flights
 from mavfi_cli.claims.effects import (
-    Protected,
-    compared,
-    harm_share,
-    struck,
+    autoencoder_better,
+    protected,
+    recovered,
+    shortened,
     success_lost,
     worst_as_long,
-    worst_flights,
 )
-from mavfi_cli.claims.flights import GoldenFlights, where
+from mavfi_cli.reproduction.flights import share, struck
 
 PLANNING = {"target": "planning", "fault": {"field": "exponent"}}
 
@@ -29,22 +30,22 @@ def pairs(*outcomes):
 
 def test_a_fault_is_harmful_if_lost_or_more_than_5_percent_longer():
     those = flights(pairs(20.0, 21.0, 21.1, "timeout"))
-    share = harm_share(GoldenFlights(those), struck(those))
-    assert (share.count, share.total) == (2, 4)
+    found = share(struck(those), "harmed")
+    assert (found.count, found.total) == (2, 4)
 
 
 def test_a_fault_without_a_successful_golden_flight_is_not_counted():
     rows = pairs("timeout", 40.0)
     rows[0] = {**rows[0], "outcome": "collision"}
-    share = harm_share(GoldenFlights(flights(rows)), struck(flights(rows)))
-    assert (share.count, share.total) == (1, 1)
+    found = share(struck(flights(rows)), "harmed")
+    assert (found.count, found.total) == (1, 1)
 
 
 def test_success_lost_is_paired_and_counts_faults_that_nothing_read():
     rows = pairs("collision", *[20.0] * 8)
     rows[3] = {**rows[3], "injected": "not_activated"}
     rows.append(row(**PLANNING, seed=50, injected="not_injected"))
-    found = success_lost(GoldenFlights(flights(rows)), struck(flights(rows)))
+    found = success_lost(flights(rows))
     assert found.effect.value == pytest.approx(1 / 9)
     assert found.effect.count == 9
     assert found.told == "1 of 9 lost; golden 0 of 9"
@@ -55,16 +56,16 @@ def test_the_longest_flight_is_paired_and_unpaired():
     rows[2] = {**rows[2], "flight_time_s": 10.0}  # the second golden flight is short
     rows[3] = {**rows[3], "flight_time_s": 18.0}
     those = flights(rows)
-    worst = worst_flights(GoldenFlights(those), struck(those))
-    assert worst.paired == pytest.approx(0.8)  # 18 over its own 10
-    assert worst.unpaired == pytest.approx(1.0)  # 30 over the mean of 20 and 10
-    assert worst.golden == pytest.approx(20 / 15 - 1)
-    assert (worst.longer.count, worst.longer.total) == (2, 2)
+    (worst,) = worst_flights("mavbench", those)
+    assert worst["paired"] == pytest.approx(0.8)  # 18 over its own 10
+    assert worst["unpaired"] == pytest.approx(1.0)  # 30 over the mean of 20 and 10
+    assert worst["golden"] == pytest.approx(20 / 15 - 1)
+    assert (worst["longer"], worst["flights"]) == (1.0, 2)
 
 
 def test_a_longest_flight_is_as_probable_as_flights_are_as_long():
     those = flights(pairs(30.0, 20.0, 20.0, 20.0))
-    found = worst_as_long(GoldenFlights(those), struck(those), 1.5, 10)
+    found = worst_as_long(those, 1.5, 10)
     assert found.effect.value == pytest.approx(1.0 - 0.75**10)
     assert found.told == "1 of 4 as long; longest +50.0 %"
 
@@ -83,21 +84,21 @@ def test_a_detector_saves_lost_missions_and_brings_long_ones_back():
     rows = watched(rows, "gad", 20.0, "collision", 20.5, 20.0)
     rows = watched(rows, "aad", 20.0, 20.0, 40.0, "crash")
     those = flights(rows)
-    gad, aad = (Protected.of(those, name) for name in ("gad", "aad"))
-    assert gad.recovered().told == "1 of 2 lost missions saved"
-    assert aad.recovered().effect.value == 1.0
-    assert gad.shortened().told == "1 of 1 longer flights brought back"
-    assert (gad.undone().count, gad.undone().total) == (2, 3)
-    assert (aad.undone().count, aad.undone().total) == (2, 3)
-    test = compared(gad, aad)
-    assert (test.only_first, test.only_second, test.pairs) == (1, 1, 4)
+    assert recovered(those, "gad").told == "1 of 2 lost missions saved"
+    assert recovered(those, "aad").effect.value == 1.0
+    assert shortened(those, "gad").told == "1 of 1 longer flights brought back"
+    for name in ("gad", "aad"):
+        undone = share(chosen(protected(those, name), bare_harmed=True), "harmed", value=False)
+        assert (undone.count, undone.total) == (2, 3)
+    told = autoencoder_better(those).told
+    assert told == "1 missions by AAD only, 1 by GAD only, of 4"
 
 
 def test_nothing_to_recover_says_so():
-    found = Protected.of(flights(watched(pairs(20.0), "gad", 20.0)), "gad").recovered()
+    found = recovered(flights(watched(pairs(20.0), "gad", 20.0)), "gad")
     assert found.effect is None
     assert found.told == "without it 0 of 1 lost"
-    assert Protected.of(flights(pairs(20.0)), "gad").recovered().told == ""
+    assert recovered(flights(pairs(20.0)), "gad").told == ""
 
 
 def test_what_is_not_of_the_paper_is_marked():
@@ -108,10 +109,12 @@ def test_what_is_not_of_the_paper_is_marked():
         row("planning", config={"v_max_mps": 0.6}),
         row("planning", config={"time_limit_s": 99.0}),
     ]
-    assert [each.as_paper for each in flights(rows)] == [True, False, False, True]
+    assert flights(rows)["as_paper"].to_pylist() == [True, False, False, True]
 
 
 def test_flights_are_chosen_by_their_columns():
     those = flights([row(seed=1), row("planning", seed=2), row("control", seed=3)])
-    assert [each.seed for each in where(those, fault_target=("planning", "control"))] == [2, 3]
-    assert [each.seed for each in where(those, seed=1, level=None)] == [1]
+    found = chosen(those, fault_target=("planning", "control"))
+    assert found["seed"].to_pylist() == [2, 3]
+    assert chosen(those, fault_target=(None, "control"))["seed"].to_pylist() == [1, 3]
+    assert chosen(those, seed=1, level=None)["seed"].to_pylist() == [1]

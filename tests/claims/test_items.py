@@ -7,6 +7,8 @@ from flown import table
 
 from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.claims import items
+from mavfi_cli.claims.sources import STACKS
+from mavfi_cli.reproduction.flights import flown_missions, pooled
 from mavfi_cli.reproduction.items import BY_NAME
 from mavfi_cli.reproduction.missions import kinds_of
 
@@ -17,13 +19,16 @@ FIG13 = BY_NAME["fig13"]
 def shown(monkeypatch):
     """What is shown of Fig. 13 on `mavbench`, and the run folders that are drawn."""
     monkeypatch.setattr(items, "ITEMS", [FIG13])
-    monkeypatch.setattr(items, "draw_flights", lambda *given: given[2]["path"].to_pylist())
+    monkeypatch.setattr(items, "draw", lambda *given: given[1]["path"].to_pylist())
 
     def of(*exports):
+        tables = [flown_missions(each) for each in exports]
         evidence = SimpleNamespace(
-            campaigns=[SimpleNamespace(table=each) for each in exports], kernels=[]
+            campaigns=[SimpleNamespace(flights=each) for each in tables], kernels=[]
         )
-        return next(each for each in items.shown_items(evidence) if each.stack == "mavbench")
+        flights = {stack: pooled(tables, stack) for stack in STACKS}
+        shown = items.shown_items(evidence, flights)
+        return next(each for each in shown if each.stack == "mavbench")
 
     return of
 

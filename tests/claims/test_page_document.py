@@ -6,17 +6,15 @@ import pytest
 from flown import row, table
 
 from mavfi_cli.claims.document import document
-from mavfi_cli.claims.flights import flights_of
 from mavfi_cli.claims.sources import CampaignSource, Evidence
+from mavfi_cli.reproduction.flights import flown_missions
 from mavfi_cli.stats.effects import ClaimVerdict
 
 
 def evidence(rows, name="mine", problems=()):
     path = Path(f"{name}.parquet")
-    told = table(rows)
-    source = CampaignSource(
-        path=path, name=name, spec=None, planned=None, flights=flights_of(told, path), table=told
-    )
+    flights = flown_missions(table(rows))
+    source = CampaignSource(path=path, name=name, spec=None, planned=None, flights=flights)
     return Evidence(campaigns=[source], kernels=[], problems=problems)
 
 
@@ -31,7 +29,7 @@ def told():
         rows.append(row("planning", **where, **lost, time_s=20.0 + seed / 10))
         saved = {} if seed != 2 else {"outcome": "collision"}
         rows.append(row("planning", **where, detector="aad", **saved))
-    return document(evidence(rows, problems=["something is missing."]), [], 2.0)
+    return document(evidence(rows, problems=["something is missing."]), 2.0)
 
 
 def test_five_sentences_say_what_was_counted(told):
@@ -52,7 +50,7 @@ def test_five_sentences_say_what_was_counted(told):
 
 
 def test_nothing_flown_is_said_in_sentences_too():
-    found = document(evidence([row()]), [])
+    found = document(evidence([row()]))
     assert found["summary"][1:] == [
         "None of the claims has been flown yet.",
         "No flight with a fault has a golden flight beside it, so the cost is not known.",
@@ -88,7 +86,7 @@ def test_lost_and_longest_missions_have_their_command(told):
 def test_a_kept_run_is_replayed_from_its_folder_as_long_as_it_is_there(tmp_path):
     rows = [row(), row("planning", outcome="crash", path=str(tmp_path))]
     rows.append(row("control", outcome="crash", path=str(tmp_path / "removed")))
-    (mine,) = document(evidence(rows), [])["missions"]
+    (mine,) = document(evidence(rows))["missions"]
     assert [each["command"] for each in mine["lost"]] == [
         f"mavfi replay {tmp_path}",
         "mavfi replay mine.parquet --mission 2",

@@ -9,8 +9,8 @@ from flown import row, table
 from mavfi_cli.analysis.flights import exported
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
-from mavfi_cli.claims.items import pooled, shown_items
-from mavfi_cli.claims.sources import gather
+from mavfi_cli.claims.items import shown_items
+from mavfi_cli.claims.sources import STACKS, gather
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.report.tables.campaign import write_flights
@@ -57,7 +57,7 @@ def test_a_whole_campaign_has_no_problems(campaign):
     found = gather([campaign("whole", 3, 3)])
     assert found.problems == []
     (source,) = found.campaigns
-    assert (source.name, source.planned, len(source.flights)) == ("whole", 3, 3)
+    assert (source.name, source.planned, source.flights.num_rows) == ("whole", 3, 3)
     assert source.host["machine"] == "x86_64"
     assert source.versions == installed_versions()
 
@@ -150,9 +150,8 @@ def test_a_part_has_the_specification_beside_it(export, tmp_path):
 def test_a_mission_in_two_places_counts_once(export):
     places = [export("one.parquet", row(seed=1)), export("two.parquet", row(seed=1), row(seed=2))]
     found = gather(places)
-    assert len(found.missions()) == 2
-    assert pooled([each.table for each in found.campaigns], "mavbench").num_rows == 2
-    assert found.missions("hardened") == []
+    assert found.flights().num_rows == found.flights("mavbench").num_rows == 2
+    assert found.flights("hardened").num_rows == 0
 
 
 def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
@@ -160,8 +159,7 @@ def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
     places = [export("one.parquet", row(seed=1, **failed), row(seed=2)),
               export("two.parquet", row(seed=1))]  # fmt: skip
     found = gather(places)
-    assert len(found.missions()) == 2
-    assert pooled([each.table for each in found.campaigns], "mavbench").num_rows == 2
+    assert found.flights().num_rows == found.flights("mavbench").num_rows == 2
 
 
 def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
@@ -172,10 +170,9 @@ def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
             fault = {"field": field, "together": True}
             rows.append(row("waypoint_position", seed=seed, fault=fault))
     rows.append(row("waypoint_position", seed=7, fault={"field": "sign"}))  # not all components
-    shown = {
-        (each.item.name, each.stack): each
-        for each in shown_items(gather([export("a.parquet", *rows)]))
-    }
+    found = gather([export("a.parquet", *rows)])
+    flights = {stack: found.flights(stack) for stack in STACKS}
+    shown = {(each.item.name, each.stack): each for each in shown_items(found, flights)}
     found = shown["fig9", "mavbench"]
     counts = {line.labels[0]: line.cells[0].count for line in found.table.rows}
     assert counts == {"golden": 2, "sign": 2, "mantissa": 2}
