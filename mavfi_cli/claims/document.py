@@ -212,20 +212,18 @@ def _instruction_faults(flights: pa.Table) -> pa.Table:
 
 
 def _saved_sentence(flights: Mapping[str, pa.Table]) -> str:
-    parts = []
-    for stack, those in flights.items():
-        for level, kind in (("instruction", "an instruction"), ("source", "a state")):
+    """What the detectors save of the first kind of faults that was flown with one."""
+    for level, kind in (("instruction", "an instruction"), ("source", "a state")):
+        for stack, those in flights.items():
             saved = []
             for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
                 lost = protected(those, detector, level=level, bare_lost=True)
                 found = share(lost, value=False)
                 saved += [f"{name} saves {_rate(found)}"] if found.total else []
             if saved:
-                place = f"on {stack}, of the missions that a fault in {kind} loses"
-                parts.append(f"{place}, {_listed_in_words(saved)}")
-    if not parts:
-        return "No mission that a fault loses was flown again with a detector."
-    return _sentence(parts)
+                place = f"On {stack}, of the missions that a fault in {kind} loses"
+                return f"{place}, {_listed_in_words(saved)}."
+    return "No mission that a fault loses was flown again with a detector."
 
 
 def _crash_sentence(flights: Mapping[str, pa.Table]) -> str:

@@ -42,7 +42,7 @@ from mavfi_cli.stats.shares import Share, wilson
 
 Where = Mapping[str, Any]  # values of columns; a tuple allows several
 Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
-FEWEST = 4  # flights for a correlation with an interval
+_FEWEST = 4  # flights for a correlation with an interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +75,7 @@ def _difference(shares: Sequence[Share], told: str) -> Finding:
 # Faults without a detector ------------------------------------------------------------------------
 
 
-def success_lost(flights: pa.Table, **where: Any) -> Finding:
+def _success_lost(flights: pa.Table, **where: Any) -> Finding:
     """Success of the golden flights minus that of the same missions with a fault."""
     hit = struck(flights, **where)
     both = hit.filter(pc.is_valid(hit["own_lost"]))
@@ -86,30 +86,30 @@ def success_lost(flights: pa.Table, **where: Any) -> Finding:
     return Finding(effect=found, told=told)
 
 
-def most_lost_kernel(flights: pa.Table, **where: Any) -> Finding:
+def _most_lost_kernel(flights: pa.Table, **where: Any) -> Finding:
     """Success lost by faults in the kernel that loses most."""
     hit = by_value(struck(flights, **where), "struck_kernel")
     kernels = {name: share(those).share for (name,), those in hit.items() if name}
     if not kernels:
         return Finding()
     most = max(kernels, key=lambda name: kernels[name])
-    found = success_lost(flights, **where, struck_kernel=most)
+    found = _success_lost(flights, **where, struck_kernel=most)
     return Finding(effect=found.effect, told=f"most in {most}: {found.told}")
 
 
-def harm_difference(flights: pa.Table, groups: Mapping[str, Where]) -> Finding:
+def _harm_difference(flights: pa.Table, groups: Mapping[str, Where]) -> Finding:
     """Share of harmful faults in the first of two groups minus that in the second."""
     shares = [share(struck(flights, **where), "harmed") for where in groups.values()]
     told = (f"{name} {count_of(each)}" for name, each in zip(groups, shares, strict=True))
     return _difference(shares, f"harmful: {'; '.join(told)}")
 
 
-def harmful(flights: pa.Table, **where: Any) -> Finding:
+def _harmful(flights: pa.Table, **where: Any) -> Finding:
     """The share of harmful faults."""
     return _of_share(share(struck(flights, **where), "harmed"), "harmful")
 
 
-def loss_difference(
+def _loss_difference(
     flights: pa.Table, first: Where, second: Where, told: str, **where: Any
 ) -> Finding:
     """Share of lost missions in one group of faults minus that in another.
@@ -121,7 +121,7 @@ def loss_difference(
     return _difference(shares, f"lost: {told.format(*map(count_of, shares))}")
 
 
-def as_long(flights: pa.Table, ratio: float, **where: Any) -> Finding:
+def _as_long(flights: pa.Table, ratio: float, **where: Any) -> Finding:
     """The share of flights that take at least so many times as long as their golden flights."""
     return _of_share(_at_least(ratio, ratios(struck(flights, **where))), "as long")
 
@@ -130,7 +130,7 @@ def _at_least(ratio: float, found: FloatArray) -> Share:
     return wilson(int((found >= ratio).sum()), len(found))
 
 
-def worst_as_long(flights: pa.Table, ratio: float, missions: int, **where: Any) -> Finding:
+def _worst_as_long(flights: pa.Table, ratio: float, missions: int, **where: Any) -> Finding:
     """The probability that the longest of so many flights reaches a ratio to its golden flight."""
     found = ratios(struck(flights, **where))
     if not len(found):
@@ -143,12 +143,12 @@ def worst_as_long(flights: pa.Table, ratio: float, missions: int, **where: Any) 
     )
 
 
-def energy_follows_time(flights: pa.Table, **where: Any) -> Finding:
+def _energy_follows_time(flights: pa.Table, **where: Any) -> Finding:
     """Correlation of energy with flight time over successful golden flights."""
     won = chosen(golden(flights), lost=False, **where)
     pairs = np.stack([numbers(won, name) for name in ("flight_time_s", "energy_regression_j")], 1)
     pairs = pairs[(pairs > 0.0).all(axis=1)]
-    if len(pairs) < FEWEST:
+    if len(pairs) < _FEWEST:
         return Finding()
     return Finding(effect=correlation(pairs.tolist()), told=f"{len(pairs):,} golden flights")
 
@@ -164,14 +164,14 @@ def protected(
     return chosen(flights, **seen, **where)
 
 
-def recovered(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _recovered(flights: pa.Table, detector: str, **where: Any) -> Finding:
     """The share of lost missions that a detector saves."""
     seen = protected(flights, detector, **where)
     lost = chosen(seen, bare_lost=True)
     return _of_some(lost, "lost", "lost missions saved") or _none_of(seen, "lost")
 
 
-def shortened(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _shortened(flights: pa.Table, detector: str, **where: Any) -> Finding:
     """The share of longer flights that a detector brings back within 5 %."""
     seen = protected(flights, detector, **where)
     longer = chosen(seen, bare_lost=False, bare_harmed=True)
@@ -194,7 +194,7 @@ def _undone(flights: pa.Table, detector: str, protect: str, where: Where) -> Sha
     return share(chosen(seen, bare_harmed=True), "harmed", value=False)
 
 
-def control_recovers_most(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _control_recovers_most(flights: pa.Table, detector: str, **where: Any) -> Finding:
     """Harm undone by watching control minus that by the better single other stage."""
     shares = {stage: _undone(flights, detector, stage, where) for stage in STAGES}
     if not all(each.total for each in shares.values()):
@@ -205,14 +205,14 @@ def control_recovers_most(flights: pa.Table, detector: str, **where: Any) -> Fin
     return _difference((control, best), f"harm undone: {told}")
 
 
-def all_stages_best(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _all_stages_best(flights: pa.Table, detector: str, **where: Any) -> Finding:
     """Harm undone by watching all stages minus that by watching control."""
     shares = [_undone(flights, detector, each, where) for each in (EVERY_STAGE, "control")]
     told = "harm undone: all stages {}, control {}".format(*map(count_of, shares))
     return _difference(shares, told)
 
 
-def autoencoder_better(flights: pa.Table, **where: Any) -> Finding:
+def _autoencoder_better(flights: pa.Table, **where: Any) -> Finding:
     """Success with the autoencoder minus success with the Gaussian detector."""
     seen = [protected(flights, name, **where) for name in ("gad", "aad")]
     gad, aad = (dict(zip(faults_of(x), ~flags(x, "lost"), strict=True)) for x in seen)
@@ -229,14 +229,14 @@ def autoencoder_better(flights: pa.Table, **where: Any) -> Finding:
 _NO_COSTS = Finding(told="flown, but this export does not hold these times; a new one does")
 
 
-def overhead_of(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _overhead_of(flights: pa.Table, detector: str, **where: Any) -> Finding:
     """The mean share of the flight time that detection and recovery take."""
     seen, shares = _overheads(flights, detector, where)
     told = "time of the computer that flew, and simulated recovery"
     return _mean_cost(seen, shares, told)
 
 
-def gaussian_dearer(flights: pa.Table, **where: Any) -> Finding:
+def _gaussian_dearer(flights: pa.Table, **where: Any) -> Finding:
     """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
     gad, aad = (
         dict(zip(*_overheads(flights, name, where), strict=True)) for name in ("gad", "aad")
@@ -260,7 +260,7 @@ def _mean_cost(seen: Collection[Any], costs: Sequence[float], told: str) -> Find
     return Finding(effect=interval(known, resamples=RESAMPLES), told=told)
 
 
-def calibrated(_: pa.Table) -> Finding:
+def _calibrated(_: pa.Table) -> Finding:
     """No finding: the model takes this number from the paper."""
     return Finding(told="our model is calibrated with this number, so it tells nothing")
 
@@ -268,29 +268,26 @@ def calibrated(_: pa.Table) -> Finding:
 # Isolated kernels ---------------------------------------------------------------------------------
 
 
-def outcome_beside(
-    kernels: Kernels,
-    name: str,
-    outcome: str,
-    choose: Callable[..., str],
-    others: Sequence[str] = (),
+def _outcome_beside(
+    kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
 ) -> Finding:
     """The share of an outcome in one kernel minus that in the most extreme of others.
 
     Args:
-        choose: `max` or `min`.
+        extreme: `most` or `least`.
         others: none mean all.
     """
-    there = [each for each in others or kernels if each in kernels and each != name]
-    if name not in kernels or not there:
+    there = [each for each in others or kernels if each in kernels and each != kernel]
+    if kernel not in kernels or not there:
         return Finding()
-    extreme = choose(there, key=lambda each: _outcome(kernels, each, outcome).share)
-    shares = {each: _outcome(kernels, each, outcome) for each in (name, extreme)}
+    choose = max if extreme == "most" else min
+    other = choose(there, key=lambda each: _outcome(kernels, each, outcome).share)
+    shares = {each: _outcome(kernels, each, outcome) for each in (kernel, other)}
     told = (f"{kernels[each]['title']} {100 * found.share:.1f} %" for each, found in shares.items())
     return Finding(effect=rate_difference(*shares.values()), told=", ".join(told))
 
 
-def least_benign(kernels: Kernels, but: str) -> Finding:
+def _least_benign(kernels: Kernels, but: str) -> Finding:
     """The least share of benign runs of all kernels but one."""
     shares = {each: _outcome(kernels, each, "benign") for each in kernels if each != but}
     if not shares:
@@ -303,3 +300,26 @@ def least_benign(kernels: Kernels, but: str) -> Finding:
 def _outcome(kernels: Kernels, name: str, outcome: str) -> Share:
     told = kernels[name]["outcomes"][outcome]
     return wilson(told["count"], told["of"])
+
+
+MEASURES: Mapping[str, Callable[..., Finding]] = {
+    "success_lost": _success_lost,
+    "most_lost_kernel": _most_lost_kernel,
+    "harm_difference": _harm_difference,
+    "harmful": _harmful,
+    "loss_difference": _loss_difference,
+    "as_long": _as_long,
+    "worst_as_long": _worst_as_long,
+    "energy_follows_time": _energy_follows_time,
+    "recovered": _recovered,
+    "shortened": _shortened,
+    "control_recovers_most": _control_recovers_most,
+    "all_stages_best": _all_stages_best,
+    "autoencoder_better": _autoencoder_better,
+    "overhead_of": _overhead_of,
+    "gaussian_dearer": _gaussian_dearer,
+    "calibrated": _calibrated,
+    "outcome_beside": _outcome_beside,
+    "least_benign": _least_benign,
+}
+"""By the names that claims.toml uses. Each takes flights or kernels, and what a claim gives it."""

@@ -1,12 +1,18 @@
 """The claims: each has its words, numbers and range, and decides what it says."""
 
 import re
+import tomllib
+from pathlib import Path
 
 import pytest
 from flown import flights, row
 
+from mavfi_cli.claims import effects
 from mavfi_cli.claims.catalogue import CLAIMS
+from mavfi_cli.reproduction import items
 from mavfi_cli.reproduction.items import BY_NAME
+from mavfi_cli.reproduction.layouts import WORLDS
+from mavfi_cli.reproduction.paper import printed
 from mavfi_cli.stats.effects import ClaimVerdict, judge
 
 BY_CLAIM = {claim.name: claim for claim in CLAIMS}
@@ -44,6 +50,40 @@ def test_the_papers_numbers_stand_in_their_claims():
     assert BY_CLAIM["table3-5"].paper_tells.endswith("Fisher's p = 0.63")
     assert BY_CLAIM["fig12-farm"].words.endswith("takes 74.2 % longer.")
     assert BY_CLAIM["table4-gad"].low > 0.4
+
+
+NUMBERS = tomllib.loads((Path(items.__file__).parent / "paper.toml").read_text())
+
+
+def flat(value):
+    """All numbers inside."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    own = {float(value)} if isinstance(value, (int, float)) else set()
+    return own.union(*map(flat, inside))
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
+def test_the_numbers_in_the_words_of_a_claim_are_those_of_its_item(claim):
+    told = {float(each) for each in re.findall(r"\d+\.\d+", claim.words)}
+    assert told - {89.6} <= flat(NUMBERS[claim.item])  # Table IV's best world
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
+def test_a_longest_flight_is_as_long_as_its_words_say(claim):
+    ratio = claim.find.keywords.get("ratio")
+    if ratio is not None:
+        (said,) = re.findall(r"\d+\.\d+", claim.words)
+        assert float(said) == pytest.approx(ratio if ratio >= 2.0 else 100.0 * (ratio - 1.0))
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_counts_of_table_iv_are_its_printed_rates(world):
+    told = tomllib.loads((Path(effects.__file__).parent / "claims.toml").read_text())["claim"]
+    (counts,) = (each["paper_counts"] for each in told if each["name"] == f"table4-{world}")
+    for kind, runs, found in zip(("golden", "none"), ("golden_runs", "runs"), counts, strict=True):
+        missions = printed("table4", runs)
+        assert found == [round(missions * printed("table4", "success_percent", kind, world) / 100),
+                         missions]  # fmt: skip
 
 
 def stage(name, seed, **how):

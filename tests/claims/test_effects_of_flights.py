@@ -5,14 +5,7 @@ from flown import flights, row
 
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.claims.document import worst_flights
-from mavfi_cli.claims.effects import (
-    autoencoder_better,
-    protected,
-    recovered,
-    shortened,
-    success_lost,
-    worst_as_long,
-)
+from mavfi_cli.claims.effects import MEASURES, protected
 from mavfi_cli.reproduction.flights import share, struck
 
 PLANNING = {"target": "planning", "fault": {"field": "exponent"}}
@@ -45,7 +38,7 @@ def test_success_lost_is_paired_and_counts_faults_that_nothing_read():
     rows = pairs("collision", *[20.0] * 8)
     rows[3] = {**rows[3], "injected": "not_activated"}
     rows.append(row(**PLANNING, seed=50, injected="not_injected"))
-    found = success_lost(flights(rows))
+    found = MEASURES["success_lost"](flights(rows))
     assert found.effect.value == pytest.approx(1 / 9)
     assert found.effect.count == 9
     assert found.told == "1 of 9 lost; golden 0 of 9"
@@ -65,7 +58,7 @@ def test_the_longest_flight_is_paired_and_unpaired():
 
 def test_a_longest_flight_is_as_probable_as_flights_are_as_long():
     those = flights(pairs(30.0, 20.0, 20.0, 20.0))
-    found = worst_as_long(those, 1.5, 10)
+    found = MEASURES["worst_as_long"](those, 1.5, 10)
     assert found.effect.value == pytest.approx(1.0 - 0.75**10)
     assert found.told == "1 of 4 as long; longest +50.0 %"
 
@@ -84,21 +77,21 @@ def test_a_detector_saves_lost_missions_and_brings_long_ones_back():
     rows = watched(rows, "gad", 20.0, "collision", 20.5, 20.0)
     rows = watched(rows, "aad", 20.0, 20.0, 40.0, "crash")
     those = flights(rows)
-    assert recovered(those, "gad").told == "1 of 2 lost missions saved"
-    assert recovered(those, "aad").effect.value == 1.0
-    assert shortened(those, "gad").told == "1 of 1 longer flights brought back"
+    assert MEASURES["recovered"](those, "gad").told == "1 of 2 lost missions saved"
+    assert MEASURES["recovered"](those, "aad").effect.value == 1.0
+    assert MEASURES["shortened"](those, "gad").told == "1 of 1 longer flights brought back"
     for name in ("gad", "aad"):
         undone = share(chosen(protected(those, name), bare_harmed=True), "harmed", value=False)
         assert (undone.count, undone.total) == (2, 3)
-    told = autoencoder_better(those).told
+    told = MEASURES["autoencoder_better"](those).told
     assert told == "1 missions by AAD only, 1 by GAD only, of 4"
 
 
 def test_nothing_to_recover_says_so():
-    found = recovered(flights(watched(pairs(20.0), "gad", 20.0)), "gad")
+    found = MEASURES["recovered"](flights(watched(pairs(20.0), "gad", 20.0)), "gad")
     assert found.effect is None
     assert found.told == "without it 0 of 1 lost"
-    assert recovered(flights(pairs(20.0)), "gad").told == ""
+    assert MEASURES["recovered"](flights(pairs(20.0)), "gad").told == ""
 
 
 def test_what_is_not_of_the_paper_is_marked():
