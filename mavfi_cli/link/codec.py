@@ -13,11 +13,9 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import itertools
 import re
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
@@ -161,6 +159,8 @@ Message = Any  # an instance of one of pymavlink's generated message classes
 _MARKERS = _V1, _V2 = 0xFE, 0xFD
 _V2_MARKER = bytes([_V2])
 _V1_HEADER, _V2_HEADER = 6, 10  # bytes
+# Headers after the marker: length, flags (2 bytes), sequence, system, component, message id.
+_V1_HEAD, _V2_HEAD = struct.Struct("<BBBBB"), struct.Struct("<BBBBBBHB")
 
 
 def _slow_crc(data: bytes, initial: int = 0xFFFF) -> int:
@@ -183,94 +183,66 @@ class _Kind:
     An array of bytes is packed and unpacked in one piece, which is faster than byte by byte.
     """
 
-    __slots__ = ("build", "crc_extra", "number", "pack", "read", "size", "unpack", "values")
+    __slots__ = (
+        "_arguments", "_arrays", "_columns", "_texts", "build", "crc_extra", "number", "pack",
+        "size", "unpack_from",
+    )  # fmt: skip
 
     def __init__(self, cls: Any) -> None:
         layout = struct.Struct(re.sub(r"(\d+)B", r"\1s", cls.unpacker.format))
         self.build: Callable[..., Message] = cls
-        self.number: bytes = cls.id.to_bytes(3, "little")
+        self.number: int = cls.id
         self.crc_extra = bytes([cls.crc_extra])
         self.size: int = layout.size
-        self.unpack: Callable[[bytes], tuple[Any, ...]] = layout.unpack
+        self.unpack_from: Callable[[bytes, int], tuple[Any, ...]] = layout.unpack_from
         self.pack: Callable[..., bytes] = layout.pack
-        types = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
-        fields = [
-            _Field(cls.msgname, name, types[name], length)
-            for name, length in zip(cls.ordered_fieldnames, cls.lengths, strict=True)
-        ]
-        self.read = _reader(fields, cls.orders)
-        self.values = _writer(fields)
+        kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
+        names = cls.ordered_fieldnames
+        texts = [kinds[name] == "char" for name in names]
+        self._columns = _all_of(
+            attrgetter,
+            [f"_{name}_raw" if text else name for name, text in zip(names, texts, strict=True)],
+        )
+        self._arguments = _all_of(itemgetter, cls.orders)
+        self._texts = [place for place, text in enumerate(texts) if text]
+        self._arrays = [
+            (place, length, kinds[name] == "uint8_t")
+            for place, (name, length) in enumerate(zip(names, cls.lengths, strict=True))
+            if length > 1
+        ]  # place among the fields, length, and whether it lies there in one piece
+        if cls.msgname == _PACKET:
+            self._columns, self._arrays = lambda packet: (packet.seqnr, bytes(packet.data)), []
+
+    def payload(self, message: Message) -> bytes:
+        """Return the payload of a message, without the zeros at its end."""
+        values = self._columns(message)
+        if self._arrays:
+            values = list(values)
+            for place, length, whole in reversed(self._arrays):
+                part = values[place][:length]
+                values[place : place + 1] = [bytes(part)] if whole else part
+        return self.pack(*values).rstrip(b"\0") or b"\0"
+
+    def message(self, frame: bytes, start: int, length: int) -> Message:
+        """Return the message of a payload. Arrays become lists, and texts lose their padding."""
+        size = self.size
+        if length != size:  # a sender cuts zeros off, and a newer one adds fields
+            frame, start = frame[start : start + length].ljust(size, b"\0"), 0
+        values: Any = self.unpack_from(frame, start)
+        if self._arrays or self._texts:
+            values = list(values)
+            for place, length, whole in self._arrays:
+                end = place + 1 if whole else place + length
+                values[place:end] = [list(values[place]) if whole else values[place:end]]
+            for place in self._texts:
+                values[place] = values[place].rstrip(b"\0")
+        return self.build(*self._arguments(values))
 
 
-@dataclass(frozen=True, slots=True)
-class _Field:
-    """A field of a message. A text, like a number, has length 1."""
-
-    message: str
-    name: str
-    type: str
-    length: int
-
-    @property
-    def values(self) -> int:
-        """Number of values on the wire, where an array of bytes is one."""
-        return 1 if self.type == "uint8_t" else self.length
-
-    @property
-    def is_plain(self) -> bool:
-        """True if the value on the wire is the constructor's argument."""
-        packet = self.message == _PACKET and self.values == 1
-        return packet or (self.length == 1 and self.type != "char")
-
-
-def _reader(
-    fields: Sequence[_Field], orders: Sequence[int]
-) -> Callable[[tuple[Any, ...]], Sequence[Any]]:
-    """Return a function from unpacked wire values to the constructor's arguments."""
-    starts = [0, *itertools.accumulate(field.values for field in fields)]
-    wire = [(starts[order], fields[order]) for order in orders]
-    if len(wire) > 1 and all(field.is_plain for _, field in wire):
-        getter: Callable[[tuple[Any, ...]], Sequence[Any]] = itemgetter(*(s for s, _ in wire))
-        return getter
-    spans = [(start, start + each.values, each.length, each.type == "char") for start, each in wire]
-
-    def read(values: tuple[Any, ...]) -> Sequence[Any]:
-        """Return arrays as lists and texts without padding."""
-        arguments = []
-        for start, end, length, text in spans:
-            value = values[start]
-            if length > 1:
-                value = list(value if end == start + 1 else values[start:end])
-            arguments.append(value.rstrip(b"\0") if text else value)
-        return arguments
-
-    return read
-
-
-def _writer(fields: Sequence[_Field]) -> Callable[[Message], Sequence[Any]]:
-    """Return a function that converts a message to the values of its wire layout."""
-    if fields[0].message == _PACKET:
-        return lambda message: (message.seqnr, bytes(message.data))
-    names = [f"_{each.name}_raw" if each.type == "char" else each.name for each in fields]
-    if len(names) > 1 and all(field.length == 1 for field in fields):
-        getter: Callable[[Message], Sequence[Any]] = attrgetter(*names)
-        return getter
-    shapes = [(n, each.length, each.values) for n, each in zip(names, fields, strict=True)]
-
-    def values(message: Message) -> Sequence[Any]:
-        """Return the values with arrays flattened."""
-        flat: list[Any] = []
-        for name, length, count in shapes:
-            value = getattr(message, name)
-            if length == 1:
-                flat.append(value)
-            elif count == 1:
-                flat.append(bytes(value[:length]))
-            else:
-                flat.extend(value[:length])
-        return flat
-
-    return values
+def _all_of(getter: Callable[..., Any], keys: Sequence[Any]) -> Callable[[Any], Sequence[Any]]:
+    """Return the getter of these keys, which returns a sequence for a single key, too."""
+    get: Callable[[Any], Any] = getter(*keys)
+    return get if len(keys) > 1 else lambda source: (get(source),)
 
 
 def _kind(message_id: int) -> _Kind | None:
@@ -323,13 +295,15 @@ class Codec:
         kind = _KINDS.get(type(message).id) or _kind(type(message).id)
         if kind is None:
             raise ValueError(f"{type(message).__name__} is not a message of the dialect")
-        payload = kind.pack(*kind.values(message)).rstrip(b"\0") or b"\0"
+        payload = kind.payload(message)
         flags = 0 if self._signing is None else _SIGNED
-        header = (len(payload), flags, 0, self._sequence, self.system, self.component)
+        head = _V2_HEAD.pack(
+            len(payload), flags, 0, self._sequence, self.system, self.component,
+            kind.number & 0xFFFF, kind.number >> 16,
+        )  # fmt: skip
         self._sequence = (self._sequence + 1) & 0xFF
-        checked = bytes(header) + kind.number + payload
-        crc = _crc(checked + kind.crc_extra)
-        frame = _V2_MARKER + checked + crc.to_bytes(2, "little")
+        checked = head + payload
+        frame = _V2_MARKER + checked + _crc(checked + kind.crc_extra).to_bytes(2, "little")
         return frame if self._signing is None else frame + self._signing.sign(frame)
 
     def decode(self, data: bytes, *, datagram: bool = False) -> list[Message]:
@@ -368,11 +342,17 @@ class Codec:
         the end.
         """
         frame = buffer[start:end]
-        header = _V2_HEADER if frame[0] == _V2 else _V1_HEADER
-        signed = header == _V2_HEADER and bool(frame[2] & _SIGNED)
-        crc_at = header + frame[1]
+        if frame[0] == _V2:
+            header = _V2_HEADER
+            length, flags, compat, sequence, system, component, low, high = _V2_HEAD.unpack_from(
+                frame, 1
+            )
+            number = low | high << 16
+        else:
+            header, flags, compat = _V1_HEADER, 0, 0
+            length, sequence, system, component, number = _V1_HEAD.unpack_from(frame, 1)
+        crc_at = header + length
         crc = frame[crc_at] | frame[crc_at + 1] << 8
-        number = frame[5] if header == _V1_HEADER else frame[7] | frame[8] << 8 | frame[9] << 16
         kind = _KINDS.get(number) or _kind(number)
         if kind is None:
             # Test whether any extra byte makes the checksum right.
@@ -383,11 +363,15 @@ class Codec:
             return True
         if _crc(frame[1:crc_at] + kind.crc_extra) != crc:
             return False
-        if self._signing and not self._signing.accept(frame, header, number, signed=signed):
+        if self._signing and not self._signing.accept(frame, header, number, signed=flags != 0):
             self.refused += 1
             return True
-        message = _build(kind, frame, header, crc)
-        if signed and self._signing is not None:
+        message = kind.message(frame, header, length)
+        head = message._header
+        head.mlen, head.incompat_flags, head.compat_flags = length, flags, compat
+        head.seq, head.srcSystem, head.srcComponent = sequence, system, component
+        message._msgbuf, message._crc = frame, crc
+        if flags and self._signing is not None:
             message._signed = True
             message._link_id = frame[-SIGNATURE_LENGTH]
         messages.append(message)
@@ -411,20 +395,3 @@ def frame_length(buffer: bytes, position: int, end: int) -> int:
             return 0
         length += 4 + (SIGNATURE_LENGTH if flags else 0)
     return length if position + length <= end else _INCOMPLETE
-
-
-def _build(kind: _Kind, frame: bytes, header: int, crc: int) -> Message:
-    payload = frame[header : header + frame[1]]
-    size = kind.size
-    values = kind.unpack(payload.ljust(size, b"\0")[:size])
-    message = kind.build(*kind.read(values))
-    head = message._header
-    if header == _V2_HEADER:
-        head.mlen, head.incompat_flags, head.compat_flags = frame[1:4]
-        head.seq, head.srcSystem, head.srcComponent = frame[4:7]
-    else:
-        head.mlen, head.seq, head.srcSystem, head.srcComponent = frame[1:5]
-    message._msgbuf = frame
-    message._payload = payload
-    message._crc = crc
-    return message

@@ -33,9 +33,9 @@ _TRIALS = 64  # combinations of packets that are tried against the checksum of o
 _LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
 _REMEMBERED = 64  # indices of frames that are done with
 
-_CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
+_DEPTH_M = np.array([*(DEPTH_UNIT_M * level for level in range(NOTHING)), math.inf])  # by pixel
 
-_DEPTH_M = np.arange(256, dtype=np.float64) * DEPTH_UNIT_M
+_CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
 
 
 def _hfov_of(message: Message) -> float | None:
@@ -99,7 +99,7 @@ class _Assembly:
     """A frame that was announced but is not complete yet."""
 
     __slots__ = (
-        "announced", "checksum", "improved", "index", "near", "stamp_s", "strays", "trials_left",
+        "announced", "checksum", "improved", "index", "near", "stamp_s", "trials_left",
     )  # fmt: skip
 
     def __init__(self, index: int, stamp_s: float, checksum: int | None, announced: int) -> None:
@@ -108,7 +108,6 @@ class _Assembly:
         self.checksum = checksum
         self.announced = announced  # count of messages at its announcement
         self.near: dict[int, tuple[int, bytes]] = {}  # place -> how far off its due time, data
-        self.strays = 0  # places whose packet came so far off that it is another frame's
         self.improved = False  # a packet came that no trial has seen
         self.trials_left = _TRIALS
 
@@ -119,8 +118,12 @@ class _Assembly:
         if off > reach or (held is not None and held[0] <= off):
             return
         self.near[place] = (off, data)
-        self.strays += (off > _STRAY) - (held is not None and held[0] > _STRAY)
         self.improved = True
+
+    @property
+    def has_strays(self) -> bool:
+        """True if a packet came so far off its due time that it may be another frame's."""
+        return any(off > _STRAY for off, _ in self.near.values())
 
     def image(self, packets: Iterable[bytes], shape: _Shape) -> bytes | None:
         """The pixels of these packets, if the checksum agrees."""
@@ -233,7 +236,6 @@ class ImageReceiver:
             self._fresh &= self._latest.keys()
             for frame in self._open:
                 frame.near = {p: held for p, held in frame.near.items() if p < shape.packets}
-                frame.strays = sum(off > _STRAY for off, _ in frame.near.values())
         return self._finish(self._open)
 
     def _packet(self, message: Message) -> list[ImageFrame]:
@@ -244,20 +246,15 @@ class ImageReceiver:
         self._recent.append((self._count, place, data))
         self._latest[place] = data
         self._fresh.add(place)
+        last = self._count - 1 - self._places  # announced then, a frame has had its time
+        ready = []
         for frame in self._open:
             frame.offer(place, data, self._count, self._reach)
-        if self._shape is None:
-            return []
+            whole = frame.improved and len(frame.near) == self._places
+            if whole and (frame.announced <= last or not frame.has_strays):
+                ready.append(frame)
         if len(self._fresh) >= self._places:
-            return self._finish(self._open)
-        last = self._count - 1 - self._places  # announced then, a frame has had its time
-        ready = [
-            frame
-            for frame in self._open
-            if frame.improved
-            and len(frame.near) == self._places
-            and (not frame.strays or frame.announced <= last)
-        ]
+            ready = self._open
         return self._finish(ready) if ready else []
 
     def _finish(self, frames: list[_Assembly]) -> list[ImageFrame]:
@@ -284,12 +281,24 @@ class ImageReceiver:
     def _solve(self, frame: _Assembly, shape: _Shape) -> bytes | None:
         """Return the pixels of the nearest or else the newest packets that match the checksum."""
         places = range(shape.packets)
-        image = None
+        candidates = []
         if len(frame.near) == shape.packets:
-            image = frame.image((frame.near[place][1] for place in places), shape)
-        if image is None and len(self._fresh) == shape.packets:
-            image = frame.image((self._latest[place] for place in places), shape)
-        return image
+            candidates.append([frame.near[place][1] for place in places])
+        if len(self._fresh) == shape.packets:
+            candidates.append([self._latest[place] for place in places])
+        for packets in candidates:
+            image = frame.image(packets, shape)
+            if image is not None:
+                self._forget(packets)
+                return image
+        return None
+
+    def _forget(self, packets: Iterable[bytes]) -> None:
+        """Offer the packets of a complete frame to no other one."""
+        used = set(map(id, packets))
+        recent = [each for each in self._recent if id(each[2]) not in used]
+        self._recent.clear()
+        self._recent.extend(recent)
 
     def _close(self, frame: _Assembly) -> None:
         self._open.remove(frame)
@@ -315,6 +324,3 @@ def _shape_of(message: Message) -> _Shape | None:
     if message.packets != -(-message.size // payload):
         return None
     return _Shape(columns=columns, rows=rows, packets=message.packets, payload=payload)
-
-
-_DEPTH_M[NOTHING] = np.inf

@@ -43,9 +43,12 @@ _LISTEN_S = 1.2  # time in which a second autopilot would send a HEARTBEAT, too
 _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the vehicle itself
 
 
-def _float32(value: float) -> float:
-    number = float(value)
-    return math.copysign(math.inf, number) if abs(number) > _LARGEST_FLOAT32 else number
+def _float32(vector: Sequence[float]) -> list[float]:
+    """Return a vector's numbers, or infinity for those beyond float32; NaN stays NaN."""
+    return [
+        math.copysign(math.inf, number) if abs(number) > _LARGEST_FLOAT32 else number
+        for number in map(float, vector)
+    ]
 
 
 def _heartbeat() -> Message:
@@ -112,7 +115,7 @@ class OffboardSession:
         self._settings = settings or SessionSettings()
         self._url = url
         self.telemetry = telemetry or Telemetry()
-        self.phase = Phase.CONNECTING
+        self.phase, self._step = Phase.CONNECTING, _STEPS[Phase.CONNECTING]
         self.failure: LinkError | None = None
         self.failsafe_text: str | None = None
         self._commands = CommandChannel(self._settings.system, self._settings.component)
@@ -163,11 +166,11 @@ class OffboardSession:
             acceleration_enu_mps2: Feed-forward acceleration (3,), m/s^2; None for none.
         """
         mask, yaw, ax, ay, az = _IGNORED, 0.0, 0.0, 0.0, 0.0
-        east, north, up = map(_float32, velocity_enu_mps)
+        east, north, up = _float32(velocity_enu_mps)
         if acceleration_enu_mps2 is None:
             mask |= _NO_ACCELERATION
         else:
-            ay, ax, az = map(_float32, acceleration_enu_mps2)
+            ay, ax, az = _float32(acceleration_enu_mps2)
         if yaw_enu_rad is None:
             mask |= _NO_YAW
         else:
@@ -273,7 +276,7 @@ class OffboardSession:
             self._phase_since_s = stamp_s
         self.telemetry.expire()
         try:
-            _STEPS[self.phase](self)
+            self._step(self)
         except LinkError as failure:
             self._enter(Phase.FAILED)
             self.failure = failure
@@ -297,7 +300,7 @@ class OffboardSession:
     # Phases -------------------------------------------------------------------------------------
 
     def _enter(self, phase: Phase) -> None:
-        self.phase = phase
+        self.phase, self._step = phase, _STEPS[phase]
         self._phase_since_s = self._now_s
         self._requests.begin()
 

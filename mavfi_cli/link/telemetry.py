@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, y
 from mavfi_cli.core.types import FloatArray, VehicleState
 from mavfi_cli.link.codec import Message, dialect
 from mavfi_cli.link.sender_slot import TWO_AUTOPILOTS
-from mavfi_cli.link.texts import TextCollector
+from mavfi_cli.link.texts import Text, TextCollector
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,7 +188,7 @@ class Telemetry:
             return
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._adopt(message)
-        if self.heard and message.get_srcSystem() == self.system:
+        if self.system and message.get_srcSystem() == self.system:
             handler(self, message)
 
     def _adopt(self, message: Message) -> None:
@@ -272,18 +272,14 @@ class Telemetry:
 
     def take_text(self, message: Message) -> None:
         """Handle a STATUSTEXT of the autopilot, or of a component that speaks for it."""
-        before = self.texts.total
-        self.texts.add(message, self.now_s)
-        self._look_for_verdict(before)
+        self._look_for_verdict(self.texts.add(message, self.now_s))
 
     def expire(self) -> None:
         """Close texts whose missing chunks are overdue."""
-        before = self.texts.total
-        self.texts.expire(self.now_s)
-        self._look_for_verdict(before)
+        self._look_for_verdict(self.texts.expire(self.now_s))
 
-    def _look_for_verdict(self, before: int) -> None:
-        for text in self.texts.since(before):
+    def _look_for_verdict(self, texts: Iterable[Text]) -> None:
+        for text in texts:
             if self.collision_text is None and text.text.startswith("Collision"):
                 self.collision_text = text.text
             elif text.text.startswith(TWO_AUTOPILOTS):

@@ -40,7 +40,7 @@ def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Any]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Text:
+class Text:
     """A complete text of a component."""
 
     stamp_s: float  # arrival of its last chunk
@@ -59,46 +59,50 @@ class TextCollector:
     """Collects texts. `texts` holds the newest thousand, `total` counts all."""
 
     def __init__(self) -> None:
-        self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
+        self.texts: deque[Text] = deque(maxlen=_MAX_TEXTS)
         self.total = 0
         self._open: dict[tuple[int, int, int], _Open] = {}
 
-    def since(self, total: int) -> list[_Text]:
+    def since(self, total: int) -> list[Text]:
         """Return the texts received since `total` had this value."""
+        if total == self.total:
+            return []
         fresh = min(self.total - total, len(self.texts))
-        return list(self.texts)[len(self.texts) - fresh :] if fresh else []
+        return list(self.texts)[len(self.texts) - fresh :]
 
-    def add(self, message: Message, stamp_s: float) -> None:
-        """Handle a STATUSTEXT."""
+    def add(self, message: Message, stamp_s: float) -> list[Text]:
+        """Handle a STATUSTEXT. Return the texts that are complete now."""
         if message.id == 0:
-            self._emit(stamp_s, message.severity, message.text)
-            return
+            return [self._emit(stamp_s, message.severity, message.text)]
+        done = []
         key = (message.get_srcSystem(), message.get_srcComponent(), message.id)
         if key not in self._open:
             if len(self._open) >= _MAX_OPEN:
-                self._finish(next(iter(self._open)), stamp_s)
+                done.append(self._finish(next(iter(self._open)), stamp_s))
             self._open[key] = _Open(severity=message.severity, started_s=stamp_s, chunks={})
         chunks = self._open[key].chunks
         chunks[message.chunk_seq] = message.text
         last = max(chunks)
         if len(chunks[last]) < CHUNK_LENGTH and len(chunks) == last + 1:
-            self._finish(key, stamp_s)
+            done.append(self._finish(key, stamp_s))
+        return done
 
-    def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> None:
-        """Close texts with chunks missing for longer than the patience. They keep a gap."""
-        if self._open:
-            late = [k for k, o in self._open.items() if stamp_s - o.started_s >= patience_s]
-            for key in late:
-                self._finish(key, stamp_s)
+    def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[Text]:
+        """Close and return texts with chunks missing for longer than the patience, with a gap."""
+        if not self._open:
+            return []
+        late = [k for k, o in self._open.items() if stamp_s - o.started_s >= patience_s]
+        return [self._finish(key, stamp_s) for key in late]
 
-    def _finish(self, key: tuple[int, int, int], stamp_s: float) -> None:
+    def _finish(self, key: tuple[int, int, int], stamp_s: float) -> Text:
         part = self._open.pop(key)
         last = max(part.chunks)
         text = "".join(part.chunks.get(index, _GAP) for index in range(last + 1))
         if len(part.chunks[last]) >= CHUNK_LENGTH:
             text += _GAP
-        self._emit(stamp_s, part.severity, text)
+        return self._emit(stamp_s, part.severity, text)
 
-    def _emit(self, stamp_s: float, severity: int, text: str) -> None:
+    def _emit(self, stamp_s: float, severity: int, text: str) -> Text:
         self.total += 1
-        self.texts.append(_Text(stamp_s=stamp_s, severity=severity, text=text.strip()))
+        self.texts.append(Text(stamp_s=stamp_s, severity=severity, text=text.strip()))
+        return self.texts[-1]

@@ -75,6 +75,16 @@ def test_frames_come_out_as_they_were_sent_over_the_wire() -> None:
     assert (receiver.received, receiver.lost) == (5, 0)
 
 
+def test_frames_in_order_are_compared_with_their_checksums_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    messages, sizes = [m for index in range(5) for m in _frame(index)], []
+    checksum = zlib.crc32
+    monkeypatch.setattr(zlib, "crc32", lambda data: sizes.append(len(data)) or checksum(data))
+    assert _check(_feed(ImageReceiver(), messages)) == [0, 1, 2, 3, 4]
+    assert sizes == [ROWS * COLUMNS] * 5
+
+
 @pytest.mark.parametrize(("rows", "columns"), [(1, 1), (1, 253), (2, 253), (3, 100), (240, 320)])
 def test_any_size(rows: int, columns: int) -> None:
     (frame,) = _feed(ImageReceiver(), _frame(1, rows, columns))
