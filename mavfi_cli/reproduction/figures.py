@@ -25,6 +25,7 @@ from mavfi_cli.report.paper_figures import (
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.report.top_view import draw_trajectories, panels_of
 from mavfi_cli.reproduction.flights import STAGES, by_value, comparable, faulty, golden
+from mavfi_cli.reproduction.items import printed
 from mavfi_cli.reproduction.layouts import (
     DETECTORS,
     KERNELS_FLOWN,
@@ -33,7 +34,6 @@ from mavfi_cli.reproduction.layouts import (
     worlds_of,
 )
 from mavfi_cli.reproduction.measures import PERCENT, increases
-from mavfi_cli.reproduction.paper import printed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

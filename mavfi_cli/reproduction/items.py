@@ -1,12 +1,22 @@
-"""The items of the paper: its figures and tables that are experiments, and what each needs."""
+"""The items of the paper: its figures and tables that are experiments, and the numbers it prints.
+
+paper.toml has them all.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
+from pathlib import Path
+from typing import Any
 
+from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.report.tables.paper_table import PaperColumn, PaperRow, PaperTable, Printed
+
+_PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
+_ROMAN = ("", "I", "II", "III", "IV", "V")
 
 
 class Source(Enum):
@@ -24,21 +34,43 @@ class Item:
     Attributes:
         name: as on the command line, such as `fig6`.
         title: what it shows.
+        labels: headings of its table's labels.
+        columns: of its table; a column without a title stands for one of each world.
+        notes: below its table.
+        origin: where the paper prints its numbers, and what it only draws.
         preset: the campaign that flies it; empty if its source is not flights.
     """
 
     name: str
     title: str
-    preset: str = ""
-    source: Source = Source.FLIGHTS
+    labels: tuple[str, ...]
+    columns: tuple[PaperColumn, ...]
+    notes: tuple[str, ...]
+    origin: str
+    preset: str
+    source: Source
 
     @property
     def paper(self) -> str:
         """The paper's name of it."""
         return printed_name(self.name)
 
-
-_ROMAN = ("", "I", "II", "III", "IV", "V")
+    def table(
+        self, rows: Sequence[PaperRow], worlds: Sequence[str] = (), notes: Sequence[str] = ()
+    ) -> PaperTable:
+        """The item's table with these rows, and with more notes."""
+        return PaperTable(
+            name=self.name,
+            title=f"{self.paper}: {self.title}",
+            labels=self.labels,
+            columns=tuple(
+                column if column.title else replace(column, title=world)
+                for column in self.columns
+                for world in ([column.title] if column.title else worlds)
+            ),
+            rows=tuple(rows),
+            notes=(*self.notes, *notes, self.origin),
+        )
 
 
 def printed_name(name: str) -> str:
@@ -47,33 +79,33 @@ def printed_name(name: str) -> str:
     return f"Fig. {name.removeprefix('fig')}" if table == name else f"Table {_ROMAN[int(table)]}"
 
 
-ITEMS = (
-    Item(name="fig6", title="outcomes of faults in isolated kernels", source=Source.KERNELS),
-    Item(name="fig7", title="faults in each kernel of the flight", preset="fig7"),
-    Item(name="fig8", title="faults in each inter-kernel state", preset="fig8"),
-    Item(name="fig9", title="faults in each field of float64", preset="fig9"),
-    Item(name="fig11", title="ranges of the states' values and of their deltas", preset="fig11"),
-    Item(name="fig12", title="flight time with detection and recovery", preset="table4"),
-    Item(name="fig13", title="trajectories: golden, with a fault, recovered", preset="fig13"),
-    Item(name="fig14", title="worst flight time by protected stages", preset="fig14"),
-    Item(name="fig15", title="flight time with redundant computers", source=Source.MODEL),
-    Item(name="fig16", title="two computing platforms", preset="fig16"),
-    Item(name="table3", title="number of flipped bits", preset="table3"),
-    Item(name="table4", title="success rate in four worlds", preset="table4"),
-    Item(name="table5", title="compute time of detection and recovery", preset="table4"),
-)
-BY_NAME = {item.name: item for item in ITEMS}
+def printed(item: str, *keys: object) -> Printed:
+    """A number that the paper prints, or its words; None if it prints nothing there."""
+    found: Any = _PAPER.get(item, {})
+    for key in keys:
+        found = found.get(str(key)) if isinstance(found, Mapping) else None
+    if found is None or isinstance(found, str):
+        return found
+    return float(found)
 
-LEFT_OUT = {
-    "table1": "compares the speed of injectors at other levels, from the literature",
-    "table2": "compares the features of injectors, from the literature",
-    "fig1": "draws the pipeline",
-    "fig2": "draws the system",
-    "fig3": "plots Table I",
-    "fig4": "draws the framework",
-    "fig5": "draws the injector",
-    "fig10": "draws the detectors",
-}
+
+def _item(name: str, told: Mapping[str, Any]) -> Item:
+    drawn = f"; {told['unprinted']}: drawn only" if "unprinted" in told else ""
+    return Item(
+        name=name,
+        title=told["title"],
+        labels=tuple(told["labels"]),
+        columns=tuple(PaperColumn(**each) for each in told["columns"]),
+        notes=tuple(_PAPER["notes"].get(each, each) for each in told["notes"]),
+        origin=f"paper: {told['source']}{drawn}",
+        preset=told.get("preset", ""),
+        source=Source(told.get("computed_from", "flights")),
+    )
+
+
+ITEMS = tuple(_item(name, told) for name, told in _PAPER.items() if "title" in told)
+BY_NAME = {item.name: item for item in ITEMS}
+LEFT_OUT: Mapping[str, str] = _PAPER["left_out"]
 """Figures and tables of the paper that are no experiment, and why."""
 
 

@@ -1,13 +1,14 @@
 """The layout of each item: from flown missions, or from another source, to the paper's table.
 
 A layout of flights takes the item's missions as `reproduction.flights.beside_golden`. It reads
-configuration and record only, never labels, so that it serves any campaign with such missions.
+configuration and record only, never labels, so that it serves any campaign with such missions. It
+gives the cells of each row; paper.toml has headings, columns and notes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,16 +20,17 @@ from mavfi_cli.analysis.flights import chosen, known, numbers
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.record.run_folder import TRACE
-from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
+from mavfi_cli.report.tables.paper_table import PaperCell, PaperRow, PaperTable
 from mavfi_cli.reproduction.flights import (
     EVERY_STAGE,
     STAGES,
+    by_value,
     comparable,
     faulty,
     golden,
     ratios,
 )
-from mavfi_cli.reproduction.items import BY_NAME
+from mavfi_cli.reproduction.items import BY_NAME, printed
 from mavfi_cli.reproduction.measures import (
     PERCENT,
     increases,
@@ -40,64 +42,58 @@ from mavfi_cli.reproduction.measures import (
     success,
     worst_mean,
 )
-from mavfi_cli.reproduction.paper import printed, source
 from mavfi_cli.stats.shares import Share
 
 DETECTORS = {"gad": "Gaussian", "aad": "autoencoder"}
 WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
-EVERY_MISSION = "success: all flown missions, as in the paper, 95 % Wilson interval"
-MAXIMUM = "worst: longest flight over the golden one of its mission; a maximum has no interval"
-_SUCCESS = PaperColumn(title="success, %", ends=0)
-_TIME = PaperColumn(title="mean time, s")
-_WORST = PaperColumn(title="worst, %", sign=True)
-_ENERGY = PaperColumn(title="mean energy, kJ")
+_GOLDEN = "golden"  # begins the labels of rows of golden flights
 _JOULES = 1e-3  # kJ
+_NOTHING = "nothing flown yet"
 
 
-def _table(
-    name: str,
-    labels: Sequence[str],
-    columns: Sequence[PaperColumn],
-    rows: Sequence[PaperRow],
-    *,
-    result: str,
-    notes: Sequence[str] = (),
-) -> PaperTable:
-    item = BY_NAME[name]
-    return PaperTable(
-        name=name,
-        title=f"{item.paper}: {item.title}",
-        labels=tuple(labels),
-        columns=tuple(columns),
-        rows=tuple(rows),
-        notes=(*notes, source(name)),
-        result=result,
-    )
+def of_flights(name: str, flights: pa.Table) -> PaperTable:
+    """The table of an item that is flown.
+
+    Args:
+        flights: the item's missions, as `reproduction.flights.beside_golden`.
+    """
+    if name in _ONLY_COMPARABLE:
+        flights = comparable(flights)
+    rows = [*OF_FLIGHTS[name](flights)]
+    notes = _unknown_costs(flights) if name == "table5" else []
+    table = BY_NAME[name].table(rows, worlds_of(flights), notes)
+    return replace(table, result=_RESULTS[name](table))
 
 
-def _row(*labels: object, cells: Sequence[PaperCell]) -> PaperRow:
+_ONLY_COMPARABLE = ("fig12", "table4", "table5")  # have no flights with a part of the stages
+
+
+def _row(*labels: object, cells: Iterable[PaperCell]) -> PaperRow:
     return PaperRow(labels=tuple(map(str, labels)), cells=tuple(cells))
 
 
-def _told(cell: PaperCell, column: PaperColumn, unit: str = "") -> str:
+def _told(table: PaperTable, row: PaperRow, place: int, unit: str = " %") -> str:
     """Our number, with the paper's in brackets if it prints one."""
+    column, cell = table.columns[place], row.cells[place]
     paper = column.printed(cell.paper)
     return f"{column.told(cell.value)}{unit}" + (f" (paper {paper}{unit})" if paper else "")
 
 
-def _largest(rows: Sequence[PaperRow], place: int, least: bool = False) -> PaperRow | None:
-    """The row with the largest or the smallest number in a column; None if there is none."""
-    filled = [row for row in rows if not math.isnan(row.cells[place].value)]
-    if not filled:
-        return None
-    return (min if least else max)(filled, key=lambda row: row.cells[place].value)
+def _filled(table: PaperTable, place: int) -> list[PaperRow]:
+    """The rows with a number in a column, the largest first."""
+    rows = [row for row in table.rows if not math.isnan(row.cells[place].value)]
+    return sorted(rows, key=lambda row: -row.cells[place].value)
+
+
+def worlds_of(flights: pa.Table) -> list[str]:
+    """The worlds that were flown, the paper's first."""
+    found = set(flights["world"].to_pylist())
+    return [*(world for world in WORLDS if world in found), *sorted(found - set(WORLDS))]
 
 
 # Faults by place: Figs. 7, 8, 9, Table III ------------------------------------------------------
 
-_EFFECTS = (_SUCCESS, _TIME, _WORST)
-_EFFECT_NOTES = (EVERY_MISSION, MAXIMUM)
 KERNELS_FLOWN = {  # node and planner
     "point cloud": ("point_cloud", "rrtstar"),
     "OctoMap": ("octomap", "rrtstar"),
@@ -110,239 +106,179 @@ KERNELS_FLOWN = {  # node and planner
 _PLANNERS = {"rrtstar": "RRT*", "rrt": "RRT", "rrtconnect": "RRTConnect"}
 
 
-def _golden_row(label: str, table: pa.Table, *more: str) -> PaperRow:
-    cells = [success(table), mean(table, "flight_time_s"), PaperCell()]
-    return _row(label, *more, cells=cells)
+def _effects(flights: pa.Table) -> list[PaperCell]:
+    """Success, mean time, and the longest flight of those with a fault."""
+    longest = maximum(increases(faulty(flights)))
+    return [success(flights), mean(flights, "flight_time_s"), longest]
 
 
-def _struck_row(label: str, flights: pa.Table, *more: str) -> PaperRow:
-    cells = [success(flights), mean(flights, "flight_time_s"), maximum(increases(flights))]
-    return _row(label, *more, cells=cells)
+def _fig7(flights: pa.Table) -> Iterator[PaperRow]:
+    """Faults in each kernel beside the golden flights with the same planner."""
+    groups = {
+        f"{_GOLDEN}, {title}": chosen(golden(flights), planner=name)
+        for name, title in _PLANNERS.items()
+    } | {
+        title: faulty(flights, level="instruction", fault_target=node, planner=planner)
+        for title, (node, planner) in KERNELS_FLOWN.items()
+    }
+    for title, those in groups.items():
+        if those.num_rows:
+            energy = mean(those, "energy_regression_j", scale=_JOULES)
+            yield _row(title, cells=[*_effects(those), energy])
 
 
-def _with_energy(row: PaperRow, flights: pa.Table) -> PaperRow:
-    energy = mean(flights, "energy_regression_j", scale=_JOULES)
-    return replace(row, cells=(*row.cells, energy))
+def _fig7_told(table: PaperTable) -> str:
+    worst = printed("fig7", "worst_increase_percent")
+    lost = printed("fig7", "success_lost_points")
+    return f"{_worst_told(table)}; paper: up to +{worst} % and -{lost} points"
 
 
-def _worst_told(rows: Sequence[PaperRow]) -> str:
+def _by_value(name: str, column: str) -> Callable[[pa.Table], Iterator[PaperRow]]:
+    """Faults by the values of a column, and what the paper says of each."""
+
+    def rows(flights: pa.Table) -> Iterator[PaperRow]:
+        yield _row(_GOLDEN, "", cells=_effects(golden(flights)))
+        for (value,), those in by_value(faulty(flights), column).items():
+            critical = printed(name, "critical", value) or "-"
+            yield _row(value, critical, cells=_effects(those))
+
+    return rows
+
+
+def _worst_told(table: PaperTable) -> str:
     """The row with the longest flight, and the one with the lowest success."""
-    longest, lowest = _largest(rows, 2), _largest(rows, 0, least=True)
-    if longest is None or lowest is None:
-        return "nothing flown yet"
+    struck = [row for row in table.rows if not row.labels[0].startswith(_GOLDEN)]
+    longest = _filled(table, 2)
+    if not longest:
+        return _NOTHING
+    lowest = min(struck, key=lambda row: row.cells[0].value)
     return (
-        f"longest flight {_told(longest.cells[2], _WORST, ' %')} over its own golden one "
-        f"({longest.labels[0]}); lowest success {_told(lowest.cells[0], _SUCCESS, ' %')} "
-        f"({lowest.labels[0]})"
+        f"longest flight {_told(table, longest[0], 2)} over its own golden one "
+        f"({longest[0].labels[0]}); lowest success {_told(table, lowest, 0)} ({lowest.labels[0]})"
     )
 
 
-def _fig7(flights: pa.Table) -> PaperTable:
-    """Faults in each kernel beside the golden flights with the same planner."""
-    bare = {name: chosen(golden(flights), planner=name) for name in _PLANNERS}
-    rows = [
-        _with_energy(_golden_row(f"golden, {_PLANNERS[name]}", table), table)
-        for name, table in bare.items()
-        if table.num_rows
-    ]
-    struck = []
-    for title, (node, planner) in KERNELS_FLOWN.items():
-        hit = faulty(flights, level="instruction", fault_target=node, planner=planner)
-        if hit.num_rows:
-            struck.append(_with_energy(_struck_row(title, hit), hit))
-    worst = printed("fig7", "worst_increase_percent")
-    lost = printed("fig7", "success_lost_points")
-    return _table(
-        "fig7", ["kernel"], [*_EFFECTS, _ENERGY], [*rows, *struck],
-        notes=[*_EFFECT_NOTES, f"paper, planning and control: up to +{worst} %, -{lost} points"],
-        result=f"{_worst_told(struck)}; paper: up to +{worst} % and -{lost} points",
-    )  # fmt: skip
-
-
-def _by_value(name: str, column: str, heading: str, flights: pa.Table) -> PaperTable:
-    """Faults by the values of a column, and what the paper says of each."""
-    bare, struck = golden(flights), faulty(flights)
-    values = list(dict.fromkeys(struck[column].to_pylist()))
-    rows = [
-        _struck_row(
-            str(value), chosen(struck, **{column: value}),
-            str(printed(name, "critical", value) or "-"),
-        )
-        for value in values
-    ]  # fmt: skip
-    return _table(
-        name, [heading, "paper: critical"], _EFFECTS,
-        [_golden_row("golden", bare, ""), *rows],
-        notes=_EFFECT_NOTES, result=_worst_told(rows),
-    )  # fmt: skip
-
-
-def _fig8(flights: pa.Table) -> PaperTable:
-    """Faults in each inter-kernel state."""
-    return _by_value("fig8", "fault_target", "state", flights)
-
-
-def _fig9(flights: pa.Table) -> PaperTable:
-    """Faults in each field of float64."""
-    return _by_value("fig9", "fault_field", "field", flights)
-
-
-_QUALITY = {  # the paper's name of a measure, its column, its scale, and its column here
-    "flight_time_s": ("flight_time_s", 1.0, PaperColumn(title="flight time, s")),
-    "distance_m": ("distance_m", 1.0, PaperColumn(title="distance, m")),
-    "energy_kj": ("energy_regression_j", _JOULES, PaperColumn(title="energy, kJ")),
-    "replans": ("replans", 1.0, PaperColumn(title="replans", digits=2)),
+_QUALITY = {  # the paper's name of a measure, its column, and its scale
+    "flight_time_s": ("flight_time_s", 1.0),
+    "distance_m": ("distance_m", 1.0),
+    "energy_kj": ("energy_regression_j", _JOULES),
+    "replans": ("replans", 1.0),
 }
 
 
-def _table3(flights: pa.Table) -> PaperTable:
+def _table3(flights: pa.Table) -> Iterator[PaperRow]:
     """Quality of flight by the number of flipped bits."""
-    struck = faulty(flights)
-    groups = {0: golden(flights)} | {
-        bits: chosen(struck, fault_bits=bits)
-        for bits in sorted(set(struck["fault_bits"].to_pylist()))
-    }
-    rows = []
-    for bits, table in groups.items():
-        cells = [
-            mean(table, column, printed("table3", paper, bits), scale)
-            for paper, (column, scale, _) in _QUALITY.items()
+    groups = {0: golden(flights)}
+    faults = by_value(faulty(flights), "fault_bits")
+    groups |= {bits: faults[bits,] for (bits,) in sorted(faults)}
+    for bits, those in groups.items():
+        means = [
+            mean(those, column, printed("table3", paper, bits), scale)
+            for paper, (column, scale) in _QUALITY.items()
         ]
-        cells.append(success(table, printed("table3", "success_percent", bits)))
-        rows.append(_row("0 (golden)" if bits == 0 else bits, cells=cells))
-    most = rows[-1]
-    return _table(
-        "table3", ["flipped bits"], [*(each[2] for each in _QUALITY.values()), _SUCCESS], rows,
-        notes=[EVERY_MISSION, "means: successful flights, bootstrap interval"],
-        result=f"{most.labels[0]} bits: flight time {_told(most.cells[0], _TIME, ' s')}, "
-        f"success {_told(most.cells[-1], _SUCCESS, ' %')}",
-    )  # fmt: skip
+        won = success(those, printed("table3", "success_percent", bits))
+        yield _row(bits or f"0 ({_GOLDEN})", cells=[*means, won])
+
+
+def _table3_told(table: PaperTable) -> str:
+    most = table.rows[-1]
+    time_s, won = _told(table, most, 0, " s"), _told(table, most, -1)
+    return f"{most.labels[0]} bits: flight time {time_s}, success {won}"
 
 
 # Detection and recovery in four worlds: Table IV, Figs. 12 and 14, Table V -----------------------
 
 
-def worlds_of(flights: pa.Table) -> list[str]:
-    """The worlds that were flown, the paper's first."""
-    found = set(flights["world"].to_pylist())
-    return [*(world for world in WORLDS if world in found), *sorted(found - set(WORLDS))]
-
-
-def _settings(flights: pa.Table) -> dict[str, tuple[str, pa.Table]]:
-    """The paper's four rows: key of the paper's numbers, and flights."""
-    return {
-        "golden": ("golden", golden(flights)),
-        "injection": ("none", faulty(flights)),
-        **{f"{told}-based": (name, faulty(flights, name)) for name, told in DETECTORS.items()},
-    }
-
-
-def _table4(flights: pa.Table) -> PaperTable:
+def _table4(flights: pa.Table) -> Iterator[PaperRow]:
     """Success in each world: golden, with faults, with each detector."""
-    flights = comparable(flights)
-    worlds = worlds_of(flights)
-    rows = [
-        _row(title, cells=[
-            success(chosen(table, world=world), printed("table4", "success_percent", key, world))
-            for world in worlds
-        ])
-        for title, (key, table) in _settings(flights).items()
-    ]  # fmt: skip
-    dense = worlds[-1] if worlds else "no world"
-    told = [f"{row.labels[0]} {_told(row.cells[-1], _SUCCESS, ' %')}" for row in rows if row.cells]
-    return _table(
-        "table4", ["success, %"], [PaperColumn(title=world, ends=0) for world in worlds], rows,
-        notes=[EVERY_MISSION], result=f"{dense}: {', '.join(told)}",
-    )  # fmt: skip
+    settings = [(_GOLDEN, "golden", golden(flights)), ("injection", "none", faulty(flights))]
+    settings += [(f"{told}-based", x, faulty(flights, x)) for x, told in DETECTORS.items()]
+    for title, key, those in settings:
+        cells = (
+            success(chosen(those, world=world), printed("table4", "success_percent", key, world))
+            for world in worlds_of(flights)
+        )
+        yield _row(title, cells=cells)
 
 
-def _fig12(flights: pa.Table) -> PaperTable:
+def _table4_told(table: PaperTable) -> str:
+    world = table.columns[-1].title if table.columns else "no world"
+    told = (f"{row.labels[0]} {_told(table, row, -1)}" for row in table.rows if row.cells)
+    return f"{world}: {', '.join(told)}"
+
+
+def _fig12(flights: pa.Table) -> Iterator[PaperRow]:
     """Worst flight time with faults, and what each detector recovers of it, in points."""
-    flights = comparable(flights)
-    rows = []
     for world in worlds_of(flights):
         here = chosen(flights, world=world)
         bare, struck = golden(here), faulty(here)
         increase = printed("fig12", "worst_increase_percent", world)
-        rows.append(_row(world, cells=[
+        saved = (
+            recovered(
+                faulty(here, name),
+                printed("fig12", "recovered_points", name, world),
+                lambda case: case.recovered,
+            )
+            for name in DETECTORS
+        )
+        yield _row(world, cells=[
             mean(bare, "flight_time_s"),
             maximum(increases(struck), increase),
             worst_mean(bare, struck, increase),
-            *(recovered(faulty(here, name), printed("fig12", "recovered_points", name, world),
-                        lambda case: case.recovered) for name in DETECTORS),
-        ]))  # fmt: skip
-    columns = (
-        PaperColumn(title="golden, s"), _WORST,
-        PaperColumn(title="over mean, %", sign=True),
-        PaperColumn(title="GAD, points"), PaperColumn(title="AAD, points"),
-    )  # fmt: skip
-    most = _largest(rows, 1)
-    return _table(
-        "fig12", ["world"], columns, rows,
-        notes=[MAXIMUM, "over mean: the longest flight over the mean golden one",
-               "GAD, AAD: what they recover of the worst of the same faults, in points of the "
-               "golden flight time"],
-        result="nothing flown yet" if most is None else
-        f"worst flight {_told(most.cells[1], _WORST, ' %')} in {most.labels[0]}, GAD recovers "
-        f"{_told(most.cells[3], columns[3])} and AAD {_told(most.cells[4], columns[4])} points",
-    )  # fmt: skip
+            *saved,
+        ])  # fmt: skip
 
 
-def _fig14(flights: pa.Table) -> PaperTable:
+def _fig12_told(table: PaperTable) -> str:
+    if not (worst := _filled(table, 1)):
+        return _NOTHING
+    longest, gad, aad = (_told(table, worst[0], *each) for each in ((1,), (3, ""), (4, "")))
+    world = worst[0].labels[0]
+    return f"worst flight {longest} in {world}, GAD recovers {gad} and AAD {aad} points"
+
+
+def _fig14(flights: pa.Table) -> Iterator[PaperRow]:
     """Share of the worst increase that each detector recovers, by protected stages."""
-    worlds = worlds_of(flights)
-    rows = []
     for detector, told in DETECTORS.items():
         for stages in PROTECTED:
-            cells = [
+            cells = (
                 recovered(
                     faulty(flights, detector, protect=stages, world=world),
                     printed("fig14", "recovered_percent", detector, world, stages),
                     lambda case: case.recovered_share,
                 )
-                for world in worlds
-            ]
-            rows.append(_row(told, stages, cells=cells))
-    column = PaperColumn(title="")
-    protected = [row for row in rows if row.labels[1] == EVERY_STAGE and row.cells]
-    return _table(
-        "fig14", ["recovered, %", "protected stages"],
-        [PaperColumn(title=world) for world in worlds], rows,
-        notes=[MAXIMUM, "recovered: share of the worst increase of the same faults; a dash: they "
-               "prolong no flight"],
-        result="all stages, " + "; ".join(
-            f"{row.labels[0]} recovers {_told(row.cells[0], column, ' %')} in {worlds[0]}"
-            for row in protected
-        ),
-    )  # fmt: skip
+                for world in worlds_of(flights)
+            )
+            yield _row(told, stages, cells=cells)
 
 
-def _table5(flights: pa.Table) -> PaperTable:
+def _fig14_told(table: PaperTable) -> str:
+    protected = [row for row in table.rows if row.labels[1] == EVERY_STAGE and row.cells]
+    return "all stages, " + "; ".join(
+        f"{row.labels[0]} recovers {_told(table, row, 0)} in {table.columns[0].title}"
+        for row in protected
+    )
+
+
+def _table5(flights: pa.Table) -> Iterator[PaperRow]:
     """Shares of the flight time that detection and recovery take."""
-    flights = comparable(flights)
-    worlds = worlds_of(flights)
-    rows = []
     for detector in DETECTORS:
-        watched = {world: faulty(chosen(flights, world=world), detector) for world in worlds}
-        rows += [
-            _row(detector.upper(), title, cells=[
-                mean_cell(PERCENT * _summed(table, columns),
-                          printed("table5", *keys, world))
-                for world, table in watched.items()
-            ])
-            for title, (columns, keys) in _parts(detector).items()
-        ]  # fmt: skip
-    shown = PaperColumn(title="", digits=4)
-    sums = [row for row in rows if row.labels[1] == "sum" and row.cells]
-    return _table(
-        "table5", ["%", "of flight time"],
-        [PaperColumn(title=world, digits=4, ends=2) for world in worlds], rows,
-        notes=["stages: their recovery, simulated time; detection: one check for all stages, "
-               "host time", *_unknown_costs(flights)],
-        result="detection and recovery, " + "; ".join(
-            f"{row.labels[0]} {_told(row.cells[-1], shown, ' %')} in {worlds[-1]}" for row in sums
-        ),
-    )  # fmt: skip
+        for title, (columns, keys) in _parts(detector).items():
+            cells = (
+                mean_cell(
+                    PERCENT * _summed(faulty(flights, detector, world=world), columns),
+                    printed("table5", *keys, world),
+                )
+                for world in worlds_of(flights)
+            )
+            yield _row(detector.upper(), title, cells=cells)
+
+
+def _table5_told(table: PaperTable) -> str:
+    sums = [row for row in table.rows if row.labels[1] == "sum" and row.cells]
+    return "detection and recovery, " + "; ".join(
+        f"{row.labels[0]} {_told(table, row, -1)} in {table.columns[-1].title}" for row in sums
+    )
 
 
 def _unknown_costs(flights: pa.Table) -> list[str]:
@@ -396,32 +332,20 @@ def values_and_deltas(flights: pa.Table) -> dict[str, tuple[FloatArray, FloatArr
     return found
 
 
-def _fig11(flights: pa.Table) -> PaperTable:
+def _fig11(flights: pa.Table) -> Iterator[PaperRow]:
     """Ranges of the values of three states, and of their changes."""
-    rows = []
     for state, (values, deltas) in values_and_deltas(golden(flights)).items():
         spans = [_span(values, 1.0), _span(deltas, 1.0)]
         middle = [_span(values, 0.99), _span(deltas, 0.99)]
-        numbers_shown = [*spans, _reduction(*spans), _reduction(*middle)]
-        paper = [None, None, printed("fig11", "reduction_percent", state), None]
-        rows.append(_row(state, cells=[
-            PaperCell(value=value, count=len(values), paper=each)
-            for value, each in zip(numbers_shown, paper, strict=True)
-        ]))  # fmt: skip
-    columns = (
-        PaperColumn(title="range of values", digits=2),
-        PaperColumn(title="range of deltas", digits=2),
-        PaperColumn(title="reduction, %"),
-        PaperColumn(title="of the middle 99 %, %"),
-    )
-    return _table(
-        "fig11", ["state"], columns, rows,
-        notes=["n: control ticks of error-free flights; values in m, m/s and m/s^2; a range has "
-               "no interval"],
-        result="range reduced by " + ", ".join(
-            f"{_told(row.cells[2], columns[2], ' %')} ({row.labels[0]})" for row in rows
-        ),
-    )  # fmt: skip
+        reduced = [_reduction(*spans), _reduction(*middle)]
+        cells = [PaperCell(value=each, count=len(values)) for each in (*spans, *reduced)]
+        cells[2] = replace(cells[2], paper=printed("fig11", "reduction_percent", state))
+        yield _row(state, cells=cells)
+
+
+def _fig11_told(table: PaperTable) -> str:
+    told = (f"{_told(table, row, 2)} ({row.labels[0]})" for row in table.rows)
+    return f"range reduced by {', '.join(told)}"
 
 
 def _span(values: FloatArray, share: float) -> float:
@@ -436,29 +360,21 @@ def _reduction(values: float, deltas: float) -> float:
     return PERCENT * (1.0 - deltas / values) if values else math.nan
 
 
-def _fig13(flights: pa.Table) -> PaperTable:
+def _fig13(flights: pa.Table) -> Iterator[PaperRow]:
     """The flight that a fault prolongs most, of each stage, and the same with the autoencoder."""
-    rows = []
-    for stage in dict.fromkeys(faulty(flights)["fault_target"].to_pylist()):
-        struck = faulty(flights, fault_target=stage)
-        cells = [
+    for (stage,), struck in by_value(faulty(flights), "fault_target").items():
+        yield _row(stage, cells=[
             maximum(increases(struck), printed("fig13", "increase_percent", stage)),
             maximum(_with(struck, faulty(flights, "aad", fault_target=stage))),
             mean_cell(increases(struck)),
-        ]
-        rows.append(_row(stage, cells=cells))
-    columns = (
-        _WORST,
-        PaperColumn(title="the same with AAD, %", sign=True),
-        PaperColumn(title="mean of all, %", sign=True),
-    )
-    return _table(
-        "fig13", ["fault in"], columns, rows, notes=[MAXIMUM],
-        result="; ".join(
-            f"{row.labels[0]}: {_told(row.cells[0], _WORST, ' %')}, with AAD "
-            f"{_told(row.cells[1], columns[1], ' %')}" for row in rows
-        ) or "nothing flown yet",
-    )  # fmt: skip
+        ])  # fmt: skip
+
+
+def _fig13_told(table: PaperTable) -> str:
+    return "; ".join(
+        f"{row.labels[0]}: {_told(table, row, 0)}, with AAD {_told(table, row, 1)}"
+        for row in table.rows
+    ) or _NOTHING  # fmt: skip
 
 
 def _with(struck: pa.Table, protected: pa.Table) -> FloatArray:
@@ -472,52 +388,48 @@ def _with(struck: pa.Table, protected: pa.Table) -> FloatArray:
 # Platforms: Fig. 16 ------------------------------------------------------------------------------
 
 
-def _fig16(flights: pa.Table) -> PaperTable:
+def _fig16(flights: pa.Table) -> Iterator[PaperRow]:
     """Worst flight time on each platform, and what each detector recovers of it."""
-    rows = []
-    for platform in dict.fromkeys(flights["platform"].to_pylist()):
-        here = chosen(flights, platform=platform)
-        bare, struck = golden(here), faulty(here)
-        rows.append(_row(platform, cells=[
-            mean(bare, "flight_time_s"),
+    for (platform,), here in by_value(flights, "platform").items():
+        struck = faulty(here)
+        saved = (
+            recovered(
+                faulty(here, name),
+                printed("fig16", "recovered_percent", name, platform),
+                lambda case: case.recovered_share,
+            )
+            for name in DETECTORS
+        )
+        yield _row(platform, cells=[
+            mean(golden(here), "flight_time_s"),
             success(struck),
             maximum(ratios(struck), printed("fig16", "worst_ratio", platform)),
-            *(recovered(faulty(here, name), printed("fig16", "recovered_percent", name, platform),
-                        lambda case: case.recovered_share) for name in DETECTORS),
-        ]))  # fmt: skip
-    columns = (
-        PaperColumn(title="golden, s"), PaperColumn(title="success with faults, %"),
-        PaperColumn(title="worst, x own golden", digits=2),
-        PaperColumn(title="GAD recovers, %"), PaperColumn(title="AAD recovers, %"),
-    )  # fmt: skip
-    return _table(
-        "fig16", ["platform"], columns, rows, notes=[MAXIMUM, EVERY_MISSION],
-        result="; ".join(
-            f"{row.labels[0]}: worst x {_told(row.cells[2], columns[2])}, GAD recovers "
-            f"{_told(row.cells[3], columns[3], ' %')}, AAD {_told(row.cells[4], columns[4], ' %')}"
-            for row in rows
-        ) or "nothing flown yet",
-    )  # fmt: skip
+            *saved,
+        ])  # fmt: skip
 
 
-OF_FLIGHTS: Mapping[str, Callable[[pa.Table], PaperTable]] = {
-    "fig7": _fig7, "fig8": _fig8, "fig9": _fig9, "fig11": _fig11, "fig12": _fig12, "fig13": _fig13,
+def _fig16_told(table: PaperTable) -> str:
+    return "; ".join(
+        f"{row.labels[0]}: worst x {_told(table, row, 2, '')}, GAD recovers "
+        f"{_told(table, row, 3)}, AAD {_told(table, row, 4)}"
+        for row in table.rows
+    ) or _NOTHING  # fmt: skip
+
+
+OF_FLIGHTS: Mapping[str, Callable[[pa.Table], Iterator[PaperRow]]] = {
+    "fig7": _fig7, "fig8": _by_value("fig8", "fault_target"),
+    "fig9": _by_value("fig9", "fault_field"), "fig11": _fig11, "fig12": _fig12, "fig13": _fig13,
     "fig14": _fig14, "fig16": _fig16, "table3": _table3, "table4": _table4, "table5": _table5,
 }  # fmt: skip
-
-
-def of_flights(name: str, flights: pa.Table) -> PaperTable:
-    """The table of an item that is flown.
-
-    Args:
-        flights: the item's missions, as `reproduction.flights.beside_golden`.
-    """
-    return OF_FLIGHTS[name](flights)
-
+_RESULTS: Mapping[str, Callable[[PaperTable], str]] = {
+    "fig7": _fig7_told, "fig8": _worst_told, "fig9": _worst_told, "fig11": _fig11_told,
+    "fig12": _fig12_told, "fig13": _fig13_told, "fig14": _fig14_told, "fig16": _fig16_told,
+    "table3": _table3_told, "table4": _table4_told, "table5": _table5_told,
+}  # fmt: skip
 
 # Isolated kernels: Fig. 6 ------------------------------------------------------------------------
 
-_OUTCOMES = {"benign": "benign, %", "sdc": "SDC, %", "crash": "crash, %", "hang": "hang, %"}
+_OUTCOMES = ("benign", "sdc", "crash", "hang")
 _PAPER_KERNELS = {"control": "pid"}  # the paper's name where it is another
 
 
@@ -531,18 +443,13 @@ def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
     for kernel in summary["kernels"]:
         name = kernel["kernel"]
         paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(name, name))
-        cells = [
-            share_cell(_share(kernel["outcomes"][outcome]), paper if outcome == "benign" else None)
-            for outcome in _OUTCOMES
-        ]
+        shares = [_share(kernel["outcomes"][outcome]) for outcome in _OUTCOMES]
+        cells = [share_cell(shares[0], paper), *map(share_cell, shares[1:])]
         rows.append(_row(kernel["title"], cells=cells))
-    most = _largest(rows, 1)
-    return _table(
-        "fig6", ["kernel"], [PaperColumn(title=title) for title in _OUTCOMES.values()], rows,
-        notes=["of the runs in which a bit was flipped, Wilson interval"],
-        result="no runs" if most is None else
-        f"most SDC: {most.labels[0]}, {most.cells[1].value:.1f} % (paper: OctoMap)",
-    )  # fmt: skip
+    table = BY_NAME["fig6"].table(rows)
+    most = _filled(table, 1)
+    told = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""
+    return replace(table, result=f"{told} (paper: OctoMap)" if most else "no runs")
 
 
 def _share(row: Mapping[str, Any]) -> Share:
@@ -559,33 +466,23 @@ def of_model(report: Mapping[str, Any]) -> PaperTable:
     Args:
         report: what `mavfi_cli.vpm.report.report` tells of the paper's vehicles.
     """
-    vehicles = report["vehicles"]
-    schemes = [row["scheme"] for row in vehicles[0]["schemes"]]
+    item, vehicles = BY_NAME["fig15"], report["vehicles"]
+    ratio_of = {
+        (row["scheme"], one["vehicle"]): row["flight_time_ratio"]
+        for one in vehicles
+        for row in one["schemes"]
+    }
     rows = [
-        _row(scheme, cells=[
+        _row(scheme, cells=(
             PaperCell(
-                value=_ratio(one, scheme),
-                paper=printed("fig15", "time_ratio", scheme, one["vehicle"]),
+                value=math.nan if (ratio := ratio_of[scheme, name]) is None else float(ratio),
+                paper=printed("fig15", "time_ratio", scheme, name),
             )
-            for one in vehicles
-        ])
-        for scheme in schemes
+            for name in (column.title for column in item.columns)
+        ))
+        for scheme in dict.fromkeys(scheme for scheme, _ in ratio_of)
     ]  # fmt: skip
-    columns = [PaperColumn(title=one["vehicle"], digits=3) for one in vehicles]
-    told = [
-        f"{column.title} {_told(cell, column)}"
-        for row in rows if row.labels[0] == "tmr"
-        for column, cell in zip(columns, row.cells, strict=True)
-    ]  # fmt: skip
-    return _table(
-        "fig15", ["flight time, x detection"], columns, rows,
-        notes=["an analytic model: no missions, no interval; calibrated so that TMR takes the "
-               "paper's ratio"],
-        result=f"flight time with TMR: x {', x '.join(told)}",
-    )  # fmt: skip
-
-
-def _ratio(vehicle: Mapping[str, Any], scheme: str) -> float:
-    (row,) = [each for each in vehicle["schemes"] if each["scheme"] == scheme]
-    ratio = row["flight_time_ratio"]
-    return math.nan if ratio is None else float(ratio)
+    table = item.table(rows)
+    (tmr,) = (row for row in rows if row.labels[0] == "tmr")
+    told = (f"{x.title} {_told(table, tmr, place, '')}" for place, x in enumerate(table.columns))
+    return replace(table, result=f"flight time with TMR: x {', x '.join(told)}")

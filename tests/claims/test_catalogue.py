@@ -10,9 +10,8 @@ from flown import flights, row
 from mavfi_cli.claims import effects
 from mavfi_cli.claims.catalogue import CLAIMS
 from mavfi_cli.reproduction import items
-from mavfi_cli.reproduction.items import BY_NAME
+from mavfi_cli.reproduction.items import BY_NAME, printed
 from mavfi_cli.reproduction.layouts import WORLDS
-from mavfi_cli.reproduction.paper import printed
 from mavfi_cli.stats.effects import ClaimVerdict, judge
 
 BY_CLAIM = {claim.name: claim for claim in CLAIMS}

@@ -8,9 +8,8 @@ import pytest
 from made_flights import flight, struck, table
 
 from mavfi_cli.reproduction.evidence import model_report
-from mavfi_cli.reproduction.items import ITEMS, Source
+from mavfi_cli.reproduction.items import ITEMS, Source, printed
 from mavfi_cli.reproduction.layouts import OF_FLIGHTS, of_flights, of_kernels, of_model
-from mavfi_cli.reproduction.paper import printed
 
 KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
 
