@@ -18,12 +18,11 @@ import pyarrow.compute as pc
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.claims.sources import STACKS, Evidence
 from mavfi_cli.report.tables.paper_table import PaperTable
-from mavfi_cli.reproduction.evidence import model_report
 from mavfi_cli.reproduction.figures import draw
 from mavfi_cli.reproduction.flights import pooled, ratios
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
-from mavfi_cli.reproduction.missions import key_of, kinds_of
+from mavfi_cli.reproduction.plan import key_of, kinds_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,7 +64,7 @@ def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator
         if item.source is Source.FLIGHTS:
             yield from (_flown_item(item, stack, flights[stack], evidence) for stack in STACKS)
         elif item.source is Source.MODEL:
-            yield _drawn(item, "performance model", of_model(model_report()))
+            yield _drawn(item, "performance model", of_model())
         elif summaries:
             yield from (_drawn(item, "isolated kernels", of_kernels(each)) for each in summaries)
         else:

@@ -159,9 +159,8 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
     from mavfi_cli.core.files import require_output
     from mavfi_cli.report.drawing import PICTURES, write_figure
     from mavfi_cli.report.tables.paper_table import FORMATS
-    from mavfi_cli.reproduction.evidence import item_flights
     from mavfi_cli.reproduction.figures import draw
-    from mavfi_cli.reproduction.status import asked_item, table_of
+    from mavfi_cli.reproduction.status import asked_item, item_flights, table_of
 
     if output is not None:
         require_output(output, PICTURES)

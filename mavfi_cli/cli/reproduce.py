@@ -41,10 +41,10 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.report.tables.paper_table import as_text
-    from mavfi_cli.reproduction.evidence import tables
-    from mavfi_cli.reproduction.flying import FlightsPlan
+    from mavfi_cli.reproduction.flying import reproduce as run
     from mavfi_cli.reproduction.items import items_named
-    from mavfi_cli.reproduction.reproduce import reproduce as run
+    from mavfi_cli.reproduction.plan import FlightsPlan
+    from mavfi_cli.reproduction.status import tables
 
     plan = FlightsPlan(
         items=items_named(names),

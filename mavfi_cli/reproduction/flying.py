@@ -1,52 +1,31 @@
-"""Flies the missions that items need into one folder for each stack, and tells the cost before."""
+"""Flies the missions that items need and runs the kernels of Fig. 6, and tells the cost before."""
 
 from __future__ import annotations
 
-import json
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mavfi_cli.campaigns.begin import check_kinds
 from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
-from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
-from mavfi_cli.campaigns.specification_file import folder_name
-from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.reproduction.items import ITEMS, Item
-from mavfi_cli.reproduction.missions import (
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.reproduction.items import ITEMS, Source
+from mavfi_cli.reproduction.kernels import PAPER_RUNS, KernelRuns
+from mavfi_cli.reproduction.plan import (
+    FlightsPlan,
     kept_keys,
-    key_of,
     kinds_of,
     missions_of,
     numbers_of,
+    stored_plan,
 )
 
-OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
-_META = "reproduction"  # key of the ledger's `meta`
 _MEASURED = 12  # missions that are flown before the forecast
 _RUN_BYTES = 2_000_000  # of a kept run folder, until one is there
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlightsPlan:
-    """The flights of items on one stack.
-
-    Attributes:
-        scale: fraction of the paper's number of missions.
-        out: folder of all reproductions; each stack has its own folder in it.
-    """
-
-    items: Sequence[Item]
-    stack: str
-    scale: float = 1.0
-    out: Path = OUT
-
-    @property
-    def folder(self) -> Path:
-        """The folder of the flights."""
-        return self.out / folder_name(self.stack)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,44 +50,60 @@ class Forecast:
     runs: int = 0
 
 
-def fly_items(
+def reproduce(
     plan: FlightsPlan,
     options: Options,
     spectator: Spectator,
     on_forecast: Callable[[Forecast], None],
 ) -> None:
-    """Fly the missions of the items that the folder lacks.
+    """Fly the missions of the items that the folder lacks, and run the kernels for Fig. 6.
 
     Args:
-        on_forecast: hears what is left before it is flown, after a few missions are measured.
+        on_forecast: hears what is left before it begins, after a little of it is measured.
 
     Raises:
         ConfigError: the folder holds another stack, more missions, or another campaign.
-        MavfiError: as `run_campaign`.
+        RecordError: the disk has not enough room.
+        MavfiError: a mission or a kernel cannot be run.
     """
-    with _opened(plan) as ledger:
-        keys = [key_of(each) for each in missions_of(plan.items, plan.stack, plan.scale)]
-        wanted = frozenset(numbers_of(ledger, keys))
-        kept = frozenset(numbers_of(ledger, kept_keys(ITEMS, plan.stack, plan.scale)))
-        options = replace(options, only=wanted, kept=kept)
-        missing = _missing(ledger, wanted)
-        if len(wanted) - len(missing) < _MEASURED and len(missing) > _MEASURED:
-            spectator.on_note(f"measuring {_MEASURED} missions")
-            fly_missing(ledger, replace(options, only=_spread(missing, ledger)), Spectator())
-            missing = _missing(ledger, wanted)
-        on_forecast(_forecast(ledger, wanted, missing, options))
-        fly_missing(ledger, options, spectator)
+    jobs = options.jobs or len(os.sched_getaffinity(0))
+    kernels = KernelRuns(out=plan.out, runs=max(1, round(PAPER_RUNS * plan.scale)), jobs=jobs)
+    left = Forecast(jobs=jobs)
+    if any(item.source is Source.KERNELS for item in plan.items) and (runs := kernels.missing()):
+        spectator.on_note("measuring a few runs of a kernel")
+        seconds = kernels.forecast_s()
+        left = replace(left, runs=runs, seconds=seconds, disk_bytes=kernels.disk_bytes)
+    if any(item.preset for item in plan.items):
+        with _opened(plan) as ledger:
+            kept = numbers_of(ledger, kept_keys(ITEMS, plan.stack, plan.scale))
+            wanted = frozenset(numbers_of(ledger, plan.keys()))
+            options = replace(options, only=wanted, kept=frozenset(kept))
+            _measure(ledger, wanted, options, spectator)
+            whole = _with_flights(left, ledger, wanted, options)
+            on_forecast(whole)
+            _require_room(plan.out, whole)
+            fly_missing(ledger, options, _Ahead(spectator, left.seconds))
+    else:
+        on_forecast(left)
+        _require_room(plan.out, left)
+    if left.runs:
+        kernels.run(spectator, left.seconds)
 
 
-def stored_plan(ledger: Ledger) -> FlightsPlan | None:
-    """The plan with which a reproduction was begun, for all items; None of another campaign."""
-    text = ledger.meta(_META)
-    if text is None:
-        return None
-    stored = json.loads(text)
-    return FlightsPlan(
-        items=ITEMS, stack=stored["stack"], scale=stored["scale"], out=ledger.folder.parent
-    )
+class _Ahead(Spectator):
+    """Passes everything on; the time left includes what follows the missions."""
+
+    def __init__(self, spectator: Spectator, beyond_s: float) -> None:
+        self._spectator, self._beyond_s = spectator, beyond_s
+
+    def on_progress(self, progress: Progress) -> None:
+        self._spectator.on_progress(replace(progress, beyond_s=self._beyond_s))
+
+    def on_end(self, progress: Progress) -> None:
+        self._spectator.on_end(progress)
+
+    def on_note(self, text: str) -> None:
+        self._spectator.on_note(text)
 
 
 def _opened(plan: FlightsPlan) -> Ledger:
@@ -121,8 +116,7 @@ def _opened(plan: FlightsPlan) -> Ledger:
     ledger = Ledger(plan.folder, writing=True)
     try:
         require_unchanged(ledger)
-        asked = {"stack": plan.stack, "scale": plan.scale}
-        ledger.set_meta({"name": plan.folder.name, _META: json.dumps(asked)})
+        ledger.set_meta(plan.meta)
         store_plan(ledger, missions_of(ITEMS, plan.stack, plan.scale), append=True)
     except BaseException:
         ledger.close()
@@ -153,6 +147,16 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> list[int]:
     return [number for number, _, _ in ledger.missing() if number in wanted]
 
 
+def _measure(
+    ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
+) -> None:
+    """Fly a few missions for the forecast, unless enough are over or few are missing."""
+    missing = _missing(ledger, wanted)
+    if len(wanted) - len(missing) < _MEASURED and len(missing) > _MEASURED:
+        spectator.on_note(f"measuring {_MEASURED} missions")
+        fly_missing(ledger, replace(options, only=_spread(missing, ledger)), Spectator())
+
+
 def _spread(missing: Sequence[int], ledger: Ledger) -> frozenset[int]:
     """Missions of as many settings as possible: of the first repetition, evenly."""
     first = missing[: len(ledger.cells())]
@@ -160,26 +164,28 @@ def _spread(missing: Sequence[int], ledger: Ledger) -> frozenset[int]:
     return frozenset(first[::step][:_MEASURED])
 
 
-def _forecast(
-    ledger: Ledger, wanted: frozenset[int], missing: Sequence[int], options: Options
+def _with_flights(
+    forecast: Forecast, ledger: Ledger, wanted: frozenset[int], options: Options
 ) -> Forecast:
+    """A forecast with what the missing missions take beside it."""
+    missing = _missing(ledger, wanted)
     over = sorted(wanted - set(missing))
     flown = list(ledger.results(over[-2000:]))
-    jobs = options.jobs or len(os.sched_getaffinity(0))
     each_s = sum(each.wall_s for each in flown) / len(flown) if flown else 0.0
     losses = sum(each.outcome != "success" for each in flown) / len(flown) if flown else 0.0
     kept = sum(number in options.kept for number in missing)
     rows = sum(path.stat().st_size for path in ledger.folder.glob(f"{LEDGER}*"))
     runs = [each for each in (ledger.folder / RUNS).glob("*") if each.is_dir()]
     run_bytes = _size(runs[-20:]) / len(runs[-20:]) if runs else _RUN_BYTES
-    return Forecast(
+    return replace(
+        forecast,
         missions=len(wanted),
         over=len(over),
-        seconds=len(missing) * each_s / jobs,
-        disk_bytes=len(missing) * rows / max(1, ledger.over())
+        seconds=forecast.seconds + len(missing) * each_s / forecast.jobs,
+        disk_bytes=forecast.disk_bytes
+        + len(missing) * rows / max(1, ledger.over())
         + (kept + losses * len(missing)) * run_bytes,
         measured=len(flown),
-        jobs=jobs,
     )
 
 
@@ -187,3 +193,13 @@ def _size(folders: Sequence[Path]) -> int:
     return sum(
         path.stat().st_size for each in folders for path in each.rglob("*") if path.is_file()
     )
+
+
+def _require_room(out: Path, forecast: Forecast) -> None:
+    place = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
+    free = shutil.disk_usage(place).free
+    if forecast.disk_bytes > free:
+        raise RecordError(
+            f"{out}: needs about {forecast.disk_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB "
+            "are free"
+        )

@@ -14,7 +14,7 @@ from mavfi_cli.campaigns.progress import Spectator, duration
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
 from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise
-from mavfi_cli.reproduction.flying import KERNELS_FOLDER
+from mavfi_cli.reproduction.plan import KERNELS_FOLDER
 
 PAPER_RUNS = 5000  # of each kernel
 _SEED = 1

@@ -1,27 +1,75 @@
-"""A campaign on one screen: what is done, the time left, and one table."""
+"""What a campaign shows of the paper: the tables of its items, and its state on one screen."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.groups import METRICS, Group, groups
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import presets
-from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.errors import RecordError, UnknownName
 from mavfi_cli.report.tables.campaign import SettingColumns
 from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
-from mavfi_cli.reproduction.evidence import items_of_preset, table_of_item
-from mavfi_cli.reproduction.flying import stored_plan
-from mavfi_cli.reproduction.items import ITEMS, Item, items_named
+from mavfi_cli.reproduction.flights import beside_golden, flown_missions
+from mavfi_cli.reproduction.items import ITEMS, Item, Source, items_named
+from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
 from mavfi_cli.reproduction.measures import mean_cell, share_cell
-from mavfi_cli.reproduction.missions import key_of, missions_of, numbers_of
+from mavfi_cli.reproduction.plan import KERNELS_FOLDER, FlightsPlan, numbers_of, stored_plan
 from mavfi_cli.stats.shares import rate
 
 ROWS = 14  # of a table on one screen
 WIDE = 2  # columns of settings on one screen
 SETTINGS = "settings"  # name of the table of a user's own campaign
+
+
+# Items --------------------------------------------------------------------------------------------
+
+
+def item_flights(item: Item, ledger: Ledger) -> pa.Table:
+    """The flights of an item in a campaign: a reproduction, or one with the item's missions."""
+    table, plan = beside_golden(flown_missions(flights(ledger))), stored_plan(ledger)
+    return table if plan is None else _flights_of(item, plan, table)
+
+
+def _flights_of(item: Item, plan: FlightsPlan, table: pa.Table) -> pa.Table:
+    """The flights of an item among those of a reproduction."""
+    keys = pa.array(plan.keys(item), pa.string())
+    return table.filter(pc.is_in(table["changes"], value_set=keys))
+
+
+def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
+    """The table of each item of a plan, from what is there.
+
+    Raises:
+        RecordError: nothing was flown, or the kernels were not run.
+    """
+    table = None
+    for item in plan.items:
+        if item.source is not Source.FLIGHTS:
+            yield _unflown(item, plan.out)
+            continue
+        if table is None:
+            with Ledger(plan.folder) as ledger:
+                table = beside_golden(flown_missions(flights(ledger)))
+        yield of_flights(item.name, _flights_of(item, plan, table))
+
+
+def _unflown(item: Item, out: Path) -> PaperTable:
+    if item.source is Source.MODEL:
+        return of_model()
+    path = out / KERNELS_FOLDER / KERNELS
+    if not path.is_file():
+        raise RecordError(f"{path.parent}: no runs of kernels (mavfi reproduce fig6)")
+    return of_kernels(kernel_summary(path))
 
 
 def _preset_of(ledger: Ledger) -> str | None:
@@ -34,7 +82,8 @@ def _preset_of(ledger: Ledger) -> str | None:
 def item_of(ledger: Ledger) -> Item | None:
     """The paper's item of a campaign; None if the paper has none."""
     preset = _preset_of(ledger)
-    return next(iter(items_of_preset(preset)), None) if preset else None
+    found = [item for item in ITEMS if preset and item.preset == preset]
+    return min(found, key=lambda item: item.name != preset, default=None)
 
 
 def asked_item(ledger: Ledger, name: str | None) -> Item | None:
@@ -56,9 +105,15 @@ def asked_item(ledger: Ledger, name: str | None) -> Item | None:
 
 
 def table_of(ledger: Ledger, item: Item | None = None) -> PaperTable:
-    """The one table of a campaign: the paper's, the items of a reproduction, or the settings."""
+    """The one table of a campaign: an item's, the items of a reproduction, or the settings.
+
+    Raises:
+        RecordError: the kernels were not run.
+    """
+    if item is not None and item.source is not Source.FLIGHTS:
+        return _unflown(item, ledger.folder.parent)
     if item is not None:
-        return table_of_item(item, ledger)
+        return of_flights(item.name, item_flights(item, ledger))
     if stored_plan(ledger) is not None:
         return _progress_table(ledger)
     return _settings_table(ledger)
@@ -110,8 +165,7 @@ def _progress_table(ledger: Ledger) -> PaperTable:
     rows = []
     for item in plan.items:
         if item.preset:
-            keys = map(key_of, missions_of([item], plan.stack, plan.scale))
-            numbers = numbers_of(ledger, keys)
+            numbers = numbers_of(ledger, plan.keys(item))
             done = sum(number in over for number in numbers)
             counts = (float(done), 100.0 * done / len(numbers))
             cells = tuple(PaperCell(value=value, count=len(numbers)) for value in counts)

@@ -10,7 +10,7 @@ from mavfi_cli.claims import items
 from mavfi_cli.claims.sources import STACKS
 from mavfi_cli.reproduction.flights import flown_missions, pooled
 from mavfi_cli.reproduction.items import BY_NAME
-from mavfi_cli.reproduction.missions import kinds_of
+from mavfi_cli.reproduction.plan import kinds_of
 
 FIG13 = BY_NAME["fig13"]
 

@@ -14,11 +14,9 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.reproduction import flying
-from mavfi_cli.reproduction import reproduce as reproducing
-from mavfi_cli.reproduction.evidence import item_flights, table_of_item
-from mavfi_cli.reproduction.flying import FlightsPlan, stored_plan
 from mavfi_cli.reproduction.items import BY_NAME, items_named
-from mavfi_cli.reproduction.missions import missions_of
+from mavfi_cli.reproduction.plan import FlightsPlan, missions_of, stored_plan
+from mavfi_cli.reproduction.status import item_flights, table_of
 from mavfi_cli.spec.mission import MissionConfig
 
 TASK = Options(jobs=2, task="fake_task")
@@ -41,7 +39,7 @@ def plan(out, *names, scale=SCALE, stack="mavbench"):
 def flown(asked, options=TASK, spectator=None):
     """Reproduce; the forecast."""
     told = []
-    reproducing.reproduce(asked, options, spectator or Spectator(), told.append)
+    flying.reproduce(asked, options, spectator or Spectator(), told.append)
     (forecast,) = told
     return forecast
 
@@ -59,7 +57,7 @@ def test_only_the_missions_of_the_named_items_are_flown(tmp_path):
         assert stored_plan(ledger).scale == SCALE
         assert item_flights(BY_NAME["fig9"], ledger).num_rows == 8
         assert item_flights(BY_NAME["table3"], ledger).num_rows == 2  # the golden ones, shared
-        assert table_of_item(BY_NAME["fig9"], ledger).rows[0].cells[0].count == 2
+        assert table_of(ledger, BY_NAME["fig9"]).rows[0].cells[0].count == 2
     more = flown(plan(tmp_path, "table3"))
     assert (more.missions, more.over) == (8, 2)
     assert over(asked) == 14
@@ -154,7 +152,7 @@ def test_other_versions_are_refused(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_told_before_the_flights(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(reproducing.shutil, "disk_usage", lambda place: usage(1000, 1000, 0))
+    monkeypatch.setattr(flying.shutil, "disk_usage", lambda place: usage(1000, 1000, 0))
     with pytest.raises(RecordError, match="GB are free"):
         flown(plan(tmp_path, "fig16"))
     assert over(plan(tmp_path)) == 12

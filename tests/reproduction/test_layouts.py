@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from made_flights import flight, struck, table
 
-from mavfi_cli.reproduction.evidence import model_report
 from mavfi_cli.reproduction.items import ITEMS, Source, printed
 from mavfi_cli.reproduction.layouts import OF_FLIGHTS, of_flights, of_kernels, of_model
 
@@ -191,7 +190,7 @@ def test_fig_6_reads_the_runs_of_kernels():
 
 
 def test_fig_15_is_the_model_calibrated_to_the_paper():
-    found = of_model(model_report())
+    found = of_model()
     for vehicle, ratio in (("airsim", 1.06), ("spark", 1.91)):
         assert cell(found, "tmr", vehicle).paper == ratio
         assert cell(found, "tmr", vehicle).value == pytest.approx(ratio, abs=0.005)

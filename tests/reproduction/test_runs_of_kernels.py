@@ -7,11 +7,11 @@ from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.reproduction import kernels
-from mavfi_cli.reproduction.evidence import tables
-from mavfi_cli.reproduction.flying import FlightsPlan
 from mavfi_cli.reproduction.items import items_named
 from mavfi_cli.reproduction.kernels import KernelRuns
 from mavfi_cli.reproduction.layouts import of_kernels
+from mavfi_cli.reproduction.plan import FlightsPlan
+from mavfi_cli.reproduction.status import tables
 
 RUNS = 6
 

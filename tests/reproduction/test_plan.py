@@ -5,7 +5,7 @@ import pytest
 from mavfi_cli.campaigns.specification_file import load_spec
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.reproduction.items import BY_NAME, ITEMS, LEFT_OUT, Source, items_named
-from mavfi_cli.reproduction.missions import kept_keys, key_of, missions_of
+from mavfi_cli.reproduction.plan import kept_keys, key_of, missions_of
 
 SCALE = 0.02
 WHOLE = missions_of(ITEMS, "mavbench", SCALE)

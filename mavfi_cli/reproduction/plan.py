@@ -1,28 +1,60 @@
-"""The missions of all items as one list, in which missions that items share stand once."""
+"""What a reproduction flies: the missions of its items as one list, each once."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from operator import itemgetter
+from pathlib import Path
 
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaigns.specification import Keep, Spec
-from mavfi_cli.campaigns.specification_file import load_spec
+from mavfi_cli.campaigns.specification_file import folder_name, load_spec
 from mavfi_cli.reproduction.items import ITEMS, Item
 
 Key = str  # the configuration of a mission as text; equal missions have equal keys
+OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
+_META = "reproduction"  # key of the ledger's `meta`
 
 
-def spec_of(item: Item, stack: str, scale: float = 1.0) -> Spec:
-    """The campaign of an item on a stack, at a fraction of the paper's size.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightsPlan:
+    """The flights of items on one stack.
 
-    Raises:
-        ConfigError: the scale leaves nothing.
+    Attributes:
+        scale: fraction of the paper's number of missions.
+        out: folder of all reproductions; each stack has its own folder in it.
     """
-    spec = load_spec(item.preset).scaled(scale)
-    return replace(spec, fixed={**spec.fixed, "stack": stack})
+
+    items: Sequence[Item]
+    stack: str
+    scale: float = 1.0
+    out: Path = OUT
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the flights."""
+        return self.out / folder_name(self.stack)
+
+    @property
+    def meta(self) -> dict[str, str]:
+        """What the ledger of the flights stores of the plan."""
+        asked = {"stack": self.stack, "scale": self.scale}
+        return {"name": self.folder.name, _META: json.dumps(asked)}
+
+    def keys(self, *items: Item) -> list[Key]:
+        """The missions of items of the plan, without any of all of them."""
+        return [key_of(each) for each in missions_of(items or self.items, self.stack, self.scale)]
+
+
+def stored_plan(ledger: Ledger) -> FlightsPlan | None:
+    """The plan with which a reproduction was begun, for all items; None of another campaign."""
+    text = ledger.meta(_META)
+    if text is None:
+        return None
+    return FlightsPlan(items=ITEMS, out=ledger.folder.parent, **json.loads(text))
 
 
 def missions_of(items: Iterable[Item], stack: str, scale: float = 1.0) -> list[PlannedMission]:
@@ -69,10 +101,8 @@ def key_of(mission: PlannedMission) -> Key:
 
 
 def _specs(items: Iterable[Item], stack: str, scale: float) -> list[Spec]:
-    """The campaigns of items, each once, in the order of ITEMS."""
+    """The campaigns of items on a stack, each once, in the order of ITEMS."""
     asked = set(items)
-    first: dict[str, Item] = {}
-    for item in ITEMS:
-        if item in asked and item.preset:
-            first.setdefault(item.preset, item)
-    return [spec_of(item, stack, scale) for item in first.values()]
+    presets = dict.fromkeys(item.preset for item in ITEMS if item in asked and item.preset)
+    specs = (load_spec(preset).scaled(scale) for preset in presets)
+    return [replace(spec, fixed={**spec.fixed, "stack": stack}) for spec in specs]
