@@ -61,6 +61,12 @@ def test_every_node_begins_with_the_same_memory_whoever_lives_beside_it(fork):
     assert first.scope.kernel == "control"
 
 
+def test_the_memory_depends_on_the_values_of_a_setup_not_on_its_objects(fork, setup):
+    again = pickle.loads(pickle.dumps(setup))  # whose strings are other objects
+    alike = replace(setup, node="".join(setup.node))
+    assert memory_of(fork()) == memory_of(fork(again)) == memory_of(fork(alike))
+
+
 @pytest.mark.parametrize(
     ("number", "how"), [(signal.SIGSEGV, "killed by SIGSEGV"), (None, "ended with code 1")]
 )

@@ -17,7 +17,9 @@ import contextlib
 import ctypes
 import functools
 import gc
+import io
 import os
+import pickle
 import select
 import signal
 import socket
@@ -28,11 +30,11 @@ from mavfi_cli.attack.served import ServedProcess, served_process, start_early
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.processes import fork, receive, send
-from mavfi_cli.mission.instruction import PROGRAM
 
 if TYPE_CHECKING:
     from mavfi_cli.attack.kernels.scope import KernelScope
 
+_PROGRAM = "mavfi_cli.mission.instruction.server"
 _REQUEST = b"n"
 _NUMBER = 4  # bytes of a process id or of a wait status
 _SET_CHILD_SUBREAPER, _SET_PTRACER, _ANYBODY = 36, 0x59616D61, -1  # prctl(2)
@@ -46,7 +48,7 @@ _loaded: list[ServedProcess] = []  # the program, once it has loaded
 def start_program() -> None:
     """Start the program of the nodes, because it loads long; it ends with all its users."""
     if not _loaded:
-        start_early(PROGRAM)
+        start_early(_PROGRAM)
 
 
 def load_program() -> ServedProcess:
@@ -56,7 +58,7 @@ def load_program() -> ServedProcess:
         TargetError: it could not start; says why.
     """
     if not _loaded:
-        program = served_process(PROGRAM)
+        program = served_process(_PROGRAM)
         program.begin(None, "node")
         _loaded.append(program)
     return _loaded[0]
@@ -129,7 +131,7 @@ def _forked(setup: Any) -> tuple[socket.socket, socket.socket]:
     """Our ends of the connections to a fresh node and to its guard."""
     ours, theirs = socket.socketpair()
     guard, guarded = socket.socketpair()
-    send(ours, setup)  # before the node receives: a message in pieces leaves other memory behind
+    send(ours, _canonical(setup))  # now, because a message in pieces leaves other memory behind
     with theirs, guarded:
         descriptors = [theirs.fileno(), guarded.fileno()]
         try:
@@ -138,6 +140,15 @@ def _forked(setup: Any) -> tuple[socket.socket, socket.socket]:
             _drop_program()  # it was killed since
             socket.send_fds(load_program().connection, [_REQUEST], descriptors)
     return ours, guard
+
+
+def _canonical(value: Any) -> bytes:
+    """A pickle that is the same for equal values, whether or not their parts are one object."""
+    buffer = io.BytesIO()
+    pickler = pickle.Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL)
+    pickler.fast = True  # without references to what came before
+    pickler.dump(value)
+    return buffer.getvalue()
 
 
 def _drop_program() -> None:

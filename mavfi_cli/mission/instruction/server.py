@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import pickle
 import socket
 import time
 from dataclasses import dataclass
@@ -51,7 +52,7 @@ def _work(ready_ns: int, connection: socket.socket) -> None:
 
     The answer is the node's scope, and whether bytecode has been written since `ready_ns`.
     """
-    setup: Setup = receive(connection)
+    setup: Setup = pickle.loads(receive(connection))
     config = setup.config
     companion = Companion(
         config,
