@@ -24,7 +24,7 @@ from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import memory_pair
 
 COMPANION = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
-_PACKET = dialect.MAVLink_encapsulated_data_message
+_PACKET = dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA
 
 
 def vehicle_ticks(tlog: bytes) -> list[tuple[float, bytes]]:
@@ -55,7 +55,7 @@ def link_cpu_s(ticks: list[tuple[float, bytes]], sent: list[Message], tlog: Path
                     pose = session.state_at(image.stamp_s)
                     if pose is not None:
                         image.depth_frame(pose, hfov_rad=1.5, mount_offset_flu_m=mount)
-                if type(message) is not _PACKET:
+                if type(message).id != _PACKET:
                     session.handle(message)
             session.set_target([1.0, 2.0, 0.3], 0.4, [0.1, 0.2, 0.3])
             link.send(session.tick(stamp_s), stamp_s)

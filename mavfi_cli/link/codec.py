@@ -16,7 +16,7 @@ import hmac
 import re
 import struct
 from collections.abc import Callable, Sequence
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
 _MARKER = re.compile(rb"[\xfd\xfe]")
 _SIGNED = 0x01
 _INCOMPLETE = -1
+_TOLD = ("_header", "_msgbuf", "_crc")  # attributes of a message that its frame tells
 _PACKET = "ENCAPSULATED_DATA"  # half of all messages; its array stays in one piece
 
 _KINDS: dict[int, _Kind] = {}
@@ -184,13 +185,13 @@ class _Kind:
     """
 
     __slots__ = (
-        "_arguments", "_arrays", "_columns", "_texts", "build", "crc_extra", "number", "pack",
-        "size", "unpack_from",
+        "_arrays", "_columns", "_texts", "crc_extra", "number", "pack", "receive", "size",
+        "unpack_from",
     )  # fmt: skip
 
     def __init__(self, cls: Any) -> None:
         layout = struct.Struct(re.sub(r"(\d+)B", r"\1s", cls.unpacker.format))
-        self.build: Callable[..., Message] = cls
+        self.receive: Callable[..., Message] = _received(cls)
         self.number: int = cls.id
         self.crc_extra = bytes([cls.crc_extra])
         self.size: int = layout.size
@@ -199,11 +200,9 @@ class _Kind:
         kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
         names = cls.ordered_fieldnames
         texts = [kinds[name] == "char" for name in names]
-        self._columns = _all_of(
-            attrgetter,
-            [f"_{name}_raw" if text else name for name, text in zip(names, texts, strict=True)],
+        self._columns = _getter(
+            [f"_{name}_raw" if text else name for name, text in zip(names, texts, strict=True)]
         )
-        self._arguments = _all_of(itemgetter, cls.orders)
         self._texts = [place for place, text in enumerate(texts) if text]
         self._arrays = [
             (place, length, kinds[name] == "uint8_t")
@@ -223,26 +222,50 @@ class _Kind:
                 values[place : place + 1] = [bytes(part)] if whole else part
         return self.pack(*values).rstrip(b"\0") or b"\0"
 
-    def message(self, frame: bytes, start: int, length: int) -> Message:
-        """Return the message of a payload. Arrays become lists, and texts lose their padding."""
+    def values(self, frame: bytes, start: int, length: int) -> Sequence[Any]:
+        """Return the fields of a payload. Arrays become lists, and texts lose their padding."""
         size = self.size
         if length != size:  # a sender cuts zeros off, and a newer one adds fields
             frame, start = frame[start : start + length].ljust(size, b"\0"), 0
-        values: Any = self.unpack_from(frame, start)
-        if self._arrays or self._texts:
-            values = list(values)
-            for place, length, whole in self._arrays:
-                end = place + 1 if whole else place + length
-                values[place:end] = [list(values[place]) if whole else values[place:end]]
-            for place in self._texts:
-                values[place] = values[place].rstrip(b"\0")
-        return self.build(*self._arguments(values))
+        unpacked = self.unpack_from(frame, start)
+        if not (self._arrays or self._texts):
+            return unpacked
+        values = list(unpacked)
+        for place, length, whole in self._arrays:
+            end = place + 1 if whole else place + length
+            values[place:end] = [list(values[place]) if whole else values[place:end]]
+        for place in self._texts:
+            values[place] = values[place].rstrip(b"\0")
+        return values
 
 
-def _all_of(getter: Callable[..., Any], keys: Sequence[Any]) -> Callable[[Any], Sequence[Any]]:
-    """Return the getter of these keys, which returns a sequence for a single key, too."""
-    get: Callable[[Any], Any] = getter(*keys)
-    return get if len(keys) > 1 else lambda source: (get(source),)
+def _getter(names: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
+    """Return a function from an object to its attributes, which may also be a single one."""
+    get: Callable[[Any], Any] = attrgetter(*names)
+    return get if len(names) > 1 else lambda source: (get(source),)
+
+
+def _received(cls: Any) -> Any:
+    """Return a subclass for received messages, which differs in its constructor only.
+
+    The constructor takes _TOLD and the fields in the order of the wire. It is generated, as those
+    of dataclasses are. With pymavlink's, a frame takes a third longer to decode, because each
+    message then begins with an empty header and attributes that are equal in the whole class.
+    """
+    kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
+    blank = vars(cls(*(b"" if kind == "char" else 0 for kind in cls.fieldtypes)))
+    lines = [f"self.{name} = {name}" for name in _TOLD]
+    for name in cls.ordered_fieldnames:
+        if kinds[name] == "char":
+            lines.append(f"self._{name}_raw = {name}")
+            lines.append(f"self.{name} = {name}.split(b'\\0', 1)[0].decode('ascii', 'replace')")
+        else:
+            lines.append(f"self.{name} = {name}")
+    defined: dict[str, Any] = {}
+    arguments = ", ".join(["self", *_TOLD, *cls.ordered_fieldnames])
+    exec(f"def __init__({arguments}):\n    " + "\n    ".join(lines), defined)
+    constants = {name: blank[name] for name in blank if name[0] == "_" and name not in _TOLD}
+    return type(cls.__name__, (cls,), {**constants, "__init__": defined["__init__"]})
 
 
 def _kind(message_id: int) -> _Kind | None:
@@ -366,11 +389,8 @@ class Codec:
         if self._signing and not self._signing.accept(frame, header, number, signed=flags != 0):
             self.refused += 1
             return True
-        message = kind.message(frame, header, length)
-        head = message._header
-        head.mlen, head.incompat_flags, head.compat_flags = length, flags, compat
-        head.seq, head.srcSystem, head.srcComponent = sequence, system, component
-        message._msgbuf, message._crc = frame, crc
+        head = dialect.MAVLink_header(number, flags, compat, length, sequence, system, component)
+        message = kind.receive(head, frame, crc, *kind.values(frame, header, length))
         if flags and self._signing is not None:
             message._signed = True
             message._link_id = frame[-SIGNATURE_LENGTH]

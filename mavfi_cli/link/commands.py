@@ -133,7 +133,7 @@ class CommandChannel:
         """Return the commands that are due at `stamp_s`, addressed to `system`."""
         self._now_s = stamp_s
         due = []
-        for lane in self._lanes.values():
+        for lane in filter(None, self._lanes.values()):
             while lane and lane[0].due_s <= stamp_s:
                 ticket = lane[0]
                 if ticket.sent_since_answer < TRIES:

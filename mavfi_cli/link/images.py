@@ -180,7 +180,7 @@ class ImageReceiver:
 
     def feed(self, message: Message) -> list[ImageFrame]:
         """Take a message; the frames that it completes, mostly none, at most a few."""
-        handler = _HANDLERS.get(type(message))
+        handler = _HANDLERS.get(type(message).id)
         return [] if handler is None else handler(self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
@@ -305,12 +305,12 @@ class ImageReceiver:
         self._closed.append(frame.index)
 
 
-_HANDLERS: dict[type, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
-    dialect.MAVLink_encapsulated_data_message: ImageReceiver._packet,
-    dialect.MAVLink_data_transmission_handshake_message: ImageReceiver._handshake,
-    dialect.MAVLink_camera_image_captured_message: ImageReceiver._captured,
-    dialect.MAVLink_camera_information_message: ImageReceiver._field_of_view,
-    dialect.MAVLink_camera_fov_status_message: ImageReceiver._field_of_view,
+_HANDLERS: dict[int, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
+    dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA: ImageReceiver._packet,
+    dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE: ImageReceiver._handshake,
+    dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED: ImageReceiver._captured,
+    dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION: ImageReceiver._field_of_view,
+    dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: ImageReceiver._field_of_view,
 }
 
 

@@ -204,7 +204,7 @@ class OffboardSession:
     def handle(self, message: Message) -> None:
         """Handle a received message. Messages for other receivers are ignored."""
         self.telemetry.handle(message)
-        handler = _HANDLERS.get(type(message))
+        handler = _HANDLERS.get(type(message).id)
         if handler is not None:
             handler(self, message)
 
@@ -465,11 +465,11 @@ _STEPS = {
     Phase.DONE: OffboardSession._ended,
     Phase.FAILED: OffboardSession._ended,
 }
-_HANDLERS: dict[type, Callable[[OffboardSession, Message], None]] = {
-    dialect.MAVLink_command_ack_message: OffboardSession._acknowledged,
-    dialect.MAVLink_heartbeat_message: OffboardSession._heartbeat,
-    dialect.MAVLink_timesync_message: OffboardSession._timesync,
-    dialect.MAVLink_ping_message: OffboardSession._ping,
-    dialect.MAVLink_local_position_ned_system_global_offset_message: OffboardSession._told_origin,
-    dialect.MAVLink_statustext_message: OffboardSession._camera_text,
+_HANDLERS: dict[int, Callable[[OffboardSession, Message], None]] = {
+    dialect.MAVLINK_MSG_ID_COMMAND_ACK: OffboardSession._acknowledged,
+    dialect.MAVLINK_MSG_ID_HEARTBEAT: OffboardSession._heartbeat,
+    dialect.MAVLINK_MSG_ID_TIMESYNC: OffboardSession._timesync,
+    dialect.MAVLINK_MSG_ID_PING: OffboardSession._ping,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET: OffboardSession._told_origin,
+    dialect.MAVLINK_MSG_ID_STATUSTEXT: OffboardSession._camera_text,
 }

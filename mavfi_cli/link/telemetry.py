@@ -183,12 +183,15 @@ class Telemetry:
 
     def handle(self, message: Message) -> None:
         """Handle a message of the autopilot. Others are ignored."""
-        handler = _HANDLERS.get(type(message))
-        if handler is None or message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
+        handler = _HANDLERS.get(type(message).id)
+        if handler is None:
+            return
+        header = message.get_header()
+        if header.srcComponent != dialect.MAV_COMP_ID_AUTOPILOT1:
             return
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._adopt(message)
-        if self.system and message.get_srcSystem() == self.system:
+        if self.system and header.srcSystem == self.system:
             handler(self, message)
 
     def _adopt(self, message: Message) -> None:
@@ -292,14 +295,14 @@ def _name(enum: str, number: int) -> str:
     return f"{enum} {number}" if entry is None else str(entry.name)
 
 
-_HANDLERS: dict[type, Callable[[Telemetry, Message], None]] = {
-    dialect.MAVLink_heartbeat_message: Telemetry._heartbeat,
-    dialect.MAVLink_local_position_ned_message: Telemetry._local_position,
-    dialect.MAVLink_attitude_quaternion_message: Telemetry._attitude_quaternion,
-    dialect.MAVLink_attitude_message: Telemetry._attitude,
-    dialect.MAVLink_sys_status_message: Telemetry._sys_status,
-    dialect.MAVLink_extended_sys_state_message: Telemetry._extended_sys_state,
-    dialect.MAVLink_home_position_message: Telemetry._home,
-    dialect.MAVLink_global_position_int_message: Telemetry._global_position,
-    dialect.MAVLink_statustext_message: Telemetry.take_text,
+_HANDLERS: dict[int, Callable[[Telemetry, Message], None]] = {
+    dialect.MAVLINK_MSG_ID_HEARTBEAT: Telemetry._heartbeat,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Telemetry._local_position,
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Telemetry._attitude_quaternion,
+    dialect.MAVLINK_MSG_ID_ATTITUDE: Telemetry._attitude,
+    dialect.MAVLINK_MSG_ID_SYS_STATUS: Telemetry._sys_status,
+    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Telemetry._extended_sys_state,
+    dialect.MAVLINK_MSG_ID_HOME_POSITION: Telemetry._home,
+    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Telemetry._global_position,
+    dialect.MAVLINK_MSG_ID_STATUSTEXT: Telemetry.take_text,
 }

@@ -56,7 +56,8 @@ class TlogWriter:
     def __init__(self, path: Path, epoch_unix_s: int = EPOCH_UNIX_S) -> None:
         self._path = path
         self._epoch_us = epoch_unix_s * 1_000_000
-        self._pending = bytearray()
+        self._pending: list[bytes] = []
+        self._pending_bytes = 0
         self._whole = 0  # length of the whole records in the file, bytes
         self._flushed_s = 0.0
         self._descriptor: int | None = None
@@ -68,17 +69,20 @@ class TlogWriter:
     def write(self, stamp_s: float, *frames: bytes) -> None:
         """Record frames, sent or received, at a stamp."""
         time_us = self._epoch_us + round(stamp_s * 1e6)
-        self._pending += time_us.to_bytes(8, "big").join([b"", *frames])
+        records = time_us.to_bytes(8, "big").join([b"", *frames])
+        self._pending.append(records)
+        self._pending_bytes += len(records)
         overdue = abs(stamp_s - self._flushed_s) >= _FLUSH_INTERVAL_S
-        if overdue or len(self._pending) >= _FLUSH_BYTES:
+        if overdue or self._pending_bytes >= _FLUSH_BYTES:
             self._flushed_s = stamp_s
             self.flush()
 
     def flush(self) -> None:
         """Write pending records to the file, each whole or not at all."""
-        if self._descriptor is None or not self._pending:
+        data = memoryview(b"".join(self._pending))
+        self._pending, self._pending_bytes = [], 0
+        if self._descriptor is None:
             return
-        data = memoryview(bytes(self._pending))
         written = 0
         try:
             while written < len(data):
@@ -87,13 +91,11 @@ class TlogWriter:
             self._take_back()
             raise self._error(error) from None
         self._whole += written
-        self._pending.clear()
 
     def _take_back(self) -> None:
         """Remove a record that did not fit on the disk, and stop writing."""
         assert self._descriptor is not None
         descriptor, self._descriptor = self._descriptor, None
-        self._pending.clear()
         try:
             os.ftruncate(descriptor, self._whole)
         except OSError:  # a pipe or device cannot be truncated
