@@ -42,9 +42,10 @@ def fly(
     """
     mission = _mission(config, settings)
     if mission.instruction is not None:  # the attacked node loads as long as this process
-        from mavfi_cli.mission.instruction.forked_node import start_program
+        from mavfi_cli.attack.served import start_early
+        from mavfi_cli.mission.instruction import PROGRAM
 
-        start_program()
+        start_early(PROGRAM)
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.run import fly_mission

@@ -25,7 +25,6 @@ from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.specification import Keep, Stop
 from mavfi_cli.campaigns.stopping import BatchLimiter, Entry, Queue
 from mavfi_cli.campaigns.workers import (
-    NODE_TASK,
     TASK,
     AttemptEnd,
     CampaignStopped,
@@ -249,19 +248,12 @@ class _Run:
             )
 
     def _workers(self) -> Workers:
-        options, task = self._options, self._task()
+        options = self._options
         if options.cluster is None:
-            return LocalWorkers(self._jobs, task)
+            return LocalWorkers(self._jobs, options.task)
         from mavfi_cli.campaigns.cluster import Cluster
 
-        return Cluster(options.cluster, options.keep, task)
-
-    def _task(self) -> str:
-        """The module that does the work: another one if nodes are attacked in some mission."""
-        if self._options.task != TASK:
-            return self._options.task
-        changes = (changes for *_, changes in self._ledger.rows())
-        return NODE_TASK if any('"instruction":' in each for each in changes) else TASK
+        return Cluster(options.cluster, options.keep, options.task)
 
     def _fill(self, workers: Workers, asked: Sequence[int]) -> None:
         """Start as many missions as there are free workers."""

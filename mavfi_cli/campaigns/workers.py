@@ -80,7 +80,6 @@ class Workers(ABC):
 
 
 TASK = "mavfi_cli.campaigns.task"
-NODE_TASK = "mavfi_cli.campaigns.node_task"
 _STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import functools
 import json
@@ -10,7 +11,7 @@ import platform as host_platform
 import resource
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -77,8 +78,8 @@ def fly_mission(
     planner = planners.find(config.planner)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
-    injection = _injection(config, out, repeat, for_debugger, launch)
     with (
+        _injection(config, out, repeat, for_debugger, launch) as injection,
         interruptible() as interrupt,
         other_end(config, launch) as (link, vehicle),
     ):
@@ -165,19 +166,21 @@ def _left_behind(vehicle: Vehicle | None, name: str) -> dict[str, Any] | None:
     return told
 
 
+@contextlib.contextmanager
 def _injection(
     config: MissionConfig,
     out: Path,
     repeat: Mapping[str, Any] | None,
     for_debugger: Callable[[int], None] | None,
     launch: StartVehicle,
-) -> NoInjection | None:
-    """Plan the instruction-level fault of a mission, if it has one."""
+) -> Iterator[NoInjection | None]:
+    """Create the instruction-level fault of a mission and start its node's process."""
     if config.instruction is None:
-        return None
+        yield None
+        return
     from mavfi_cli.mission.instruction.injection import injection_of  # loads the debugger
 
-    return injection_of(
+    injection = injection_of(
         config,
         out,
         installed_versions(),
@@ -185,6 +188,10 @@ def _injection(
         repeat=repeat,
         for_debugger=for_debugger,
     )
+    try:
+        yield injection
+    finally:
+        injection.close()
 
 
 def fly_golden(

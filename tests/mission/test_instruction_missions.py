@@ -8,15 +8,21 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.replay import replay
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.sampling import Rule
+from mavfi_cli.mission.briefing import of_config
+from mavfi_cli.mission.instruction import PROGRAM
+from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
@@ -217,3 +223,24 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "runs").glob("farm-5-*")
     assert flown(load_run(folder).folder) == flown(attacked)
+
+
+def test_a_node_that_has_filled_a_cache_is_started_again(short_config):
+    """A program that compiles its modules has another memory than one that finds bytecode."""
+    briefing = of_config(replace(short_config, goal=(20.0, 0.0, 5.0)), np.zeros(3))
+    setup = Setup(config=short_config, briefing=briefing, node="control")
+    restarted = []
+    for compiles in (True, False, False, False):
+        spawned = ServedProcess(PROGRAM)
+        first = spawned.pid
+        if compiles:
+            cache = Path(tracking.__spec__.cached).parent
+            (cache / "added").touch()
+            (cache / "added").unlink()
+        try:
+            assert spawned.begin(setup, "node").kernel == "control"
+            restarted.append(spawned.pid != first)
+        finally:
+            spawned.kill()
+    assert restarted[0]
+    assert not all(restarted)  # tests that run beside this one may fill caches too

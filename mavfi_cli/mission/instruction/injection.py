@@ -7,10 +7,10 @@ they depend on.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import pickle
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,9 +20,11 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import LiveAttack, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
+from mavfi_cli.attack.served import ServedProcess, served_process
 from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import FaultError, RecordError
 from mavfi_cli.core.files import own_digest, write_atomically, writing
 from mavfi_cli.core.seeds import Stream, generator
@@ -31,7 +33,7 @@ from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.thread import TracerThread
-from mavfi_cli.mission.instruction.forked_node import ForkedNode, start_program
+from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
@@ -199,10 +201,12 @@ class _InstructionInjection(NoInjection):
     def __init__(
         self,
         planned: _PlannedFault,
+        spawned: ServedProcess,
         for_debugger: Callable[[int], None] | None = None,
     ) -> None:
         super().__init__()
         self._planned = planned
+        self._spawned = spawned
         self._for_debugger = for_debugger
         self._path: Path | None = None
         self._tracer: TracerThread[LiveAttack] | None = None
@@ -220,18 +224,22 @@ class _InstructionInjection(NoInjection):
             BuildMismatch: the repeated record is of another build.
             TracingForbidden: the operating system refuses.
         """
-        setup = Setup(config=config, briefing=briefing, node=self.node)
-        node = ForkedNode(setup, f"node {self.node}")
-        with contextlib.ExitStack() as undo:
-            undo.callback(node.kill)
-            self._finished = lambda: executor.nodes[self.node].finished
-            if self._planned.recorded is not None:
-                image = Image(node.pid, node.scope.regions)
-                record.require_same_build(self._planned.recorded, image)
-            self._tracer = TracerThread(lambda armed: self._attack(node.pid, node.scope, armed))
-            self._tracer.await_armed()
-            undo.pop_all()
-        executor.isolate(self.node, node.process(patient=self._for_debugger is not None))
+        scope = self._spawned.begin(
+            Setup(config=config, briefing=briefing, node=self.node), f"node {self.node}"
+        )
+        self._finished = lambda: executor.nodes[self.node].finished
+        pid = self._spawned.pid
+        if self._planned.recorded is not None:
+            record.require_same_build(self._planned.recorded, Image(pid, scope.regions))
+        self._tracer = TracerThread(lambda armed: self._attack(pid, scope, armed))
+        self._tracer.await_armed()
+        process = NodeProcess(
+            self._spawned.connection,
+            pid,
+            ending=self._ending,
+            patient=self._for_debugger is not None,
+        )
+        executor.isolate(self.node, process)
 
     def _attack(self, pid: int, scope: KernelScope, armed: Callable[[], None]) -> LiveAttack:
         assert self._path is not None
@@ -251,6 +259,17 @@ class _InstructionInjection(NoInjection):
             self._for_debugger(pid)
         return done
 
+    def _ending(self) -> str | None:
+        """How the node ended, if the tracer was told."""
+        if self._tracer is None:
+            return None
+        ended = self._tracer.result().ended
+        if ended is None:
+            return None
+        if ended.signal is not None:
+            return f"killed by {signal.Signals(ended.signal).name}"
+        return f"ended with code {ended.exit_code}"
+
     def news(self) -> list[str]:
         """The fault as text, once the struck invocation is over."""
         if self._told or self._tracer is None or self._finished() < self._planned.order:
@@ -263,7 +282,15 @@ class _InstructionInjection(NoInjection):
 
     def finish(self) -> dict[str, Any] | None:
         """The record at the end of the mission, without measured times."""
-        return None if self._tracer is None else _in_result(self._tracer.result().record)
+        if self._tracer is None:
+            self._spawned.kill()
+            return None
+        return _in_result(self._tracer.result().record)
+
+    def close(self) -> None:
+        """End the node's process if no executor owns it."""
+        if self._tracer is None:
+            self._spawned.kill()
 
 
 def _in_result(written: Mapping[str, Any]) -> dict[str, Any]:
@@ -297,7 +324,7 @@ def injection_of(
     repeat: Mapping[str, Any] | None = None,
     for_debugger: Callable[[int], None] | None = None,
 ) -> _InstructionInjection:
-    """Plan the instruction-level fault of a mission.
+    """Plan the instruction-level fault of a mission, and start its node's process.
 
     Args:
         out: the folder below which golden runs and profiles are kept.
@@ -314,9 +341,8 @@ def injection_of(
             "an instruction-level fault is drawn from the golden flight, and a foreign autopilot "
             "flies no two alike: leave out --link"
         )
-    start_program()
     if repeat is not None:
         planned = _planned_of(repeat)
     else:
         planned = _plan_fault(config, config.instruction, out, versions, fly_golden)
-    return _InstructionInjection(planned, for_debugger)
+    return _InstructionInjection(planned, served_process(PROGRAM), for_debugger)

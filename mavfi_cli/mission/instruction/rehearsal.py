@@ -15,7 +15,9 @@ import numpy as np
 
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.profile import profile_call, profile_calls, profile_run
+from mavfi_cli.attack.served import served_process
 from mavfi_cli.attack.target import TargetProfile
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.fault import CountedStop
@@ -23,7 +25,7 @@ from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
 from mavfi_cli.fi.tracer.tracee import Tracee
-from mavfi_cli.mission.instruction.forked_node import ForkedNode
+from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.server import Setup
 
 Order = tuple[Any, float]  # input, start stamp
@@ -45,14 +47,14 @@ class Rehearsal:
     def __init__(self, setup: Setup, orders: Sequence[Order], entry: int = 1) -> None:
         self._setup, self._entry = setup, entry
         self._last = orders[-1]
-        self._node = ForkedNode(setup, f"node {setup.node}")
+        self._spawned = served_process(PROGRAM)
         with contextlib.ExitStack() as undo:
             undo.callback(self.close)
-            self.scope_of_node: KernelScope = self._node.scope
-            self._process = self._node.process()
+            self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
+            self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
             for value, start_s in orders[:-1]:
                 self._process.take(self._process.order(setup.node, value, start_s))
-            self._image = Image(self._node.pid, self.scope_of_node.regions)
+            self._image = Image(self._spawned.pid, self.scope_of_node.regions)
             undo.pop_all()
 
     @property
@@ -81,7 +83,7 @@ class Rehearsal:
 
         It runs on the node's own processor: switching between two doubles the time.
         """
-        linux.share_processor(self._node.pid)
+        linux.share_processor(self._spawned.pid)
         node, inner = self._setup.node, self.scope_of_node.inner
         if node == "planner":
             return self._profile_request(rng)
@@ -119,7 +121,7 @@ class Rehearsal:
 
     def close(self) -> None:
         """End the node."""
-        self._node.kill()
+        self._spawned.kill()
 
 
 def profile_invocation(
@@ -152,12 +154,13 @@ def count_entries(setup: Setup, orders: Sequence[Order]) -> list[int]:
     Raises:
         TracingForbidden: the operating system neither counts nor lets us trace.
     """
-    node, counts = ForkedNode(setup, f"node {setup.node}"), []
+    spawned, counts = served_process(PROGRAM), []
     with contextlib.ExitStack() as leaving:
-        leaving.callback(node.kill)
-        address = Image(node.pid, node.scope.regions).address(node.scope.entry)
-        counter = leaving.enter_context(contextlib.closing(EntryCounter(node.pid, address)))
-        process = node.process()
+        leaving.callback(spawned.kill)
+        scope = spawned.begin(setup, f"node {setup.node}")
+        address = Image(spawned.pid, scope.regions).address(scope.entry)
+        counter = leaving.enter_context(contextlib.closing(EntryCounter(spawned.pid, address)))
+        process = NodeProcess(spawned.connection, spawned.pid)
         for value, start_s in orders:
             process.take(process.order(setup.node, value, start_s))
             counts.append(counter.read())
