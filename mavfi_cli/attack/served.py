@@ -21,11 +21,12 @@ from mavfi_cli.fi.tracer import linux
 
 CHANNEL = 3  # file descriptor of the program's end of the socket
 _FILE_CLOCK = 5  # CLOCK_REALTIME_COARSE, which stamps files; `time.time_ns` runs ahead of it
-# It gets no other environment variables, so that its memory does not depend on the shell.
-_KEPT = (
-    "HOME", "LANG", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "PATH", "PYTHONPATH", "VIRTUAL_ENV",
-)  # fmt: skip
+# It gets no other environment variables, so that its memory does not depend on the shell: not on
+# its language, its search path or an activated virtual environment.
+_KEPT = ("HOME", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "PYTHONPATH")
 _FIXED = {
+    "LANG": "C.UTF-8",
+    "PATH": os.defpath,
     "PYTHONHASHSEED": "0",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",

@@ -1,5 +1,8 @@
 """A served program: one that was started early belongs to the next that needs it."""
 
+import os
+from pathlib import Path
+
 import pytest
 
 from mavfi_cli.attack import served
@@ -30,3 +33,20 @@ def test_a_program_that_was_started_early_is_taken_once(started):
     assert len(started) == 1
     assert [served_process(MODULE), served_process(MODULE)] == started
     assert len({each.pid for each in started}) == 2
+
+
+def environment(pid):
+    while not (found := Path(f"/proc/{pid}/environ").read_bytes()):
+        os.sched_yield()  # empty until the program has its own memory
+    return found
+
+
+def test_the_shell_leaves_no_traces_in_a_program(started, monkeypatch):
+    for name, value in (("PATH", "/elsewhere"), ("LANG", "C"), ("VIRTUAL_ENV", "/v"), ("X", "y")):
+        served_process(MODULE)
+        monkeypatch.setenv(name, value)
+    served_process(MODULE)
+    found = {environment(each.pid) for each in started}
+    assert len(started) == 5
+    assert len(found) == 1
+    assert b"PYTHONHASHSEED=0" in found.pop()

@@ -17,6 +17,11 @@ DETECTOR = DetectorConfig(name="gad", protect=("planning", "control"))
 INSTRUCTION = InstructionConfig(target="control", seed=4)
 
 
+@pytest.fixture(autouse=True)
+def _fake_task_is_importable():
+    """These flights are real, and the memory of an attacked node depends on PYTHONPATH."""
+
+
 def record(folder):
     result = json.loads(folder.result.read_text())
     del result["host"]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from click.testing import CliRunner
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.replay import replay
+from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
@@ -27,6 +29,7 @@ from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -225,10 +228,28 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
     assert flown(load_run(folder).folder) == flown(attacked)
 
 
+def test_the_nodes_of_a_pair_get_the_same_bytes(short_config):
+    """The memory of a node depends on them: also on which objects of a message are identical."""
+    briefing = of_config(replace(short_config, goal=(20.0, 0.0, 5.0)), np.zeros(3))
+    protected = replace(
+        short_config,
+        detector=DetectorConfig(name="gad"),
+        instruction=InstructionConfig(target="control", seed=3),
+    )
+    from_a_record = structure(json.loads(json.dumps(short_config.to_dict())), MissionConfig)
+    messages = [
+        pickle.dumps(Setup.of(config, told, "control"))
+        for config in (short_config, protected, from_a_record)
+        for told in (briefing, pickle.loads(pickle.dumps(briefing)))
+    ]
+    assert len(set(messages)) == 1
+    assert pickle.loads(messages[0]).config == short_config
+
+
 def test_a_node_that_has_filled_a_cache_is_started_again(short_config):
     """A program that compiles its modules has another memory than one that finds bytecode."""
     briefing = of_config(replace(short_config, goal=(20.0, 0.0, 5.0)), np.zeros(3))
-    setup = Setup(config=short_config, briefing=briefing, node="control")
+    setup = Setup.of(short_config, briefing, "control")
     restarted = []
     for compiles in (True, False, False, False):
         spawned = ServedProcess(PROGRAM)

@@ -80,7 +80,7 @@ def searching(tmp_path_factory):
     fly_mission(attacked, folder, Watcher())
     (kept,) = folder.glob(".profiles/*/orders.pickle")
     briefing, orders = pickle.loads(kept.read_bytes())
-    return Setup(config=config, briefing=briefing, node="planner"), orders["planner"][:2]
+    return Setup.of(config, briefing, "planner"), orders["planner"][:2]
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def _plan_fault(
     """Draw the fault of a mission and a seed; arguments as for `injection_of`."""
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
-    golden = replace(config, fault=None, instruction=None, detector=None, isolate=())
+    golden = config.golden
     folder = out / CACHE / _key(golden, versions)
 
     def fly() -> tuple[Briefing, dict[str, list[Order]]]:
@@ -79,7 +79,7 @@ def _plan_fault(
         return recorder.briefing, recorder.orders
 
     briefing, all_orders = _kept(folder / "orders.pickle", fly)
-    setup = Setup(config=golden, briefing=briefing, node=node)
+    setup = Setup.of(config, briefing, node)
     orders = all_orders.get(node, [])
     counts = _kept(folder / f"entries-{kernel}.pickle", lambda: count_entries(setup, orders))
     if not counts or not counts[-1]:
@@ -224,9 +224,7 @@ class _InstructionInjection(NoInjection):
             BuildMismatch: the repeated record is of another build.
             TracingForbidden: the operating system refuses.
         """
-        scope = self._spawned.begin(
-            Setup(config=config, briefing=briefing, node=self.node), f"node {self.node}"
-        )
+        scope = self._spawned.begin(Setup.of(config, briefing, self.node), f"node {self.node}")
         self._finished = lambda: executor.nodes[self.node].finished
         pid = self._spawned.pid
         if self._planned.recorded is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 from mavfi_cli.attack.kernels.scope import node_scope
@@ -12,6 +13,7 @@ from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.node_process import serve
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection
+from mavfi_cli.core.config import structure
 from mavfi_cli.core.processes import receive, send
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.core.wall import WallClock
@@ -21,11 +23,29 @@ from mavfi_cli.spec.platform import load_platform
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """The message to the program, which answers with its `KernelScope`."""
+    """The message to the program, which answers with its `KernelScope`.
 
-    config: MissionConfig
+    The memory of the node depends on the bytes of the message. So it has the golden mission, which
+    all missions of a pair share, as text: a pickle tells which objects of a mission are identical.
+
+    Attributes:
+        golden: the mission without fault and protection, as JSON.
+    """
+
+    golden: str
     briefing: Briefing
     node: str
+
+    @classmethod
+    def of(cls, config: MissionConfig, briefing: Briefing, node: str) -> Setup:
+        """The message for a node of a mission."""
+        golden = json.dumps(config.golden.to_dict(), sort_keys=True)
+        return cls(golden=golden, briefing=briefing, node=node)
+
+    @property
+    def config(self) -> MissionConfig:
+        """The golden mission."""
+        return structure(json.loads(self.golden), MissionConfig)
 
 
 def main() -> None:
