@@ -18,13 +18,12 @@ import numpy as np
 from missions import fly
 
 from mavfi_cli.link.codec import Codec, Message, dialect
-from mavfi_cli.link.images import ImageReceiver
+from mavfi_cli.link.images import IMAGE_MESSAGES, ImageReceiver
 from mavfi_cli.link.session import OffboardSession, SessionSettings
 from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import memory_pair
 
 COMPANION = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
-_PACKET = dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA
 
 
 def vehicle_ticks(tlog: bytes) -> list[tuple[float, bytes]]:
@@ -51,12 +50,13 @@ def link_cpu_s(ticks: list[tuple[float, bytes]], sent: list[Message], tlog: Path
     with link.recording(tlog):
         for stamp_s, data in ticks:
             for message in link.messages(data, stamp_s):
+                if type(message).id not in IMAGE_MESSAGES:
+                    session.handle(message)
+                    continue
                 for image in images.feed(message):
                     pose = session.state_at(image.stamp_s)
                     if pose is not None:
                         image.depth_frame(pose, hfov_rad=1.5, mount_offset_flu_m=mount)
-                if type(message).id != _PACKET:
-                    session.handle(message)
             session.set_target([1.0, 2.0, 0.3], 0.4, [0.1, 0.2, 0.3])
             link.send(session.tick(stamp_s), stamp_s)
             vehicle.decode(theirs.receive(0.0))

@@ -137,7 +137,7 @@ class _Assembly:
 
 
 class ImageReceiver:
-    """Assembles frames from messages. Pass every message to `feed`.
+    """Assembles frames from messages.
 
     A lost packet loses only its own frame. A frame whose checksum never matches is dropped.
     Memory is bounded by a few frames of MAX_PIXELS for any input.
@@ -179,9 +179,8 @@ class ImageReceiver:
         return self._lost_before + counted - whole - len(self._open)
 
     def feed(self, message: Message) -> list[ImageFrame]:
-        """Take a message; the frames that it completes, mostly none, at most a few."""
-        handler = _HANDLERS.get(type(message).id)
-        return [] if handler is None else handler(self, message)
+        """Take one of IMAGE_MESSAGES; the frames that it completes, mostly none, at most a few."""
+        return _HANDLERS[type(message).id](self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
         hfov_rad = _hfov_of(message)
@@ -312,6 +311,7 @@ _HANDLERS: dict[int, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
     dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION: ImageReceiver._field_of_view,
     dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: ImageReceiver._field_of_view,
 }
+IMAGE_MESSAGES = frozenset(_HANDLERS)  # ids of the messages that a receiver takes
 
 
 def _shape_of(message: Message) -> _Shape | None:

@@ -31,7 +31,7 @@ from mavfi_cli.core.errors import (
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.images import ImageFrame, ImageReceiver
+from mavfi_cli.link.images import IMAGE_MESSAGES, ImageFrame, ImageReceiver
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.tlog import RecordedLink
@@ -52,7 +52,6 @@ BOOT_S = 300.0  # the same for real firmware, which may boot by the wall clock
 IDLE_S = 0.1  # period of messages to a silent foreign autopilot
 CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
 _POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
-_PACKET = dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
 
@@ -297,13 +296,14 @@ class Flight:
         stamp_ms = None
         with self.wall.measure("link"):
             for message in self.link.messages(data, self.stamp_s):
-                if frames := self.images.feed(message):
-                    self._frames += frames
-                    self._seen_s = self.stamp_s
-                if type(message).id == _PACKET:
-                    continue  # half of all messages, and nothing that the session looks at
+                number = type(message).id
+                if number in IMAGE_MESSAGES:  # most of all
+                    if frames := self.images.feed(message):
+                        self._frames += frames
+                        self._seen_s = self.stamp_s
+                    continue
                 self._session.handle(message)
-                if type(message).id == _POSITION and self._is_autopilot(message):
+                if number == _POSITION and self._is_autopilot(message):
                     stamp_ms = message.time_boot_ms
         return None if stamp_ms is None else stamp_ms / 1e3
 
