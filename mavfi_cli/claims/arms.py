@@ -9,46 +9,21 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.campaigns.missions import canonical
+from mavfi_cli.core.config import read_toml
 from mavfi_cli.stats.paired import holm, mcnemar
 from mavfi_cli.stats.shares import Share, wilson
 
 Row = Mapping[str, Any]  # one flight
-PLAIN = "unprotected"
 _BASE = "mavbench"
-_NAMES = {  # what a variant of mavbench switches
-    "": PLAIN,
-    "refuses_far_waypoints=true": "far waypoints refused",
-    "guards_tracking=true": "tracking guard",
-    "owns_sequence_numbers=false": "numbers that heal",
-    "control_owns_queue=false": "plan sent every tick",
-    "skips_endless_slices=false": "endless slices not skipped",
-    "stretches_clock=false,skips_endless_slices=false": "a follower by time",
-    "position_gain_per_s=0.8,climb_gain_per_s=0.8,integral_gain_per_s2=0.05,damping_gain=0.1":
-        "PID with the gains of hardened",
-    "shifts_path_to_vehicle=false": "path not shifted for the check",
-    "stops_on_report=false,acts_on_report_once=false": "no stop, every report counts",
-    "acts_on_report_once=false": "every report counts",
-    "planner_radius_m=1.1,check_radius_m=0.9": "margins of 1.1 m and 0.9 m",
-    "plans_in_motion=true": "plans in motion",
-    "rejected_plan_pause_s=0.0": "no pause after a rejected plan",
-    "goal_tolerance_m=1.0": "goal within 1 m",
-    "arrives_at_rest=false": "arrives without rest",
-    "turns_before_departure=false": "no turn before departure",
-    "processes=[]": "a process for each node",
-}  # fmt: skip
-_SITES = {
-    "queue.waypoint_position": "position in control's queue",
-    "waypoint_position": "position",
-    "waypoint_duration": "duration",
-    "plan_trajectory_seq": "trajectory_seq",
-    "plan_future_collision_seq": "future_collision_seq",
-}
+_WORDS, _ = read_toml(Path(__file__).parent / "arms.toml")
+PLAIN = _WORDS["stacks"][""]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +92,7 @@ def _arm_of(flight: Row) -> str:
     base, _, changes = flight["stack"].partition(":")
     if base not in (_BASE, f"{_BASE}-protected"):
         return ""
-    name = "all four checks" if base != _BASE else _NAMES.get(changes, changes)
+    name = "all four checks" if base != _BASE else _WORDS["stacks"].get(changes, changes)
     detector = (flight["detector"] or "").upper()
     if not detector:
         return name
@@ -142,6 +117,6 @@ def _by_site(flights: Sequence[Row]) -> dict[str, Share]:
     found: dict[str, list[Row]] = {}
     for each in flights:
         target = str(each["fault_target"])
-        found.setdefault(_SITES.get(target, target), []).append(each)
-    order = dict.fromkeys((*_SITES.values(), *sorted(found)))
+        found.setdefault(_WORDS["sites"].get(target, target), []).append(each)
+    order = dict.fromkeys((*_WORDS["sites"].values(), *sorted(found)))
     return {name: _lost(found[name]) for name in order if name in found}

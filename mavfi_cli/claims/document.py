@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.analysis.kernel_runs import silent_of_all
-from mavfi_cli.campaigns.specification_file import to_toml
 from mavfi_cli.claims.arms import arms
 from mavfi_cli.claims.beyond import (
     BIT_CLASSES,
@@ -27,7 +26,9 @@ from mavfi_cli.claims.effects import Finding, Kernels, protected
 from mavfi_cli.claims.items import shown_items
 from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.core.installed import __version__
+from mavfi_cli.report.paper_figures import draw_strips
 from mavfi_cli.report.tables.paper_table import count_of
+from mavfi_cli.reproduction.figures import OVER_GOLDEN, panel
 from mavfi_cli.reproduction.flights import (
     LONGER,
     beside_golden,
@@ -41,7 +42,7 @@ from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT, printed_name
 from mavfi_cli.stats.effects import ClaimVerdict, excess_over_mean, judge
 from mavfi_cli.stats.shares import Share, wilson
 
-_DETECTORS = (None, "gad", "aad")
+_DETECTORS = {None: "no detector", "gad": "Gaussian", "aad": "autoencoder"}
 _LONGEST = 5  # flights of a campaign that are listed although they succeed
 _ISOLATED = "isolated kernels"
 
@@ -66,13 +67,13 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         "claims": claims,
         "verdicts": {where: _counted(claims, where) for where in (*STACKS, _ISOLATED)},
         "worst": [row for stack in STACKS for row in worst_flights(stack, flights[stack])],
-        "spreads": [row for stack in STACKS for row in _spreads(stack, flights[stack])],
+        "spreads": {stack: _spread(flights[stack]) for stack in STACKS},
         "flows": {stack: kernel_flows(flights[stack], silent) for stack in STACKS},
         "fates": [*Fate],
         "maps": [part for stack in STACKS for part in _matrices(stack, maps[stack])],
         "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
         "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
-        "items": _items(shown_items(evidence, flown)),
+        "items": [*shown_items(evidence, flown)],
         "left_out": {printed_name(name): why for name, why in LEFT_OUT.items()},
         "detectors": ("", "gad", "aad"),
         "upsets_per_hour": upsets_per_hour,
@@ -82,24 +83,10 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
             for each in evidence.campaigns
             if (found := arms(comparable(each.flights)))
         ],
-        "sources": [*map(_source, evidence.campaigns)],
-        "kernel_sources": [
-            {"path": each.path, "summary": each.summary} for each in evidence.kernels
-        ],
+        "sources": evidence.campaigns,
+        "kernel_sources": evidence.kernels,
         "missions": [_worth_a_look(each) for each in evidence.campaigns if each.flights.num_rows],
     }
-
-
-def _items(shown: Iterable[Any]) -> list[dict[str, Any]]:
-    """The paper's tables and figures, each on all stacks."""
-    found: dict[str, dict[str, Any]] = {}
-    for each in shown:
-        told = found.setdefault(each.item.name, {"item": each.item, "shown": [], "missing": []})
-        if each.table is None:
-            told["missing"].append(each.stack)
-        else:
-            told["shown"].append(each)
-    return [*found.values()]
 
 
 def _kernels(evidence: Evidence) -> Kernels:
@@ -258,7 +245,7 @@ def _rate(found: Share) -> str:
 
 def worst_flights(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
     """The longest flights of each setting, paired and unpaired, as the paper may have read them."""
-    faulty = chosen(comparable(flights), struck=True, detector=_DETECTORS)
+    faulty = chosen(comparable(flights), struck=True, detector=(*_DETECTORS,))
     groups = by_value(faulty, "level", "world", "platform", "detector")
     for (*kind, detector), those in sorted(groups.items(), key=_by_detector):
         known = those.filter(pc.is_valid(those["over_own"]))
@@ -282,16 +269,30 @@ def worst_flights(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
 
 def _by_detector(group: tuple[tuple[Any, ...], pa.Table]) -> tuple[Any, ...]:
     (*kind, detector), _ = group
-    return *map(str, kind), _DETECTORS.index(detector)
+    return *map(str, kind), [*_DETECTORS].index(detector)
 
 
-def _spreads(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
+def _spread(flights: pa.Table) -> dict[str, Any] | None:
     """Every flight with a fault in a state over its own golden one, by world and detector."""
-    faulty = chosen(comparable(flights), level="source", platform="x86", struck=True)
-    groups = by_value(faulty, "world", "detector")
-    for world, detector in sorted(groups, key=str):
-        if len(found := ratios(groups[world, detector])):
-            yield {"stack": stack, "world": world, "detector": detector, "ratios": found}
+    hit = chosen(comparable(flights), level="source", platform="x86", struck=True)
+    hit = hit.filter(pc.is_valid(hit["over_own"]))
+    groups = by_value(hit, "world", "detector")
+    places = sorted(groups, key=str)
+    if not places:
+        return None
+    panels = [
+        panel(
+            world,
+            [(told, name, groups.get((world, name), hit[:0])) for name, told in _DETECTORS.items()],
+        )
+        for world in dict.fromkeys(world for world, _ in places)
+    ]
+    rows = [
+        {"world": world, "detector": detector or "", "over_golden": f"{ratio:.4f}"}
+        for world, detector in places
+        for ratio in ratios(groups[world, detector])
+    ]
+    return {"figure": draw_strips(panels, OVER_GOLDEN), "rows": rows}
 
 
 # Where a bit hurts --------------------------------------------------------------------------------
@@ -323,27 +324,7 @@ def _map_rows(stack: str, cells: Sequence[StateCell]) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-# Where it comes from ------------------------------------------------------------------------------
-
-
-def _source(source: CampaignSource) -> dict[str, Any]:
-    spec = source.spec
-    seeds = pc.min_max(source.flights["seed"]).as_py()
-    return {
-        "name": source.name,
-        "path": source.path,
-        "about": spec.about if spec else "",
-        "toml": to_toml(spec) if spec else "",
-        "planned": source.planned,
-        "flown": source.flights.num_rows,
-        "errors": source.errors,
-        "stacks": sorted(pc.unique(source.flights["stack"]).to_pylist()),
-        "seeds": (seeds["min"], seeds["max"]) if source.flights.num_rows else None,
-        "root": spec.seed if spec else None,
-        "versions": source.versions,
-        "host": {name: source.host.get(name) for name in ("machine", "cores", "started")},
-        "digest": source.digest,
-    }
+# Where to look -----------------------------------------------------------------------------------
 
 
 def _worth_a_look(source: CampaignSource) -> dict[str, Any]:

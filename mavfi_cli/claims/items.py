@@ -36,7 +36,7 @@ _FAULTS = ("fault", "instruction")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _ShownItem:
+class _OnStack:
     """A table or figure of the paper, on one stack.
 
     Attributes:
@@ -46,14 +46,31 @@ class _ShownItem:
         flights: the flights in the figure: their setting, and time over that of the golden flight.
     """
 
-    item: Item
     stack: str
     table: PaperTable | None = None
     figure: Figure | None = None
     flights: Sequence[Mapping[str, Any]] = ()
 
 
-def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator[_ShownItem]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShownItem:
+    """A table or figure of the paper, on all stacks."""
+
+    item: Item
+    parts: Sequence[_OnStack]
+
+    @property
+    def shown(self) -> list[_OnStack]:
+        """The stacks that have a table."""
+        return [each for each in self.parts if each.table is not None]
+
+    @property
+    def missing(self) -> list[str]:
+        """The stacks without one."""
+        return [each.stack for each in self.parts if each.table is None]
+
+
+def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator[ShownItem]:
     """Every item on every stack, in the paper's order.
 
     Args:
@@ -62,30 +79,30 @@ def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator
     summaries = [each.summary for each in evidence.kernels]
     for item in ITEMS:
         if item.source is Source.FLIGHTS:
-            yield from (_flown_item(item, stack, flights[stack], evidence) for stack in STACKS)
+            parts = [_flown(item, stack, flights[stack], evidence) for stack in STACKS]
         elif item.source is Source.MODEL:
-            yield _drawn(item, "performance model", of_model())
-        elif summaries:
-            yield from (_drawn(item, "isolated kernels", of_kernels(each)) for each in summaries)
+            parts = [_drawn("performance model", of_model())]
         else:
-            yield _ShownItem(item=item, stack="isolated kernels")
+            parts = [_drawn("isolated kernels", of_kernels(each)) for each in summaries]
+            parts = parts or [_OnStack(stack="isolated kernels")]
+        yield ShownItem(item=item, parts=parts)
 
 
-def _drawn(item: Item, stack: str, table: PaperTable) -> _ShownItem:
-    return _ShownItem(item=item, stack=stack, table=table, figure=draw(table, None, "one"))
+def _drawn(stack: str, table: PaperTable) -> _OnStack:
+    return _OnStack(stack=stack, table=table, figure=draw(table, None, "one"))
 
 
-def _flown_item(item: Item, stack: str, flights: pa.Table, evidence: Evidence) -> _ShownItem:
+def _flown(item: Item, stack: str, flights: pa.Table, evidence: Evidence) -> _OnStack:
     mine = _of_kind(item, stack, flights)
     struck = mine.filter(pc.is_valid(mine["level"])).num_rows
     if not struck and not (mine.num_rows and item.name in _GOLDEN_ONLY):
-        return _ShownItem(item=item, stack=stack)
+        return _OnStack(stack=stack)
     told = of_flights(item.name, mine)
     drawn = _with_runs(item, stack, evidence) if item.name in _NEED_RUNS else mine
     if drawn is None:
-        return _ShownItem(item=item, stack=stack, table=told)
+        return _OnStack(stack=stack, table=told)
     figure = draw(told, drawn, "one")
-    return _ShownItem(item=item, stack=stack, table=told, figure=figure, flights=[*_over_own(mine)])
+    return _OnStack(stack=stack, table=told, figure=figure, flights=[*_over_own(mine)])
 
 
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> pa.Table | None:

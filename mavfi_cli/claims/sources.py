@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import flights, provenance
 from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
@@ -50,6 +51,17 @@ class CampaignSource:
     versions: Mapping[str, str] = field(default_factory=dict)
     host: Mapping[str, Any] = field(default_factory=dict)
     digest: str = ""
+
+    @property
+    def stacks(self) -> list[str]:
+        """The stacks that flew, sorted."""
+        return sorted(pc.unique(self.flights["stack"]).to_pylist())
+
+    @property
+    def seeds(self) -> tuple[int, int] | None:
+        """The smallest and the largest seed of its flights; None without any."""
+        found = pc.min_max(self.flights["seed"]).as_py()
+        return None if found["min"] is None else (found["min"], found["max"])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -38,7 +38,7 @@ from mavfi_cli.reproduction.measures import PERCENT, increases
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_QUANTITY = "flight time over the golden flight of the same mission, %"
+OVER_GOLDEN = "flight time over the golden flight of the same mission, %"
 _Row = tuple[str, str | None, pa.Table]  # of a panel: label, detector, flights
 _STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
 
@@ -59,7 +59,7 @@ def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
     return DRAWN[table.name](flights, columns)
 
 
-def _panel(title: str, rows: Iterable[_Row], paper: float | None = None) -> StripPanel:
+def panel(title: str, rows: Iterable[_Row], paper: float | None = None) -> StripPanel:
     """Distributions of flights over their golden ones.
 
     Args:
@@ -89,14 +89,14 @@ def _fig7(flights: pa.Table, columns: str) -> Figure:
         (title, None, faulty(flights, fault_target=node, planner=planner, level="instruction"))
         for title, (node, planner) in KERNELS_FLOWN.items()
     )
-    return draw_strips([_panel("fault in", rows)], _QUANTITY, columns)
+    return draw_strips([panel("fault in", rows)], OVER_GOLDEN, columns)
 
 
 def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
     def draw_values(flights: pa.Table, columns: str) -> Figure:
         groups = by_value(faulty(flights), column).items()
         rows = ((str(value), None, those) for (value,), those in groups)
-        return draw_strips([_panel("fault in", rows)], _QUANTITY, columns)
+        return draw_strips([panel("fault in", rows)], OVER_GOLDEN, columns)
 
     return draw_values
 
@@ -105,7 +105,7 @@ def _beside_detectors(title: str, flights: pa.Table, paper: float | None) -> Str
     """A row for the flights with faults, and one for those with each detector."""
     rows: list[_Row] = [("fault", None, faulty(flights))]
     rows += [(f"fault, {name.upper()}", name, faulty(flights, name)) for name in DETECTORS]
-    return _panel(title, rows, paper)
+    return panel(title, rows, paper)
 
 
 def _fig12(flights: pa.Table, columns: str) -> Figure:
@@ -118,7 +118,7 @@ def _fig12(flights: pa.Table, columns: str) -> Figure:
         )
         for world in worlds_of(flights)
     ]
-    return draw_strips(panels, _QUANTITY, columns)
+    return draw_strips(panels, OVER_GOLDEN, columns)
 
 
 def _fig14(flights: pa.Table, columns: str) -> Figure:
@@ -131,8 +131,8 @@ def _fig14(flights: pa.Table, columns: str) -> Figure:
             for name in DETECTORS
             for stages in PROTECTED
         ]
-        panels.append(_panel(world, rows))
-    return draw_strips(panels, _QUANTITY, columns)
+        panels.append(panel(world, rows))
+    return draw_strips(panels, OVER_GOLDEN, columns)
 
 
 def _short(stages: str) -> str:
@@ -148,7 +148,7 @@ def _fig16(flights: pa.Table, columns: str) -> Figure:
         ratio = _number("fig16", "worst_ratio", platform)
         worst = None if ratio is None else PERCENT * (ratio - 1.0)
         panels.append(_beside_detectors(platform, here, worst))
-    return draw_strips(panels, _QUANTITY, columns)
+    return draw_strips(panels, OVER_GOLDEN, columns)
 
 
 def _fig11(table: pa.Table, columns: str) -> Figure:

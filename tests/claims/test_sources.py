@@ -172,7 +172,11 @@ def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
     rows.append(row("waypoint_position", seed=7, fault={"field": "sign"}))  # not all components
     found = gather([export("a.parquet", *rows)])
     flights = {stack: found.flights(stack) for stack in STACKS}
-    shown = {(each.item.name, each.stack): each for each in shown_items(found, flights)}
+    shown = {
+        (each.item.name, part.stack): part
+        for each in shown_items(found, flights)
+        for part in each.parts
+    }
     found = shown["fig9", "mavbench"]
     counts = {line.labels[0]: line.cells[0].count for line in found.table.rows}
     assert counts == {"golden": 2, "sign": 2, "mantissa": 2}

@@ -13,16 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, svg
 from mavfi_cli.report.paper_figures import (
     PALETTE,
     SMALLEST,
-    Strip,
-    StripPanel,
-    draw_strips,
     print_axes,
     print_figure,
 )
@@ -32,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LOST = "#b2182b"
-_TITLES = {None: "no detector", "gad": "Gaussian", "aad": "autoencoder"}
 _THEME = {INK: "var(--ink)", NOTE: "var(--note)", GRID: "var(--rule)", "#ffffff": "none",
           PALETTE[0]: "var(--deep)"}  # fmt: skip
 _OWN_ID = re.compile(r' id="[a-z]+[a-z0-9]*_[0-9_]+"')  # figure_1, text_3: not unique in a page
@@ -80,32 +73,6 @@ def inline(figure: Figure) -> str:
     for colour, variable in _THEME.items():
         markup = markup.replace(colour, variable)
     return markup.strip()
-
-
-def spread_chart(stack: str, rows: Sequence[Mapping[str, Any]]) -> Chart:
-    """Every flight with a fault in a state over its own golden flight, a panel a world."""
-    worlds = dict.fromkeys(each["world"] for each in rows)
-    panels = [
-        StripPanel(
-            title=world,
-            strips=[
-                Strip(label=title, values=_increases(rows, world, name), style=style)
-                for style, (name, title) in enumerate(_TITLES.items(), start=1)
-            ],
-        )
-        for world in worlds
-    ]
-    figure = draw_strips(panels, "flight time over the golden flight of the same mission, %")
-    data = [
-        {"world": each["world"], "detector": each["detector"] or "", "over_golden": f"{ratio:.4f}"}
-        for each in rows for ratio in each["ratios"]
-    ]  # fmt: skip
-    return chart(f"states-{stack}", f"Faults in states, {stack}", figure, data)
-
-
-def _increases(rows: Sequence[Mapping[str, Any]], world: str, detector: str | None) -> FloatArray:
-    mine = [x["ratios"] for x in rows if (x["world"], x["detector"]) == (world, detector)]
-    return 100.0 * (np.array([ratio for each in mine for ratio in each]) - 1.0)
 
 
 # Arms, kernels ------------------------------------------------------------------------------------

@@ -8,16 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.campaigns.specification_file import to_toml
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.report.page.charts import (
     Chart,
     arm_chart,
+    chart,
     csv_link,
     data_link,
     flow_chart,
     inline,
-    spread_chart,
 )
 from mavfi_cli.report.tables.paper_table import as_csv, cells_of, count_of
 
@@ -57,7 +58,7 @@ def render(told: Mapping[str, Any]) -> str:
     environment.filters |= {
         "percent": percent, "ends": ends, "effect": effect, "of": count_of, "p": p_value,
         "times": times, "detector": detector, "hourly": hourly, "shade": _shade, "csv": csv_link,
-        "cells": cells_of, "table_csv": lambda table: data_link(as_csv(table)),
+        "cells": cells_of, "table_csv": lambda table: data_link(as_csv(table)), "toml": to_toml,
     }  # fmt: skip
     style = (_FOLDER / "page.css").read_text(encoding="utf-8")
     return environment.get_template("page.html").render(**told, style=style, charts=_charts(told))
@@ -65,22 +66,24 @@ def render(told: Mapping[str, Any]) -> str:
 
 def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
     stacks = told["stacks"]
-    spreads = {s: [each for each in told["spreads"] if each["stack"] == s] for s in stacks}
     return {
         "items": {
-            (each.item.name, each.stack): _item_chart(each)
-            for item in told["items"]
-            for each in item["shown"]
-            if each.figure is not None
+            (each.item.name, part.stack): _item_chart(each.item, part)
+            for each in told["items"]
+            for part in each.shown
+            if part.figure is not None
         },
-        "states": [spread_chart(s, rows) for s, rows in spreads.items() if rows],
+        "states": [
+            chart(f"states-{stack}", f"Faults in states, {stack}", each["figure"], each["rows"])
+            for stack, each in told["spreads"].items()
+            if each
+        ],
         "arms": [arm_chart(each["campaign"], each["arms"]) for each in told["arms"]],
         "flows": [flow_chart(s, told["flows"][s]) for s in stacks if told["flows"][s]],
     }
 
 
-def _item_chart(shown: Any) -> Chart:
-    item = shown.item
+def _item_chart(item: Any, shown: Any) -> Chart:
     rows = shown.flights or None
     link = csv_link(rows) if rows else data_link(as_csv(shown.table))
     name = f"{item.name}-{shown.stack}".replace(" ", "-")

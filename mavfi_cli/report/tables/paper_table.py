@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 from mavfi_cli.report.tables.columns import WIDTH, blocks, csv_text
 from mavfi_cli.stats.shares import Share
@@ -128,32 +129,17 @@ def as_text(table: PaperTable) -> str:
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
-def _in_pairs(table: PaperTable) -> Iterator[str]:
+def _in_pairs(table: PaperTable) -> list[str]:
     """The aligned table, in which the paper's number is never cut off from ours."""
     rows = cells_of(table)
-    labels = len(table.labels) + 1
+    labels = len(table.labels)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    together = [1, *(1 + table.printed_in(place) for place in range(len(table.columns)))]
     joined = []
     for row in rows:
-        merged, place = row[:labels], labels
-        for number in range(len(table.columns)):
-            both = 2 if table.printed_in(number) else 1
-            merged.append("\t".join(row[place : place + both]))
-            place += both
-        joined.append(merged)
-    widths = [
-        [max(len(part) for part in column) for column in zip(*parts, strict=True)]
-        for parts in zip(*[[cell.split("\t") for cell in row] for row in joined], strict=True)
-    ]
-    aligned = [
-        [
-            "  ".join(part.rjust(size) for part, size in zip(cell.split("\t"), sizes, strict=True))
-            if place >= labels - 1
-            else cell
-            for place, (cell, sizes) in enumerate(zip(row, widths, strict=True))
-        ]
-        for row in joined
-    ]
-    yield from blocks(aligned, labels, WIDTH)
+        numbers = map(str.rjust, row[labels:], widths[labels:])
+        joined.append([*row[:labels], *("  ".join(islice(numbers, each)) for each in together)])
+    return blocks(joined, labels + 1, WIDTH)
 
 
 def _as_markdown(table: PaperTable) -> str:
