@@ -53,7 +53,7 @@ class _OnStack:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShownItem:
+class _ShownItem:
     """A table or figure of the paper, on all stacks."""
 
     item: Item
@@ -70,7 +70,7 @@ class ShownItem:
         return [each.stack for each in self.parts if each.table is None]
 
 
-def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator[ShownItem]:
+def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator[_ShownItem]:
     """Every item on every stack, in the paper's order.
 
     Args:
@@ -85,7 +85,7 @@ def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator
         else:
             parts = [_drawn("isolated kernels", of_kernels(each)) for each in summaries]
             parts = parts or [_OnStack(stack="isolated kernels")]
-        yield ShownItem(item=item, parts=parts)
+        yield _ShownItem(item=item, parts=parts)
 
 
 def _drawn(stack: str, table: PaperTable) -> _OnStack:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from mavfi_cli.analysis.flights import flights, provenance
 from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
 from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.campaigns.specification_file import load_spec, presets
 from mavfi_cli.core.errors import MavfiError, RecordError
@@ -156,17 +157,8 @@ def _read(path: Path) -> CampaignSource | _KernelSource:
 
 def _from_ledger(folder: Path) -> CampaignSource:
     with Ledger(folder) as ledger:
-        table, origin = flights(ledger), provenance(ledger)
-        return CampaignSource(
-            path=folder,
-            name=origin["name"] or folder.name,
-            spec=stored_spec(ledger),
-            planned=origin["planned"],
-            flights=flown_missions(table),
-            errors=sum(ledger.errors_by_cell().values()),
-            versions=origin["versions"],
-            host=origin["host"],
-        )
+        table, origin, spec = flights(ledger), provenance(ledger), stored_spec(ledger)
+    return _campaign(folder, origin["name"] or folder.name, spec, table, origin)
 
 
 def _from_export(path: Path) -> CampaignSource:
@@ -176,19 +168,24 @@ def _from_export(path: Path) -> CampaignSource:
         raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
     spec = _spec_beside(path)
     try:
-        flown, origin = flown_missions(table), provenance(table)
+        found = _campaign(path, path.stem, spec, table, provenance(table))
     except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
         raise RecordError(f"{path}: not an export of a campaign ({error})") from None
+    return replace(found, digest=file_digest(path))
+
+
+def _campaign(
+    path: Path, name: str, spec: Spec | None, table: pa.Table, origin: Mapping[str, Any]
+) -> CampaignSource:
     return CampaignSource(
         path=path,
-        name=path.stem,
+        name=name,
         spec=spec,
         planned=origin.get("planned"),
-        flights=flown,
-        errors=table["state"].to_pylist().count("error"),
+        flights=flown_missions(table),
+        errors=table["state"].to_pylist().count(ResultState.ERROR.value),
         versions=origin.get("versions", {}),
         host=origin.get("host", {}),
-        digest=file_digest(path),
     )
 
 

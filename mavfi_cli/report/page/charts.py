@@ -7,9 +7,8 @@ nothing that can fail.
 
 from __future__ import annotations
 
-import base64
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -39,40 +38,23 @@ class Chart:
     Attributes:
         name: of its CSV file, without suffix.
         title: what it shows, in words, also for those who cannot see it.
-        markup: SVG.
-        data: a `data:` link to the CSV.
+        csv: its numbers.
     """
 
     name: str
     title: str
-    markup: str
-    data: str
+    figure: Figure
+    csv: str
 
-
-def chart(name: str, title: str, figure: Figure, rows: Iterable[Mapping[str, Any]]) -> Chart:
-    """A figure and its numbers as a part of the page."""
-    return Chart(name=name, title=title, markup=inline(figure), data=csv_link(rows))
-
-
-def csv_link(rows: Iterable[Mapping[str, Any]]) -> str:
-    """A link that holds rows as CSV."""
-    return data_link(csv_text(rows))
-
-
-def data_link(text: str) -> str:
-    """A link that holds CSV text."""
-    code = base64.b64encode(text.encode()).decode()
-    return f"data:text/csv;charset=utf-8;base64,{code}"
-
-
-def inline(figure: Figure) -> str:
-    """A figure as an SVG element in the page's font and colours."""
-    text = svg(figure)
-    markup = _OWN_ID.sub("", text[text.index("<svg") :])
-    markup = _FONT.sub(r"font-size: \1", markup)
-    for colour, variable in _THEME.items():
-        markup = markup.replace(colour, variable)
-    return markup.strip()
+    @property
+    def markup(self) -> str:
+        """An SVG element in the page's font and colours."""
+        text = svg(self.figure)
+        markup = _OWN_ID.sub("", text[text.index("<svg") :])
+        markup = _FONT.sub(r"font-size: \1", markup)
+        for colour, variable in _THEME.items():
+            markup = markup.replace(colour, variable)
+        return markup.strip()
 
 
 # Arms, kernels ------------------------------------------------------------------------------------
@@ -97,7 +79,8 @@ def arm_chart(campaign: str, arms: Sequence[Any]) -> Chart:
          "high": each.lost.high, "p": "" if each.corrected_p is None else each.corrected_p}
         for each in arms
     ]  # fmt: skip
-    return chart(f"arms-{campaign}", f"Lost missions of each arm of {campaign}", figure, rows)
+    title = f"Lost missions of each arm of {campaign}"
+    return Chart(name=f"arms-{campaign}", title=title, figure=figure, csv=csv_text(rows))
 
 
 _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "#6a4fb3",
@@ -129,4 +112,5 @@ def flow_chart(stack: str, flows: Sequence[Any]) -> Chart:
         {"kernel": each.kernel, "fate": fate.value, "missions": share.total, "lost": share.count}
         for each in flows for fate, share in each.fates.items()
     ]  # fmt: skip
-    return chart(f"kernels-{stack}", f"What struck kernels did, {stack}", figure, rows)
+    title = f"What struck kernels did, {stack}"
+    return Chart(name=f"kernels-{stack}", title=title, figure=figure, csv=csv_text(rows))

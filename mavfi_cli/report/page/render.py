@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import importlib.util
 import math
 from collections.abc import Mapping
@@ -11,15 +12,8 @@ from typing import Any
 from mavfi_cli.campaigns.specification_file import to_toml
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
-from mavfi_cli.report.page.charts import (
-    Chart,
-    arm_chart,
-    chart,
-    csv_link,
-    data_link,
-    flow_chart,
-    inline,
-)
+from mavfi_cli.report.page.charts import Chart, arm_chart, flow_chart
+from mavfi_cli.report.tables.columns import csv_text
 from mavfi_cli.report.tables.paper_table import as_csv, cells_of, count_of
 
 _FOLDER = Path(__file__).parent
@@ -57,8 +51,8 @@ def render(told: Mapping[str, Any]) -> str:
     )  # fmt: skip
     environment.filters |= {
         "percent": percent, "ends": ends, "effect": effect, "of": count_of, "p": p_value,
-        "times": times, "detector": detector, "hourly": hourly, "shade": _shade, "csv": csv_link,
-        "cells": cells_of, "table_csv": lambda table: data_link(as_csv(table)), "toml": to_toml,
+        "times": times, "detector": detector, "hourly": hourly, "shade": _shade, "csv": csv_text,
+        "cells": cells_of, "table_csv": as_csv, "link": _link, "toml": to_toml,
     }  # fmt: skip
     style = (_FOLDER / "page.css").read_text(encoding="utf-8")
     return environment.get_template("page.html").render(**told, style=style, charts=_charts(told))
@@ -74,7 +68,12 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
             if part.figure is not None
         },
         "states": [
-            chart(f"states-{stack}", f"Faults in states, {stack}", each["figure"], each["rows"])
+            Chart(
+                name=f"states-{stack}",
+                title=f"Faults in states, {stack}",
+                figure=each["figure"],
+                csv=csv_text(each["rows"]),
+            )
             for stack, each in told["spreads"].items()
             if each
         ],
@@ -84,13 +83,19 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _item_chart(item: Any, shown: Any) -> Chart:
-    rows = shown.flights or None
-    link = csv_link(rows) if rows else data_link(as_csv(shown.table))
     name = f"{item.name}-{shown.stack}".replace(" ", "-")
     return Chart(
-        name=f"{name}-flights" if rows else name, title=f"{item.paper}, {shown.stack}",
-        markup=inline(shown.figure), data=link,
-    )  # fmt: skip
+        name=f"{name}-flights" if shown.flights else name,
+        title=f"{item.paper}, {shown.stack}",
+        figure=shown.figure,
+        csv=csv_text(shown.flights) if shown.flights else as_csv(shown.table),
+    )
+
+
+def _link(text: str) -> str:
+    """A link that holds CSV text."""
+    code = base64.b64encode(text.encode()).decode()
+    return f"data:text/csv;charset=utf-8;base64,{code}"
 
 
 def _unbroken(value: Any) -> Any:
