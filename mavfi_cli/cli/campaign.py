@@ -166,10 +166,10 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
         require_output(output, PICTURES)
     with Ledger(folder_of(what)) as ledger:
         shown = asked_item(ledger, item)
-        table = table_of(ledger, shown)
+        flights = item_flights(shown, ledger)
+        table = table_of(ledger, shown, flights)
         click.echo(FORMATS[form](table), nl=False)
         if output is not None:
-            flights = None if shown is None else item_flights(shown, ledger)
             write_figure(draw(table, flights, columns), output)
             click.echo(f"figure: {output}", err=True)
 
@@ -326,7 +326,13 @@ def _show(
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.tables.campaign import campaign_lines
     from mavfi_cli.report.tables.paper_table import as_text
-    from mavfi_cli.reproduction.status import item_of, progress_lines, short, table_of
+    from mavfi_cli.reproduction.status import (
+        item_flights,
+        item_of,
+        progress_lines,
+        short,
+        table_of,
+    )
 
     if as_json:
         told = _summary(ledger, by, confidence, more or {})
@@ -339,7 +345,9 @@ def _show(
     if full:
         lines += campaign_lines(_summary(ledger, by, confidence, more or {}))
     else:
-        lines += ["", as_text(short(table_of(ledger, item_of(ledger)))).rstrip()]
+        item = item_of(ledger)
+        table = table_of(ledger, item, item_flights(item, ledger))
+        lines += ["", as_text(short(table)).rstrip()]
     click.echo("\n".join(lines))
 
 

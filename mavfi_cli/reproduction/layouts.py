@@ -216,20 +216,19 @@ def _fig12(flights: pa.Table) -> Iterator[PaperRow]:
         here = chosen(flights, world=world)
         bare, struck = golden(here), faulty(here)
         increase = printed("fig12", "worst_increase_percent", world)
-        saved = (
-            recovered(
-                faulty(here, name),
-                printed("fig12", "recovered_points", name, world),
-                lambda case: case.recovered,
-            )
-            for name in DETECTORS
-        )
         yield _row(world, cells=[
             mean(bare, "flight_time_s"),
             maximum(increases(struck), increase),
             worst_mean(bare, struck, increase),
-            *saved,
+            *_recovered(here, "fig12", "recovered_points", world),
         ])  # fmt: skip
+
+
+def _recovered(flights: pa.Table, item: str, unit: str, place: str) -> Iterator[PaperCell]:
+    """What each detector recovers of the worst flight, beside the paper's numbers in this unit."""
+    measure = "recovered" if unit == "recovered_points" else "recovered_share"
+    for name in DETECTORS:
+        yield recovered(faulty(flights, name), measure, printed(item, unit, name, place))
 
 
 def _fig12_told(table: PaperTable) -> str:
@@ -244,11 +243,12 @@ def _fig14(flights: pa.Table) -> Iterator[PaperRow]:
     """Share of the worst increase that each detector recovers, by protected stages."""
     for detector, told in DETECTORS.items():
         for stages in PROTECTED:
+            paper = ("fig14", "recovered_percent", detector)
             cells = (
                 recovered(
                     faulty(flights, detector, protect=stages, world=world),
-                    printed("fig14", "recovered_percent", detector, world, stages),
-                    lambda case: case.recovered_share,
+                    "recovered_share",
+                    printed(*paper, world, stages),
                 )
                 for world in worlds_of(flights)
             )
@@ -395,19 +395,11 @@ def _fig16(flights: pa.Table) -> Iterator[PaperRow]:
     """Worst flight time on each platform, and what each detector recovers of it."""
     for (platform,), here in by_value(flights, "platform").items():
         struck = faulty(here)
-        saved = (
-            recovered(
-                faulty(here, name),
-                printed("fig16", "recovered_percent", name, platform),
-                lambda case: case.recovered_share,
-            )
-            for name in DETECTORS
-        )
         yield _row(platform, cells=[
             mean(golden(here), "flight_time_s"),
             success(struck),
             maximum(ratios(struck), printed("fig16", "worst_ratio", platform)),
-            *saved,
+            *_recovered(here, "fig16", "recovered_percent", platform),
         ])  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +14,7 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.tables.paper_table import PaperCell, Printed
 from mavfi_cli.reproduction.flights import ratios, share
 from mavfi_cli.stats.bootstrap import interval
-from mavfi_cli.stats.paired import OWN, WorstCase, worst_case
+from mavfi_cli.stats.paired import OWN, worst_case
 from mavfi_cli.stats.shares import Share, rate
 
 PERCENT = 100.0
@@ -78,14 +78,15 @@ def worst_mean(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> Pape
     return PaperCell(value=PERCENT * increase, count=len(times_s), paper=paper)
 
 
-def recovered(
-    protected: pa.Table, paper: Printed, measure: Callable[[WorstCase], float]
-) -> PaperCell:
+def recovered(protected: pa.Table, measure: str, paper: Printed) -> PaperCell:
     """What a protection recovers of the worst case, in per cent or in points.
 
     The worst case is that of the faults that were flown with the protection, too: of more flights
     the longest is longer.
+
+    Args:
+        measure: field of `WorstCase`.
     """
     bare, own = known(numbers(protected, "bare_over_own")), ratios(protected)
-    value = PERCENT * measure(worst_case(OWN, bare.tolist(), own.tolist()))
+    value = PERCENT * getattr(worst_case(OWN, bare.tolist(), own.tolist()), measure)
     return PaperCell(value=value, count=0 if math.isnan(value) else len(own), paper=paper)

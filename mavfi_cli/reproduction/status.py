@@ -34,8 +34,13 @@ SETTINGS = "settings"  # name of the table of a user's own campaign
 # Items --------------------------------------------------------------------------------------------
 
 
-def item_flights(item: Item, ledger: Ledger) -> pa.Table:
-    """The flights of an item in a campaign: a reproduction, or one with the item's missions."""
+def item_flights(item: Item | None, ledger: Ledger) -> pa.Table | None:
+    """The flights of an item in a campaign: a reproduction, or one with the item's missions.
+
+    None if the item is not flown, or if there is none.
+    """
+    if item is None or item.source is not Source.FLIGHTS:
+        return None
     table, plan = beside_golden(flown_missions(flights(ledger))), stored_plan(ledger)
     return table if plan is None else _flights_of(item, plan, table)
 
@@ -104,16 +109,19 @@ def asked_item(ledger: Ledger, name: str | None) -> Item | None:
     return found
 
 
-def table_of(ledger: Ledger, item: Item | None = None) -> PaperTable:
+def table_of(ledger: Ledger, item: Item | None, flights: pa.Table | None) -> PaperTable:
     """The one table of a campaign: an item's, the items of a reproduction, or the settings.
+
+    Args:
+        flights: as `item_flights`.
 
     Raises:
         RecordError: the kernels were not run.
     """
-    if item is not None and item.source is not Source.FLIGHTS:
-        return _unflown(item, ledger.folder.parent)
+    if item is not None and flights is not None:
+        return of_flights(item.name, flights)
     if item is not None:
-        return of_flights(item.name, item_flights(item, ledger))
+        return _unflown(item, ledger.folder.parent)
     if stored_plan(ledger) is not None:
         return _progress_table(ledger)
     return _settings_table(ledger)

@@ -55,9 +55,11 @@ def test_only_the_missions_of_the_named_items_are_flown(tmp_path):
     with Ledger(asked.folder) as ledger:
         assert (ledger.over(), ledger.planned()) == (8, 356)
         assert stored_plan(ledger).scale == SCALE
-        assert item_flights(BY_NAME["fig9"], ledger).num_rows == 8
+        fig9 = BY_NAME["fig9"]
+        assert item_flights(fig9, ledger).num_rows == 8
+        assert item_flights(BY_NAME["fig6"], ledger) is None
         assert item_flights(BY_NAME["table3"], ledger).num_rows == 2  # the golden ones, shared
-        assert table_of(ledger, BY_NAME["fig9"]).rows[0].cells[0].count == 2
+        assert table_of(ledger, fig9, item_flights(fig9, ledger)).rows[0].cells[0].count == 2
     more = flown(plan(tmp_path, "table3"))
     assert (more.missions, more.over) == (8, 2)
     assert over(asked) == 14

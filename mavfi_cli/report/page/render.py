@@ -51,7 +51,7 @@ def render(told: Mapping[str, Any]) -> str:
     )  # fmt: skip
     environment.filters |= {
         "percent": percent, "ends": ends, "effect": effect, "of": count_of, "p": p_value,
-        "times": times, "detector": detector, "hourly": hourly, "shade": _shade, "csv": csv_text,
+        "detector": detector, "hourly": hourly, "shade": _shade, "csv": csv_text,
         "cells": cells_of, "table_csv": as_csv, "link": _link, "toml": to_toml,
     }  # fmt: skip
     style = (_FOLDER / "page.css").read_text(encoding="utf-8")
@@ -107,11 +107,11 @@ def _unbroken(value: Any) -> Any:
 # Numbers as words ---------------------------------------------------------------------------------
 
 
-def percent(value: float | None, digits: int = 0) -> str:
+def percent(value: float | None, digits: int = 0, sign: str = "") -> str:
     """A share of one as per cent."""
     if value is None or not math.isfinite(value):
         return _NONE
-    return f"{100 * value:z.{digits}f} %"
+    return f"{100 * value:{sign}z.{digits}f} %"
 
 
 def ends(share: Any, scale: float = 100.0, digits: int = 0) -> str:
@@ -136,13 +136,6 @@ def p_value(chance: float | None) -> str:
     if chance is None:
         return _NONE
     return "< 0.001" if chance < 0.001 else f"{chance:.2g}"
-
-
-def times(excess: float | None) -> str:
-    """A relative increase with its sign."""
-    if excess is None or not math.isfinite(excess):
-        return _NONE
-    return f"{100 * excess:+z.1f} %"
 
 
 def detector(name: str | None) -> str:
