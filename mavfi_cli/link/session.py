@@ -43,8 +43,10 @@ _LISTEN_S = 1.2  # time in which a second autopilot would send a HEARTBEAT, too
 _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the vehicle itself
 
 
-def _float32(vector: Sequence[float]) -> list[float]:
+def _float32(vector: Sequence[float]) -> Sequence[float]:
     """Return a vector's numbers, or infinity for those beyond float32; NaN stays NaN."""
+    if sum(map(abs, vector)) <= _LARGEST_FLOAT32:
+        return vector
     return [
         math.copysign(math.inf, number) if abs(number) > _LARGEST_FLOAT32 else number
         for number in map(float, vector)

@@ -66,8 +66,10 @@ class FlightLogger:
         if session.phase is not self._phase:
             self._phase = session.phase
             news.append(("phase", session.phase.value))
-        news += [("autopilot", t.text.strip()) for t in session.telemetry.texts.since(self._texts)]
-        self._texts = session.telemetry.texts.total
+        texts = session.telemetry.texts
+        if texts.total > self._texts:
+            news += [("autopilot", each.text.strip()) for each in texts.since(self._texts)]
+            self._texts = texts.total
         news += [("fault", text) for text in injection.news()]
         if companion is not None:
             alarms = companion.protection.news()
