@@ -221,7 +221,7 @@ def _follow_sticks(now: Snapshot, out: Setpoint) -> None:
     x, y, z, r = now.sticks
     value = now.parameters.effective
     forward, right = (_stick(s) * value("MPC_VEL_MANUAL") for s in (x, y))
-    heading_rad = now.euler_rad[2]
+    heading_rad = now.truth.euler_rad[2]
     cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
     out[3] = cosine * forward - sine * right
     out[4] = sine * forward + cosine * right

@@ -283,7 +283,7 @@ def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
     now = autopilot.snapshot
     try:
         if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
-            setpoint = local_setpoint(message, now.euler_rad[2])
+            setpoint = local_setpoint(message, now.truth.euler_rad[2])
         else:
             setpoint = global_setpoint(message, now.origin, float(now.home_ned_m[2]))
     except SetpointRefused as refusal:

@@ -46,8 +46,6 @@ class Snapshot:
     sticks: tuple[int, int, int, int] = (0, 0, 500, 0)  # newest x, y, z, r of MANUAL_CONTROL
     elapsed_s: float = 0.0  # since the tick before
     consumed_mah: float = 0.0
-    _euler: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    _euler_us: int = -1
 
     @property
     def spooled_up(self) -> bool:
@@ -60,22 +58,9 @@ class Snapshot:
         return self.stamp_us // 1000 & 0xFFFFFFFF
 
     @property
-    def euler_rad(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw from north, z-y-x; computed once per tick."""
-        if self._euler_us != self.stamp_us:
-            w, x, y, z = self.truth.quaternion_frd_ned.tolist()
-            self._euler = (
-                math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-                math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))),
-                math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-            )
-            self._euler_us = self.stamp_us
-        return self._euler
-
-    @property
     def heading_deg(self) -> float:
         """Heading from north, 0 to 360 degrees."""
-        return math.degrees(self.euler_rad[2]) % 360.0
+        return math.degrees(self.truth.euler_rad[2]) % 360.0
 
     def geodetic_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Return latitude and longitude of a local point, 1e-7 degrees."""
@@ -122,7 +107,7 @@ def _local_position_ned(s: Snapshot) -> Any:
 
 def _attitude(s: Snapshot) -> Any:
     return dialect.MAVLink_attitude_message(
-        s.boot_ms, *s.euler_rad, *s.truth.rates_frd_radps.tolist()
+        s.boot_ms, *s.truth.euler_rad, *s.truth.rates_frd_radps.tolist()
     )
 
 
@@ -228,7 +213,7 @@ def _position_target_local_ned(s: Snapshot) -> Any:
     )
     sent = [0.0 if math.isnan(value) else value for value in values]
     if math.isnan(values[9]):
-        sent[9] = s.euler_rad[2]
+        sent[9] = s.truth.euler_rad[2]
     return dialect.MAVLink_position_target_local_ned_message(
         s.boot_ms, dialect.MAV_FRAME_LOCAL_NED, mask, *sent
     )

@@ -7,7 +7,6 @@ barometer, magnetometer and GPS itself.
 from __future__ import annotations
 
 import json
-import math
 import socket
 import struct
 import time
@@ -105,20 +104,9 @@ class ArduPilotLink:
             "timestamp": stamp_us * 1e-6,
             "imu": {"gyro": rates.tolist(), "accel_body": force.tolist()},
             "position": truth.position_ned_m.tolist(),
-            "attitude": _euler_rad(truth.quaternion_frd_ned),
+            "attitude": truth.euler_rad,
             "velocity": truth.velocity_ned_mps.tolist(),
             "no_time_sync": 1,
         }
         # ArduPilot finds values by their distance from the key: no space after a colon.
         return b"\n" + json.dumps(state, separators=(",", ":")).encode() + b"\n"
-
-
-def _euler_rad(quaternion_frd_ned: Vector) -> list[float]:
-    """Return roll, pitch and yaw."""
-    w, x, y, z = quaternion_frd_ned.tolist()
-    sine = max(-1.0, min(1.0, 2.0 * (w * y - z * x)))
-    return [
-        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-        math.asin(sine),
-        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-    ]

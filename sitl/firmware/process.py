@@ -11,6 +11,7 @@ import socket
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from mavfi_cli.core.errors import VehicleProcessError
@@ -34,6 +35,19 @@ simulator_mavlink start -c {port}
 _PX4_LINKS = """#!/bin/sh
 mavlink start -x -u {local} -r 4000000 -f -m onboard -o {remote}
 """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirmwareOrder:
+    """What a firmware is started with."""
+
+    binary: Path
+    parameters: Parameters  # those of the vehicle, set before it starts
+    system_id: int  # MAVLink system id, which PX4 is told
+    simulator_port: int  # of the simulator link; PX4's own and the instance number, or ArduPilot's
+    remote_port: int  # UDP port to which it sends MAVLink
+    origin: Origin  # geographic origin of the world
+    heading_deg: float  # at the start
 
 
 class FirmwareProcess:
@@ -99,7 +113,7 @@ class FirmwareProcess:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def require_program(path: Path) -> Path:
+def _require_program(path: Path) -> Path:
     """Return the absolute path of a program.
 
     Raises:
@@ -118,34 +132,25 @@ def px4_is_running(instance: int) -> bool:
         return probe.connect_ex(_PX4_SOCKET.format(instance)) == 0
 
 
-def start_px4(
-    binary: Path, parameters: Parameters, *, simulator_port: int, remote_port: int, system_id: int
-) -> FirmwareProcess:
+def start_px4(order: FirmwareOrder) -> FirmwareProcess:
     """Start PX4's SITL binary, which lies in `bin/` beside its startup files in `etc/`.
-
-    Args:
-        binary: The program `px4`.
-        parameters: Parameters to set before it starts.
-        simulator_port: TCP port of the simulator link: PX4's own and the instance number.
-        remote_port: UDP port to which PX4 sends MAVLink.
-        system_id: MAVLink system id.
 
     Raises:
         VehicleProcessError: It cannot be started.
     """
-    program = require_program(binary)
+    program = _require_program(order.binary)
     startup = program.parent.parent / "etc"
     if not (startup / "init.d-posix" / "rcS").is_file():
-        raise VehicleProcessError(f"{binary} is no PX4: it has no startup files in {startup}")
+        raise VehicleProcessError(f"{order.binary} is no PX4: it has no startup files in {startup}")
     folder = Path(tempfile.mkdtemp(prefix="mavfi-px4-"))
-    instance = simulator_port - PORT
+    instance = order.simulator_port - PORT
     settings = [
         f"param set {name} {value:.6g}"
-        for name, value in {**parameters, "MAV_SYS_ID": system_id}.items()
+        for name, value in {**order.parameters, "MAV_SYS_ID": order.system_id}.items()
     ]
-    simulator = _PX4_SIMULATOR.format(settings="\n".join(settings), port=simulator_port)
+    simulator = _PX4_SIMULATOR.format(settings="\n".join(settings), port=order.simulator_port)
     (folder / "px4-rc.simulator").write_text(simulator)
-    links = _PX4_LINKS.format(local=_PX4_LOCAL_PORT + instance, remote=remote_port)
+    links = _PX4_LINKS.format(local=_PX4_LOCAL_PORT + instance, remote=order.remote_port)
     (folder / "px4-rc.mavlink").write_text(links)
     environment = {
         "PX4_SIM_MODEL": "none_iris",
@@ -155,40 +160,24 @@ def start_px4(
     return FirmwareProcess(program, arguments, folder, environment)
 
 
-def start_ardupilot(
-    binary: Path,
-    parameters: Parameters,
-    *,
-    simulator_port: int,
-    remote_port: int,
-    origin: Origin,
-    heading_deg: float,
-) -> FirmwareProcess:
+def start_ardupilot(order: FirmwareOrder) -> FirmwareProcess:
     """Start ArduCopter's SITL binary.
-
-    Args:
-        binary: The program `arducopter`.
-        parameters: Defaults of its parameters.
-        simulator_port: UDP port of the JSON backend.
-        remote_port: UDP port to which ArduPilot sends MAVLink.
-        origin: Geographic origin of the world.
-        heading_deg: Heading at the start.
 
     Raises:
         VehicleProcessError: It cannot be started.
     """
-    program = require_program(binary)
+    program, origin = _require_program(order.binary), order.origin
     folder = Path(tempfile.mkdtemp(prefix="mavfi-ardupilot-"))
-    lines = [f"{name} {value:.6g}" for name, value in parameters.items()]
+    lines = [f"{name} {value:.6g}" for name, value in order.parameters.items()]
     (folder / "vehicle.parm").write_text("\n".join(lines) + "\n")
-    home = (origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m, heading_deg)
+    home = (origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m, order.heading_deg)
     arguments = [
         "--model", f"JSON:{_LOOPBACK}", "--wipe", "--speedup", "100",
         "--defaults", "vehicle.parm",
         "--home", ",".join(f"{value:.7f}" for value in home),
         "--start-time", str(_EPOCH_S),
-        "--sim-port-out", str(simulator_port), "--sim-port-in", "0", "--rc-in-port", "0",
-        "--serial0", f"udpclient:{_LOOPBACK}:{remote_port}", "--serial1", "none:",
+        "--sim-port-out", str(order.simulator_port), "--sim-port-in", "0", "--rc-in-port", "0",
+        "--serial0", f"udpclient:{_LOOPBACK}:{order.remote_port}", "--serial1", "none:",
         "--serial2", "none:",
     ]  # fmt: skip
     return FirmwareProcess(program, arguments, folder, {})

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.frames import Vector, rotation_matrix
 from sitl.geodesy import Origin
 from sitl.vehicle.profile import GRAVITY_MPS2
 from sitl.vehicle.vehicle import Truth
@@ -50,22 +50,10 @@ def pressure_altitude_m(pressure: float) -> float:
     return float((1.0 - (pressure / _SEA_LEVEL_PA) ** (1.0 / _EXPONENT)) / _LAPSE_PER_M)
 
 
-def body_from_ned(quaternion_frd_ned: Vector) -> Vector:
-    """Return the matrix (3, 3) that turns NED components into body FRD components."""
-    w, x, y, z = quaternion_frd_ned.tolist()
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def specific_force(truth: Truth) -> Vector:
     """Return what an ideal accelerometer measures (3,), body FRD, m/s^2."""
     felt_ned = truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2
-    force: Vector = body_from_ned(truth.quaternion_frd_ned) @ felt_ned
+    force: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ felt_ned
     return force
 
 
@@ -100,7 +88,7 @@ class Sensors:
 
     def magnetic_field(self, truth: Truth) -> Vector:
         """Return the magnetic field (3,), body FRD, gauss."""
-        field: Vector = body_from_ned(truth.quaternion_frd_ned) @ FIELD_NED_GAUSS
+        field: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ FIELD_NED_GAUSS
         return field + MAGNETOMETER_GAUSS * self._noise.standard_normal(3)
 
     def pressure(self, truth: Truth) -> float:

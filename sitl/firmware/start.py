@@ -11,13 +11,14 @@ from enum import Enum
 from pathlib import Path
 from typing import Protocol
 
-from mavfi_cli.core.errors import EndpointError, MavfiError, VehicleProcessError
+from mavfi_cli.core.errors import EndpointError, VehicleProcessError
 from mavfi_cli.core.frames import Vector
-from mavfi_cli.link.transport import Transport, open_transport
+from mavfi_cli.link.transport import open_transport
 from sitl.firmware import ardupilot, px4
 from sitl.firmware.ardupilot import ArduPilotLink
 from sitl.firmware.autopilot import FirmwareAutopilot
 from sitl.firmware.process import (
+    FirmwareOrder,
     FirmwareProcess,
     px4_is_running,
     start_ardupilot,
@@ -102,18 +103,6 @@ class Firmware:
         self.link.close()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Order:
-    """What a firmware and its simulator link are made from."""
-
-    binary: Path | None
-    parameters: Parameters
-    sensors: Sensors
-    system_id: int
-    remote_port: int
-    heading_deg: float
-
-
 def open_firmware(
     kind: FirmwareKind,
     binary: Path | None,
@@ -139,71 +128,46 @@ def open_firmware(
         EndpointError: A port is in use.
         VehicleProcessError: The binary cannot be started.
     """
-    mavlink = open_transport(url if binary is None else "udpin:127.0.0.1:0")
-    is_px4 = kind is FirmwareKind.PX4
-    to_goal = world.goal_enu_m - world.start_enu_m
-    order = _Order(
-        binary=binary,
-        parameters=PARAMETERS[kind](profile),
-        sensors=Sensors(seed),
-        system_id=system_id,
-        remote_port=0 if binary is None else int(mavlink.port),  # type: ignore[attr-defined]
-        heading_deg=math.degrees(math.atan2(to_goal[0], to_goal[1])) % 360.0,
-    )
-    try:
-        link, process = (_open_px4 if is_px4 else _open_ardupilot)(order)
-    except MavfiError:
-        mavlink.close()
-        raise
+    sensors, to_goal = Sensors(seed), world.goal_enu_m - world.start_enu_m
+    with contextlib.ExitStack() as undo:
+        mavlink = open_transport(url if binary is None else "udpin:127.0.0.1:0")
+        undo.callback(mavlink.close)
+        is_px4, ours = kind is FirmwareKind.PX4, binary is not None
+        link, port = (_px4_link if is_px4 else _ardupilot_link)(sensors, ours=ours)
+        undo.callback(link.close)
+        process = None
+        if binary is not None:
+            order = FirmwareOrder(
+                binary=binary,
+                parameters=PARAMETERS[kind](profile),
+                system_id=system_id,
+                simulator_port=port,
+                remote_port=int(mavlink.port),  # type: ignore[attr-defined]
+                origin=Origin(),
+                heading_deg=math.degrees(math.atan2(to_goal[0], to_goal[1])) % 360.0,
+            )
+            process = (start_px4 if is_px4 else start_ardupilot)(order)
+        undo.pop_all()
     autopilot = FirmwareAutopilot(mavlink, Origin(), system_id=system_id, echoes=is_px4)
     return Firmware(autopilot=autopilot, link=link, process=process)
 
 
-_Opened = tuple[SimulatorLink, FirmwareProcess | None]
-
-
-def _open_px4(order: _Order) -> _Opened:
-    server, port = _px4_server(1 if order.binary is None else _INSTANCES)
-    link = Px4Link(server, order.sensors)
-    if order.binary is None:
-        return link, None
-    try:
-        return link, start_px4(
-            order.binary, order.parameters, simulator_port=port,
-            remote_port=order.remote_port, system_id=order.system_id,
-        )  # fmt: skip
-    except MavfiError:
-        link.close()
-        raise
-
-
-def _px4_server(tries: int) -> tuple[Transport, int]:
-    """Open the first free port of PX4's instances, and return it with its number.
-
-    Args:
-        tries: Number of instances to try. More than one is for a PX4 that will be started.
+def _px4_link(sensors: Sensors, *, ours: bool) -> tuple[SimulatorLink, int]:
+    """Open the first free port of PX4's instances, of the first one unless we start it.
 
     Raises:
         EndpointError: All of them are in use.
     """
-    for port in range(px4.PORT, px4.PORT + tries - 1):
+    ports = range(px4.PORT, px4.PORT + (_INSTANCES if ours else 1))
+    for port in ports[:-1]:
         if px4_is_running(port - px4.PORT):
             continue
         with contextlib.suppress(EndpointError):
-            return open_transport(f"tcpin:127.0.0.1:{port}"), port
-    last = px4.PORT + tries - 1
-    return open_transport(f"tcpin:127.0.0.1:{last}"), last
+            return Px4Link(open_transport(f"tcpin:127.0.0.1:{port}"), sensors), port
+    return Px4Link(open_transport(f"tcpin:127.0.0.1:{ports[-1]}"), sensors), ports[-1]
 
 
-def _open_ardupilot(order: _Order) -> _Opened:
-    link = ArduPilotLink(order.sensors, ardupilot.PORT if order.binary is None else 0)
-    if order.binary is None:
-        return link, None
-    try:
-        return link, start_ardupilot(
-            order.binary, order.parameters, simulator_port=link.port,
-            remote_port=order.remote_port, origin=Origin(), heading_deg=order.heading_deg,
-        )  # fmt: skip
-    except MavfiError:
-        link.close()
-        raise
+def _ardupilot_link(sensors: Sensors, *, ours: bool) -> tuple[SimulatorLink, int]:
+    """Open ArduPilot's port, or any if we start it."""
+    link = ArduPilotLink(sensors, 0 if ours else ardupilot.PORT)
+    return link, link.port

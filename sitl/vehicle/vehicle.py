@@ -104,6 +104,16 @@ class Truth:
         """True if a landing leg carries weight."""
         return bool(self.flat[T_ON_GROUND] > 0.5)
 
+    @property
+    def euler_rad(self) -> tuple[float, float, float]:
+        """Roll, pitch and yaw from north, z-y-x."""
+        w, x, y, z = self.quaternion_frd_ned.tolist()
+        return (
+            math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+            math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))),
+            math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+        )
+
     def wreck(self) -> Truth:
         """Return the state of a vehicle that stays where it is with its motors stopped."""
         flat = self.flat.copy()

@@ -6,6 +6,7 @@ import pytest
 from mavfi_cli.link.codec import Codec, dialect
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.streams import TICK_US, Preset
+from sitl.vehicle.vehicle import Truth
 
 NAN = math.nan
 REST_M = 0.1
@@ -14,6 +15,8 @@ GUIDE, GUIDE_COMPONENT = 245, 190
 
 class PointVehicle:
     """A vehicle without dynamics: it flies what is asked, and stands on the ground."""
+
+    euler_rad = Truth.euler_rad
 
     def __init__(self):
         self.position_ned_m = np.array([0.0, 0.0, -REST_M])

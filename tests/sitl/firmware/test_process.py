@@ -13,7 +13,8 @@ from live_processes import gone
 
 from mavfi_cli.core.errors import EndpointError, VehicleProcessError
 from sitl.firmware import process, px4, start
-from sitl.firmware.process import FirmwareProcess, require_program, start_px4
+from sitl.firmware.process import FirmwareProcess
+from sitl.firmware.sensors import Sensors
 from sitl.firmware.start import Firmware, FirmwareKind, open_firmware
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
@@ -33,20 +34,20 @@ def _program(path: Path, text: str) -> Path:
 
 def test_a_path_without_a_file(tmp_path: Path) -> None:
     with pytest.raises(VehicleProcessError, match="no firmware at"):
-        require_program(tmp_path / "px4")
+        _open(FirmwareKind.PX4, tmp_path / "px4")
 
 
 def test_a_file_that_must_not_be_executed(tmp_path: Path) -> None:
     path = tmp_path / "px4"
     path.write_text("")
     with pytest.raises(VehicleProcessError, match="no permission to execute"):
-        require_program(path)
+        _open(FirmwareKind.PX4, path)
 
 
 def test_a_program_without_startup_files_is_no_px4(tmp_path: Path) -> None:
     program = _program(tmp_path / "bin" / "px4", "#!/bin/sh\n")
     with pytest.raises(VehicleProcessError, match="is no PX4: it has no startup files"):
-        start_px4(program, {}, simulator_port=4560, remote_port=1, system_id=1)
+        _open(FirmwareKind.PX4, program)
 
 
 def test_a_file_that_is_no_program(tmp_path: Path) -> None:
@@ -106,9 +107,9 @@ def test_a_number_that_another_px4_has_is_left_to_it(
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
         other.bind(str(tmp_path / "px4-0"))
         other.listen()
-        server, port = start._px4_server(5)
-        server.close()
+        link, port = start._px4_link(Sensors(1), ours=True)
+        link.close()
     assert port > 45_600
-    server, port = start._px4_server(5)
-    server.close()
+    link, port = start._px4_link(Sensors(1), ours=True)
+    link.close()
     assert port == 45_600

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from mavfi_cli.core.frames import rotation_matrix
 from sitl.firmware.sensors import (
     BAROMETER_PA,
     FIELD_NED_GAUSS,
     FIX_HORIZONTAL_M,
     Sensors,
-    body_from_ned,
     pressure_altitude_m,
     pressure_pa,
     specific_force,
@@ -51,7 +51,7 @@ def test_a_resting_accelerometer_feels_the_ground(
 def test_the_magnetometer_turns_with_the_vehicle() -> None:
     east = _at_rest([QUARTER, 0.0, 0.0, QUARTER])
     north_gauss, east_gauss, down_gauss = FIELD_NED_GAUSS
-    field = body_from_ned(east.quaternion_frd_ned) @ FIELD_NED_GAUSS
+    field = rotation_matrix(east.quaternion_frd_ned).T @ FIELD_NED_GAUSS
     np.testing.assert_allclose(field, [east_gauss, -north_gauss, down_gauss], atol=1e-12)
 
 
