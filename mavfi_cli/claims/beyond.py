@@ -126,17 +126,16 @@ BIT_CLASSES = tuple(tuple(name for name, _ in kinds) for kinds in _BITS.values()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateCell:
-    """Harmful faults in one class of bits of a state, in one phase of flight."""
+    """Faults in one class of bits of a state, in one phase of flight."""
 
-    state: str
-    bits: str
-    phase: str
     harmed: Share
     lost: Share
 
 
-def state_map(flights: pa.Table) -> list[StateCell]:
-    """The map, for source-level faults without a detector whose golden flights succeed.
+def state_map(flights: pa.Table) -> dict[tuple[str, str, str], StateCell]:
+    """The map by state, class of bits and phase.
+
+    It counts source-level faults without a detector whose golden flights succeed.
 
     A fault in several components is told by its group, and by the highest bit that it flips.
 
@@ -157,12 +156,10 @@ def state_map(flights: pa.Table) -> list[StateCell]:
         ),
         "name", "bits", "phase",
     )  # fmt: skip
-    return [
-        StateCell(
-            state=state, bits=bits, phase=phase, harmed=share(those, "harmed"), lost=share(those)
-        )
-        for (state, bits, phase), those in sorted(cells.items())
-    ]
+    return {
+        place: StateCell(harmed=share(cells[place], "harmed"), lost=share(cells[place]))
+        for place in sorted(cells)
+    }
 
 
 def _state(flight: Row) -> str:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.analysis.kernel_runs import silent_of_all
@@ -37,6 +36,7 @@ from mavfi_cli.reproduction.flights import (
     ratios,
     share,
     struck,
+    timed,
 )
 from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT, printed_name
 from mavfi_cli.stats.effects import ClaimVerdict, excess_over_mean, judge
@@ -245,37 +245,33 @@ def _rate(found: Share) -> str:
 
 def worst_flights(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
     """The longest flights of each setting, paired and unpaired, as the paper may have read them."""
-    faulty = chosen(comparable(flights), struck=True, detector=(*_DETECTORS,))
-    groups = by_value(faulty, "level", "world", "platform", "detector")
-    for (*kind, detector), those in sorted(groups.items(), key=_by_detector):
-        known = those.filter(pc.is_valid(those["over_own"]))
-        if not known.num_rows:
-            continue
-        found, times = ratios(known), known["flight_time_s"].to_pylist()
-        own = dict(
-            zip(known["pair"].to_pylist(), known["own_flight_time_s"].to_pylist(), strict=True)
-        )
-        reference, longest = excess_over_mean([*own.values()], times)
+    hit = chosen(timed(comparable(flights)), struck=True, detector=(*_DETECTORS,))
+    groups = by_value(hit, "detector", "level", "world", "platform")
+    order = [*_DETECTORS]
+    for place in sorted(groups, key=lambda each: (*map(str, each[1:]), order.index(each[0]))):
+        detector, level, world, platform = place
+        names = ("pair", "flight_time_s", "own_flight_time_s")
+        pairs, times, own_times = (groups[place][name].to_pylist() for name in names)
+        golden = dict(zip(pairs, own_times, strict=True)).values()
+        longest_golden, longest = excess_over_mean([*golden], times)
+        found = ratios(groups[place])
         yield {
-            **dict(zip(("stack", "level", "world", "platform"), (stack, *kind), strict=True)),
+            "stack": stack,
+            "level": level,
+            "world": world,
+            "platform": platform,
             "detector": detector,
             "flights": len(found),
             "longer": float((found > LONGER).mean()),
             "paired": found.max() - 1.0,
             "unpaired": longest,
-            "golden": reference,
+            "golden": longest_golden,
         }
-
-
-def _by_detector(group: tuple[tuple[Any, ...], pa.Table]) -> tuple[Any, ...]:
-    (*kind, detector), _ = group
-    return *map(str, kind), [*_DETECTORS].index(detector)
 
 
 def _spread(flights: pa.Table) -> dict[str, Any] | None:
     """Every flight with a fault in a state over its own golden one, by world and detector."""
-    hit = chosen(comparable(flights), level="source", platform="x86", struck=True)
-    hit = hit.filter(pc.is_valid(hit["over_own"]))
+    hit = chosen(timed(comparable(flights)), level="source", platform="x86", struck=True)
     groups = by_value(hit, "world", "detector")
     places = sorted(groups, key=str)
     if not places:
@@ -298,30 +294,29 @@ def _spread(flights: pa.Table) -> dict[str, Any] | None:
 # Where a bit hurts --------------------------------------------------------------------------------
 
 
-def _matrices(stack: str, cells: Sequence[StateCell]) -> list[dict[str, Any]]:
+def _matrices(
+    stack: str, cells: Mapping[tuple[str, str, str], StateCell]
+) -> Iterator[dict[str, Any]]:
     """A matrix a phase and a kind of state: states as rows, classes of bits as columns."""
-    found = []
-    for phase in sorted({each.phase for each in cells}):
-        here = [each for each in cells if each.phase == phase]
+    for phase in sorted({phase for _, _, phase in cells}):
         for columns in BIT_CLASSES:
-            those = [each for each in here if each.bits in columns]
-            used = [bits for bits in columns if any(each.bits == bits for each in those)]
-            by_place = {(each.state, each.bits): each for each in those}
-            if those:
-                rows = [
-                    {"state": state, "cells": [by_place.get((state, bits)) for bits in used]}
-                    for state in dict.fromkeys(each.state for each in those)
-                ]
-                found.append({"stack": stack, "phase": phase, "columns": used, "rows": rows})
-    return found
+            places = [each for each in cells if each[1] in columns and each[2] == phase]
+            used = [bits for bits in columns if any(each[1] == bits for each in places)]
+            rows = [
+                {"state": state, "cells": [cells.get((state, bits, phase)) for bits in used]}
+                for state in dict.fromkeys(state for state, _, _ in places)
+            ]
+            if rows:
+                yield {"stack": stack, "phase": phase, "columns": used, "rows": rows}
 
 
-def _map_rows(stack: str, cells: Sequence[StateCell]) -> list[dict[str, Any]]:
-    return [
-        {"stack": stack, "state": each.state, "bits": each.bits, "phase": each.phase,
-         "faults": each.harmed.total, "harmful": each.harmed.count, "lost": each.lost.count}
-        for each in cells
-    ]  # fmt: skip
+def _map_rows(
+    stack: str, cells: Mapping[tuple[str, str, str], StateCell]
+) -> Iterator[dict[str, Any]]:
+    for (state, bits, phase), each in cells.items():
+        yield {"stack": stack, "state": state, "bits": bits, "phase": phase,
+               "faults": each.harmed.total, "harmful": each.harmed.count,
+               "lost": each.lost.count}  # fmt: skip
 
 
 # Where to look -----------------------------------------------------------------------------------
@@ -330,10 +325,7 @@ def _map_rows(stack: str, cells: Sequence[StateCell]) -> list[dict[str, Any]]:
 def _worth_a_look(source: CampaignSource) -> dict[str, Any]:
     """The lost missions of a campaign, and the longest of the others."""
     flights = beside_golden(source.flights)
-    faulty = flights.filter(
-        pc.and_(pc.is_valid(flights["level"]), pc.is_valid(flights["over_own"]))
-    )
-    longest = sorted(faulty.to_pylist(), key=lambda each: -each["over_own"])[:_LONGEST]
+    longest = sorted(timed(flights).to_pylist(), key=lambda each: -each["over_own"])[:_LONGEST]
     return {
         "name": source.name,
         "lost": [_listed(each, source.path) for each in chosen(flights, lost=True).to_pylist()],

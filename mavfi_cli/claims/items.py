@@ -19,7 +19,7 @@ from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.claims.sources import STACKS, Evidence
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.reproduction.figures import draw
-from mavfi_cli.reproduction.flights import pooled, ratios
+from mavfi_cli.reproduction.flights import pooled, ratios, timed
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
 from mavfi_cli.reproduction.plan import key_of, kinds_of
@@ -118,7 +118,7 @@ def _kept(table: pa.Table) -> bool:
 
 def _over_own(flights: pa.Table) -> Iterator[dict[str, Any]]:
     """The successful faulty flights, with the columns in which they differ."""
-    known = flights.filter(pc.and_(pc.is_valid(flights["level"]), pc.is_valid(flights["over_own"])))
+    known = timed(flights)
     rows = known.select(_SETTING).to_pylist()
     varying = [name for name in _SETTING if len({row[name] for row in rows}) > 1]
     for row, ratio in zip(rows, ratios(known), strict=True):

@@ -210,7 +210,7 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     for each in campaigns:
         over = each.flights.num_rows + each.errors
         if each.planned is not None and over < each.planned:
-            again = f"mavfi campaign run {each.path}" if each.spec else "the command that began it"
+            again = f"mavfi campaign run {each.path}" if each.spec else "The command that began it"
             rest = f" {again} flies the rest." if not each.digest else " An export holds no list."
             yield f"{each.path}: {over:,} of {each.planned:,} missions have flown.{rest}"
         if each.errors:

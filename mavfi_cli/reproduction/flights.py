@@ -162,6 +162,11 @@ def struck(flights: pa.Table, **values: object) -> pa.Table:
     return chosen(flights, **{"struck": True, "detector": None, **values})
 
 
+def timed(flights: pa.Table) -> pa.Table:
+    """The flights with a fault that succeed as their golden flights do."""
+    return flights.filter(pc.and_(pc.is_valid(flights["level"]), pc.is_valid(flights["over_own"])))
+
+
 def comparable(flights: pa.Table) -> pa.Table:
     """The flights without a detector, or with one that watches all stages."""
     return chosen(flights, protect=(None, EVERY_STAGE))

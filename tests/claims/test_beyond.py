@@ -49,13 +49,13 @@ def test_a_state_is_told_by_its_highest_bit():
             **where),
         row("planning", seed=3, struck_state="plan_trajectory_seq", struck_bits="15", **where),
     ]  # fmt: skip
-    cells = {(each.state, each.bits): each for each in state_map(flights(rows))}
+    cells = state_map(flights(rows))
     assert cells.keys() == {
-        ("waypoint_x", "exponent 62 to 57"),
-        ("waypoint_position", "bit 63, sign"),
-        ("plan_trajectory_seq", "bits 15 to 8"),
+        ("waypoint_x", "exponent 62 to 57", "flying"),
+        ("waypoint_position", "bit 63, sign", "flying"),
+        ("plan_trajectory_seq", "bits 15 to 8", "flying"),
     }
-    assert cells["waypoint_x", "exponent 62 to 57"].lost.count == 1
+    assert cells["waypoint_x", "exponent 62 to 57", "flying"].lost.count == 1
 
 
 def test_failures_an_hour_follow_the_rate_and_the_detector():
