@@ -1,8 +1,7 @@
 """MAVLink's command protocol: sends a command, awaits its acknowledgement, repeats it.
 
-`Requests` repeats a session's commands until telemetry shows their effect. The caller supplies the
-time. An acknowledgement names the command only, so the same command is never pending twice for one
-component. Source: https://mavlink.io/en/services/command.html.
+The caller supplies the time. An acknowledgement names the command only, so the same command is
+never pending twice for one component. Source: https://mavlink.io/en/services/command.html.
 """
 
 from __future__ import annotations
@@ -66,18 +65,28 @@ class Ticket:
         return self.verdict is _CommandState.PENDING
 
 
-class CommandChannel:
-    """Commands to the components of one system.
+class Commands:
+    """Commands of a session to the components of one system.
+
+    Any number of submitted commands is under way. Beside them a phase of the session has one
+    request at a time, which is repeated until telemetry shows its effect.
 
     Args:
         system: Own system id.
         component: Own component id. Acknowledgements for other components are ignored.
+        telemetry: Telemetry that shows the effect of commands.
+
+    Attributes:
+        now_s: Present stamp. Set it before any request.
     """
 
-    def __init__(self, system: int, component: int) -> None:
+    def __init__(self, system: int, component: int, telemetry: Telemetry) -> None:
         self._own = (system, component)
+        self._telemetry = telemetry
+        self.now_s = 0.0
         self._lanes: dict[tuple[int, int], deque[Ticket]] = {}
-        self._now_s = 0.0
+        self._asked: dict[int, tuple[Ticket, float]] = {}  # message id -> request, next one's time
+        self.begin()
 
     def submit(
         self,
@@ -120,21 +129,20 @@ class CommandChannel:
         ticket.result = _RESULTS.get(message.result, f"result {message.result}")
         ticket.sent_since_answer = 0
         if message.result == dialect.MAV_RESULT_IN_PROGRESS:
-            ticket.due_s = self._now_s + PROGRESS_TIMEOUT_S
+            ticket.due_s = self.now_s + PROGRESS_TIMEOUT_S
         elif message.result == dialect.MAV_RESULT_ACCEPTED:
             self._close(lane, _CommandState.ACCEPTED)
         elif message.result in _PASSING and ticket.refusals_left > 0:
             ticket.refusals_left -= 1
-            ticket.due_s = self._now_s + REFUSAL_PAUSE_S
+            ticket.due_s = self.now_s + REFUSAL_PAUSE_S
         else:
             self._close(lane, _CommandState.REFUSED)
 
-    def poll(self, stamp_s: float, system: int) -> list[Message]:
-        """Return the commands that are due at `stamp_s`, addressed to `system`."""
-        self._now_s = stamp_s
+    def poll(self, system: int) -> list[Message]:
+        """Return the commands that are due now, addressed to `system`."""
         due = []
         for lane in filter(None, self._lanes.values()):
-            while lane and lane[0].due_s <= stamp_s:
+            while lane and lane[0].due_s <= self.now_s:
                 ticket = lane[0]
                 if ticket.sent_since_answer < TRIES:
                     due.append(self._send(ticket, system))
@@ -146,7 +154,7 @@ class CommandChannel:
         confirmation = min(ticket.sent, 255)
         ticket.sent += 1
         ticket.sent_since_answer += 1
-        ticket.due_s = self._now_s + TIMEOUT_S
+        ticket.due_s = self.now_s + TIMEOUT_S
         return dialect.MAVLink_command_long_message(
             system, ticket.component, ticket.command, confirmation, *ticket.parameters
         )
@@ -155,24 +163,7 @@ class CommandChannel:
     def _close(lane: deque[Ticket], verdict: _CommandState) -> None:
         lane.popleft().verdict = verdict
 
-
-class Requests:
-    """Requests of one phase of the session at a time.
-
-    Args:
-        commands: Channel to the autopilot.
-        telemetry: Telemetry that shows the effect of commands.
-
-    Attributes:
-        now_s: Present stamp. Set it before any request.
-    """
-
-    def __init__(self, commands: CommandChannel, telemetry: Telemetry) -> None:
-        self._commands = commands
-        self._telemetry = telemetry
-        self.now_s = 0.0
-        self._asked: dict[int, tuple[Ticket, float]] = {}  # message id -> request, next one's time
-        self.begin()
+    # Requests of the present phase
 
     def begin(self) -> None:
         """Begin a phase and forget the requests of the last one."""
@@ -206,7 +197,7 @@ class Requests:
             CommandRefused: The command was refused permanently.
         """
         if self._ticket is None:
-            self._ticket = self._commands.submit(command, *parameters, unused=unused, refusals=2)
+            self._ticket = self.submit(command, *parameters, unused=unused, refusals=2)
             self._decided_s = None
         ticket = self._ticket
         if ticket.pending:
@@ -240,7 +231,7 @@ class Requests:
             enabled = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             if self._telemetry.armed:
                 enabled |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
-            self._ticket = self._commands.submit(
+            self._ticket = self.submit(
                 dialect.MAV_CMD_DO_SET_MODE,
                 enabled,
                 *self._telemetry.autopilot.mode_parameters(mode),
@@ -261,7 +252,7 @@ class Requests:
             ticket, next_s = self._asked[message_id]
             if ticket.pending or self.now_s < next_s:
                 return
-        ticket = self._commands.submit(dialect.MAV_CMD_REQUEST_MESSAGE, message_id)
+        ticket = self.submit(dialect.MAV_CMD_REQUEST_MESSAGE, message_id)
         self._asked[message_id] = ticket, self.now_s + interval_s
 
     def streams(self, state_rate_hz: float) -> None:
@@ -274,4 +265,4 @@ class Requests:
             (dialect.MAVLINK_MSG_ID_SYS_STATUS, 5e5),
             (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 5e5),
         ):
-            self._commands.submit(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
+            self.submit(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)

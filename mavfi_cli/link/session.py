@@ -17,7 +17,7 @@ from mavfi_cli.core.errors import LinkError, NoAutopilot, NoCamera, UnfitAutopil
 from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.commands import CommandChannel, Requests, Ticket
+from mavfi_cli.link.commands import Commands, Ticket
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.texts import text_messages
 
@@ -120,10 +120,10 @@ class OffboardSession:
         self.phase, self._step = Phase.CONNECTING, _STEPS[Phase.CONNECTING]
         self.failure: LinkError | None = None
         self.failsafe_text: str | None = None
-        self._commands = CommandChannel(self._settings.system, self._settings.component)
+        own = self._settings.system, self._settings.component
+        self._commands = Commands(*own, self.telemetry)
         self._camera_heard = self._greeted = False
         self._origin_asked: Ticket | None = None
-        self._requests = Requests(self._commands, self.telemetry)
         self.hold()
         self._answers: list[Message] = []  # sent at the next tick
         self._next_heartbeat_s = -math.inf
@@ -273,7 +273,7 @@ class OffboardSession:
         lockstep peer waits for them. ArduCopter is the exception: it has no such handshake and
         aborts a take-off at a setpoint, so it gets setpoints in the OFFBOARD phase only.
         """
-        self._now_s = self.telemetry.now_s = self._requests.now_s = stamp_s
+        self._now_s = self.telemetry.now_s = self._commands.now_s = stamp_s
         if self._phase_since_s is None:
             self._phase_since_s = stamp_s
         self.telemetry.expire()
@@ -288,7 +288,7 @@ class OffboardSession:
             out.append(_heartbeat())
         system = self.telemetry.system
         if system:
-            out += self._commands.poll(stamp_s, system)
+            out += self._commands.poll(system)
         if self.telemetry.autopilot.early_setpoints or self.phase is Phase.OFFBOARD:
             component = dialect.MAV_COMP_ID_AUTOPILOT1 if system else 0
             out.append(
@@ -304,7 +304,7 @@ class OffboardSession:
     def _enter(self, phase: Phase) -> None:
         self.phase, self._step = phase, _STEPS[phase]
         self._phase_since_s = self._now_s
-        self._requests.begin()
+        self._commands.begin()
 
     def _elapsed_s(self) -> float:
         since = self._phase_since_s
@@ -319,7 +319,7 @@ class OffboardSession:
         if not self._greeted:
             self._greeted, self._phase_since_s = True, self._now_s
             if self._settings.request_streams:
-                self._requests.streams(self._settings.state_rate_hz)
+                self._commands.streams(self._settings.state_rate_hz)
             if self._settings.needs_camera:
                 self._ask_camera()
         if self._knows_place():
@@ -348,7 +348,7 @@ class OffboardSession:
         return self._camera_heard and not asked.pending and self.telemetry.state is not None
 
     def _waiting_ready(self) -> None:
-        telemetry, requests = self.telemetry, self._requests
+        telemetry, commands = self.telemetry, self._commands
         self._require_fit()
         if telemetry.armed and telemetry.in_air and telemetry.state is not None:
             self._was_up = True
@@ -356,10 +356,10 @@ class OffboardSession:
             return
         autopilot = telemetry.autopilot
         in_mode = telemetry.mode in autopilot.arming_modes
-        if not in_mode and not requests.mode(autopilot.arming_modes[0]):
+        if not in_mode and not commands.mode(autopilot.arming_modes[0]):
             return
         if autopilot.takeoff_amsl and telemetry.home_amsl_m is None:
-            requests.home()
+            commands.home()
         elif in_mode and telemetry.ready and telemetry.state is not None:
             self._ground_m = float(telemetry.state.position_enu_m[2])
             if self._settings.needs_camera:  # home may be that of an earlier flight
@@ -371,7 +371,7 @@ class OffboardSession:
     def _require_soon(self) -> None:
         timeout_s = self._settings.ready_timeout_s
         if self._elapsed_s() >= timeout_s:
-            self._requests.refuse("arming", f"{self._missing()} within {timeout_s:g} s")
+            self._commands.refuse("arming", f"{self._missing()} within {timeout_s:g} s")
 
     def _missing(self) -> str:
         if self.telemetry.state is None:
@@ -386,26 +386,26 @@ class OffboardSession:
         self._require_fit()
         if self.telemetry.armed:
             self._enter(Phase.TAKING_OFF)
-        elif self._requests.insist("arming", dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0):
-            self._requests.look_at_heartbeat()
+        elif self._commands.insist("arming", dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0):
+            self._commands.look_at_heartbeat()
             if self._elapsed_s() >= self._settings.arm_timeout_s:
-                self._requests.refuse("arming", "accepted, but it did not arm")
+                self._commands.refuse("arming", "accepted, but it did not arm")
 
     def _taking_off(self) -> None:
-        telemetry, requests = self.telemetry, self._requests
+        telemetry, commands = self.telemetry, self._commands
         if not telemetry.armed:
-            requests.refuse("take-off", "disarmed before the height was reached")
+            commands.refuse("take-off", "disarmed before the height was reached")
         self._was_up = self._was_up or self._climbed()
         if self._was_up:
-            if requests.mode(telemetry.autopilot.offboard_mode):
+            if commands.mode(telemetry.autopilot.offboard_mode):
                 self._enter(Phase.OFFBOARD)
             return
-        if not (requests.asked and telemetry.in_air):
+        if not (commands.asked and telemetry.in_air):
             parameters = [telemetry.autopilot.unused] * 6 + [self._takeoff_altitude_m()]
-            requests.insist("take-off", dialect.MAV_CMD_NAV_TAKEOFF, *parameters)
+            commands.insist("take-off", dialect.MAV_CMD_NAV_TAKEOFF, *parameters)
         timeout_s = self._settings.takeoff_timeout_s
         if self._elapsed_s() >= timeout_s:
-            requests.refuse("take-off", f"height not reached within {timeout_s:g} s")
+            commands.refuse("take-off", f"height not reached within {timeout_s:g} s")
 
     def _takeoff_altitude_m(self) -> float:
         if not self.telemetry.autopilot.takeoff_amsl:
@@ -432,19 +432,19 @@ class OffboardSession:
             )
 
     def _landing(self) -> None:
-        telemetry, requests = self.telemetry, self._requests
+        telemetry, commands = self.telemetry, self._commands
         if not telemetry.armed:
             self._enter(Phase.DONE)
             return
         if telemetry.mode != telemetry.autopilot.land_mode:
             unused = telemetry.autopilot.unused
-            requests.insist("landing", dialect.MAV_CMD_NAV_LAND, unused=unused)
-            requests.look_at_heartbeat()
+            commands.insist("landing", dialect.MAV_CMD_NAV_LAND, unused=unused)
+            commands.look_at_heartbeat()
         elif telemetry.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND:
             self._disarm_late()
         timeout_s = self._settings.land_timeout_s
         if self._elapsed_s() >= timeout_s:
-            requests.refuse("landing", f"not down and disarmed within {timeout_s:g} s")
+            commands.refuse("landing", f"not down and disarmed within {timeout_s:g} s")
 
     def _disarm_late(self) -> None:
         if self._down_since_s is None:

@@ -13,7 +13,7 @@ from mavfi_cli.core.files import file_digest, writing
 from mavfi_cli.fi.tracer.record import read
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record.run_folder import Run, load_run
-from mavfi_cli.mission.replay import config_of, interrupted
+from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -54,7 +54,7 @@ def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
         MavfiError: As for `fly_mission`.
     """
     flown = load_run(fly_mission(config, out, Watcher(), **options).path)
-    if interrupted(flown):
+    if flown.record.interrupted:
         shutil.rmtree(flown.folder.path)
         raise Interrupted("interrupted: the mission was not flown to its end")
     return flown
@@ -81,7 +81,7 @@ def kept_golden(run: Run) -> Run | None:
     """The golden pair that is kept in the run's folder; None if none was flown to its end."""
     folder = run.folder.path / GOLDEN
     golden = load_run(folder) if folder.is_dir() else None
-    return None if golden is None or interrupted(golden) else golden
+    return None if golden is None or golden.record.interrupted else golden
 
 
 def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:

@@ -13,7 +13,6 @@ from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.states import BY_NAME
-from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import measured_factor
@@ -41,7 +40,7 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
             times, was interrupted by the user, or named a file that has changed since.
     """
     values = dict(run.record.config)
-    if interrupted(run):
+    if run.record.interrupted:
         raise RecordError(f"{run.folder.path}: an interrupted flight does not repeat")
     if values.get("link") is not None:
         raise RecordError(f"{run.folder.path}: a flight of a foreign autopilot does not repeat")
@@ -53,11 +52,6 @@ def config_of(run: Run, *, with_fault: bool = True) -> MissionConfig:
             raise RecordError(f"{run.folder.path}: {name} {how}, so the flight does not repeat")
     config = structure(values, MissionConfig, path=run.folder.result)
     return config if with_fault else config.golden
-
-
-def interrupted(run: Run) -> bool:
-    """Return True if the user interrupted the flight, so that the mission has no outcome."""
-    return bool(run.record.outcome == Outcome.INTERRUPTED.value)
 
 
 def differing_results(this: dict[str, Any], other: dict[str, Any]) -> list[str]:

@@ -213,7 +213,7 @@ def fly_golden(
     flown = fly_mission(config, out, Watcher(), recorder=recorder, launch=launch)
     result: dict[str, Any] = json.loads(flown.result.read_text())
     flight = record_of(result)
-    if flight.outcome == Outcome.INTERRUPTED.value:
+    if flight.interrupted:
         raise Interrupted("interrupted")
     if flight.referee is None:
         raise VehicleProcessError("the vehicle process of the golden flight died")

@@ -58,7 +58,7 @@ def specific_force(truth: Truth) -> Vector:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
+class _Fix:
     """One position and velocity of a GPS receiver."""
 
     latitude_deg: float
@@ -96,14 +96,14 @@ class Sensors:
         altitude_m = self._origin.altitude_amsl_m - float(truth.position_ned_m[2])
         return pressure_pa(altitude_m) + BAROMETER_PA * float(self._noise.standard_normal())
 
-    def fix(self, truth: Truth) -> Fix:
+    def fix(self, truth: Truth) -> _Fix:
         """Return position and velocity of the GPS receiver."""
         noise = self._noise.standard_normal(6)
         north, east, down = truth.position_ned_m.tolist()
         latitude, longitude = self._origin.geodetic(
             north + FIX_HORIZONTAL_M * noise[0], east + FIX_HORIZONTAL_M * noise[1]
         )
-        return Fix(
+        return _Fix(
             latitude_deg=latitude,
             longitude_deg=longitude,
             altitude_amsl_m=self._origin.altitude_amsl_m - down + FIX_VERTICAL_M * noise[2],

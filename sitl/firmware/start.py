@@ -46,7 +46,7 @@ class FirmwareKind(Enum):
     ARDUPILOT = "ardupilot"
 
 
-class SimulatorLink(Protocol):
+class _SimulatorLink(Protocol):
     """The link over which a firmware gets its sensors and gives its motor outputs."""
 
     @property
@@ -78,7 +78,7 @@ class Firmware:
     """A firmware with its links, and its process if we started it."""
 
     autopilot: FirmwareAutopilot
-    link: SimulatorLink
+    link: _SimulatorLink
     process: FirmwareProcess | None
 
     def wait(self, stopped: Callable[[], bool]) -> None:
@@ -152,7 +152,7 @@ def open_firmware(
     return Firmware(autopilot=autopilot, link=link, process=process)
 
 
-def _px4_link(sensors: Sensors, *, ours: bool) -> tuple[SimulatorLink, int]:
+def _px4_link(sensors: Sensors, *, ours: bool) -> tuple[_SimulatorLink, int]:
     """Open the first free port of PX4's instances, of the first one unless we start it.
 
     Raises:
@@ -167,7 +167,7 @@ def _px4_link(sensors: Sensors, *, ours: bool) -> tuple[SimulatorLink, int]:
     return Px4Link(open_transport(f"tcpin:127.0.0.1:{ports[-1]}"), sensors), ports[-1]
 
 
-def _ardupilot_link(sensors: Sensors, *, ours: bool) -> tuple[SimulatorLink, int]:
+def _ardupilot_link(sensors: Sensors, *, ours: bool) -> tuple[_SimulatorLink, int]:
     """Open ArduPilot's port, or any if we start it."""
     link = ArduPilotLink(sensors, 0 if ours else ardupilot.PORT)
     return link, link.port

@@ -77,6 +77,11 @@ class FlightRecord:
         return self.outcome == "success"
 
     @property
+    def interrupted(self) -> bool:
+        """True if the user interrupted the flight, so that the mission has no outcome."""
+        return self.outcome == "interrupted"
+
+    @property
     def golden(self) -> bool:
         """True if the flight has neither a fault nor a detector."""
         return not (self.fault or self.detection)
