@@ -232,19 +232,18 @@ class Telemetry:
             self.state = state
 
     def _attitude_quaternion(self, message: Message) -> None:
-        self._attitude_from([message.q1, message.q2, message.q3, message.q4])
+        self._attitude_from(message.q1, message.q2, message.q3, message.q4)
 
     def _attitude(self, message: Message) -> None:
         angles = (message.roll, message.pitch, message.yaw)
         if all(math.isfinite(angle) for angle in angles):
-            self._attitude_from(quaternion_from_euler(*angles).tolist())
+            self._attitude_from(*quaternion_from_euler(*angles).tolist())
 
-    def _attitude_from(self, components: list[float]) -> None:
-        """Store a body-FRD-to-NED quaternion w x y z if it is valid."""
-        w, x, y, z = components  # added one by one: `sum` rounds floats otherwise from 3.12 on
+    def _attitude_from(self, w: float, x: float, y: float, z: float) -> None:
+        """Store a body-FRD-to-NED quaternion if it is valid."""
         norm = math.sqrt(w * w + x * x + y * y + z * z)
-        if math.isfinite(norm) and 0.5 < norm < 2.0:
-            self._quaternion = flu_enu_from_frd_ned([c / norm for c in components])
+        if 0.5 < norm < 2.0:
+            self._quaternion = flu_enu_from_frd_ned((w / norm, x / norm, y / norm, z / norm))
 
     def _sys_status(self, message: Message) -> None:
         self.ready = bool(message.onboard_control_sensors_health & _PREARM)
@@ -279,7 +278,8 @@ class Telemetry:
 
     def expire(self) -> None:
         """Close texts whose missing chunks are overdue."""
-        self._look_for_verdict(self.texts.expire(self.now_s))
+        if self.texts.open:
+            self._look_for_verdict(self.texts.expire(self.now_s))
 
     def _look_for_verdict(self, texts: Iterable[Text]) -> None:
         for text in texts:

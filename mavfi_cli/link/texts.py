@@ -56,12 +56,18 @@ class _Open:
 
 
 class TextCollector:
-    """Collects texts. `texts` holds the newest thousand, `total` counts all."""
+    """Collects texts.
+
+    Attributes:
+        texts: The newest thousand.
+        total: Number of all.
+        open: Texts whose chunks have not all come, by system, component and id.
+    """
 
     def __init__(self) -> None:
         self.texts: deque[Text] = deque(maxlen=_MAX_TEXTS)
         self.total = 0
-        self._open: dict[tuple[int, int, int], _Open] = {}
+        self.open: dict[tuple[int, int, int], _Open] = {}
 
     def since(self, total: int) -> list[Text]:
         """Return the texts received since `total` had this value."""
@@ -76,11 +82,11 @@ class TextCollector:
             return [self._emit(stamp_s, message.severity, message.text)]
         done = []
         key = (message.get_srcSystem(), message.get_srcComponent(), message.id)
-        if key not in self._open:
-            if len(self._open) >= _MAX_OPEN:
-                done.append(self._finish(next(iter(self._open)), stamp_s))
-            self._open[key] = _Open(severity=message.severity, started_s=stamp_s, chunks={})
-        chunks = self._open[key].chunks
+        if key not in self.open:
+            if len(self.open) >= _MAX_OPEN:
+                done.append(self._finish(next(iter(self.open)), stamp_s))
+            self.open[key] = _Open(severity=message.severity, started_s=stamp_s, chunks={})
+        chunks = self.open[key].chunks
         chunks[message.chunk_seq] = message.text
         last = max(chunks)
         if len(chunks[last]) < CHUNK_LENGTH and len(chunks) == last + 1:
@@ -89,13 +95,11 @@ class TextCollector:
 
     def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[Text]:
         """Close and return texts with chunks missing for longer than the patience, with a gap."""
-        if not self._open:
-            return []
-        late = [k for k, o in self._open.items() if stamp_s - o.started_s >= patience_s]
+        late = [k for k, o in self.open.items() if stamp_s - o.started_s >= patience_s]
         return [self._finish(key, stamp_s) for key in late]
 
     def _finish(self, key: tuple[int, int, int], stamp_s: float) -> Text:
-        part = self._open.pop(key)
+        part = self.open.pop(key)
         last = max(part.chunks)
         text = "".join(part.chunks.get(index, _GAP) for index in range(last + 1))
         if len(part.chunks[last]) >= CHUNK_LENGTH:
