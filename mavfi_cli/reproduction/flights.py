@@ -22,10 +22,10 @@ STAGES = tuple(stage.value for stage in Stage)
 EVERY_STAGE = "+".join(STAGES)
 LONGER = 1.05  # a flight is longer if it takes more than this times its own golden flight
 _COLUMNS: Mapping[str, pa.DataType] = {
-    **dict.fromkeys(("number", "seed", "fault_seed", "fault_bits"), pa.int64()),
+    **dict.fromkeys(("number", "seed", "fault_bits"), pa.int64()),
     **dict.fromkeys((
         "pair", "world", "planner", "platform", "stack", "level", "fault_target", "fault_field",
-        "detector", "protect", "state", "outcome", "reason", "injected", "activation",
+        "detector", "protect", "state", "outcome", "injected", "activation",
         "strike_phase", "struck_state", "struck_bits", "struck_kernel", "node_ended", "path",
         "changes",
     ), pa.string()),

@@ -49,6 +49,20 @@ def test_five_sentences_say_what_was_counted(told):
     assert crashes.startswith("All 2 missions that a fault in an instruction loses follow a node")
 
 
+def test_the_sentence_on_detectors_tells_one_fact():
+    rows = [row(seed=1), row("planning", seed=1, outcome="timeout")]
+    rows += [row("planning", seed=1, detector="gad")]
+    saved = document(evidence(rows))["summary"][3]
+    assert saved.startswith("On mavbench, of the missions that a fault in a state loses, the Gauss")
+    rows += [row("planning", seed=1, instruction=True, outcome="timeout")]
+    rows += [row("planning", seed=1, instruction=True, detector="gad")]
+    saved = document(evidence(rows))["summary"][3]
+    assert saved.startswith(
+        "On mavbench, of the missions that a fault in an instruction loses, the"
+    )
+    assert ";" not in saved.replace("; 95 % interval", "")
+
+
 def test_nothing_flown_is_said_in_sentences_too():
     found = document(evidence([row()]))
     assert found["summary"][1:] == [
