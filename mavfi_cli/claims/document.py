@@ -62,7 +62,8 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
     return {
         "version": __version__,
         "stacks": STACKS,
-        "summary": _summary(evidence, flights, kernels, claims),
+        "extent": _extent(evidence, kernels, claims),
+        "summary": _summary(flights, claims),
         "problems": evidence.problems,
         "claims": claims,
         "verdicts": {where: _counted(claims, where) for where in (*STACKS, _ISOLATED)},
@@ -126,20 +127,20 @@ def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdi
 # Five sentences -----------------------------------------------------------------------------------
 
 
-def _summary(
-    evidence: Evidence,
-    flights: Mapping[str, pa.Table],
-    kernels: Kernels,
-    claims: Sequence[Mapping[str, Any]],
-) -> list[str]:
+def _extent(evidence: Evidence, kernels: Kernels, claims: Sequence[Mapping[str, Any]]) -> str:
+    """What the page judges, and by how much."""
     missions = evidence.flights().num_rows
     runs = sum(each["runs"] for each in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
+    return f"{len(claims)} claims are judged by {missions:,} missions{attacked}."
+
+
+def _summary(flights: Mapping[str, pa.Table], claims: Sequence[Mapping[str, Any]]) -> list[str]:
     return [
-        f"This page judges {len(claims)} claims of the paper by {missions:,} missions{attacked}.",
         _verdict_sentence(claims),
         _cost_sentence(flights),
-        _saved_sentence(flights),
+        _saved_sentence(flights, "instruction", "an instruction"),
+        _saved_sentence(flights, "source", "a state"),
         _crash_sentence(flights),
     ]
 
@@ -198,19 +199,18 @@ def _instruction_faults(flights: pa.Table) -> pa.Table:
     return struck(flights, level="instruction", platform="x86")
 
 
-def _saved_sentence(flights: Mapping[str, pa.Table]) -> str:
-    """What the detectors save of the first kind of faults that was flown with one."""
-    for level, kind in (("instruction", "an instruction"), ("source", "a state")):
-        for stack, those in flights.items():
-            saved = []
-            for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
-                lost = protected(those, detector, level=level, bare_lost=True)
-                found = share(lost, value=False)
-                saved += [f"{name} saves {_rate(found)}"] if found.total else []
-            if saved:
-                place = f"On {stack}, of the missions that a fault in {kind} loses"
-                return f"{place}, {_listed_in_words(saved)}."
-    return "No mission that a fault loses was flown again with a detector."
+def _saved_sentence(flights: Mapping[str, pa.Table], level: str, kind: str) -> str:
+    """What the detectors save of faults of one level, on the first stack flown with one."""
+    for stack, those in flights.items():
+        saved = []
+        for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
+            lost = protected(those, detector, level=level, bare_lost=True)
+            found = share(lost, value=False)
+            saved += [f"{name} saves {_rate(found)}"] if found.total else []
+        if saved:
+            place = f"On {stack}, of the missions that a fault in {kind} loses"
+            return f"{place}, {_listed_in_words(saved)}."
+    return f"No mission that a fault in {kind} loses was flown again with a detector."
 
 
 def _crash_sentence(flights: Mapping[str, pa.Table]) -> str:
