@@ -155,6 +155,8 @@ def _stream(frame: bytes, header: int) -> tuple[int, int, int]:
 __all__ = ["MAX_FRAME_LENGTH", "Codec", "Message", "Signing", "dialect"]
 
 Message = Any  # an instance of one of pymavlink's generated message classes
+frame_of: Callable[[Message], bytes] = attrgetter("_msgbuf")
+"""Return the frame of a received message, as its `get_msgbuf`."""
 
 
 _MARKERS = _V1, _V2 = 0xFE, 0xFD

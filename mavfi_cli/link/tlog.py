@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_length
+from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_length, frame_of
 from mavfi_cli.link.sender_slot import two_autopilots
 from mavfi_cli.link.transport import Transport
 
@@ -172,7 +172,7 @@ class RecordedLink:
     def messages(self, data: bytes, stamp_s: float) -> list[Message]:
         """Return the messages in received bytes, and record them at the stamp."""
         messages = self._codec.decode(data, datagram=self._transport.datagram)
-        self._record(stamp_s, [message.get_msgbuf() for message in messages])
+        self._record(stamp_s, list(map(frame_of, messages)))
         return messages
 
     def send(self, messages: Sequence[Message], stamp_s: float) -> None:
