@@ -156,7 +156,7 @@ def _attack(
         prepared, place = _prepare(plan, target, stage, notice)
     stage(f"drawing {plan.runs} faults")
     golden = tuple(each.golden for each in prepared.inputs)
-    bench = _Bench(plan=plan, target=prepared.target, golden=golden)
+    bench = _Bench(plan=plan, target=target, golden=golden)
     workers.take(bench, place)
     planned = _draw(plan, bench, prepared)
     done: dict[int, Record] = {}
@@ -196,7 +196,7 @@ def _prepare(
         undo.pop_all()
     stream = {"kernel": target.stream[0]} if target.stream else {}
     prepared = TargetRuns(
-        target=place.target,
+        target=target,
         context=stream | place.context(),
         inputs=tuple(
             _PreparedInput(golden=run, profile=profile)

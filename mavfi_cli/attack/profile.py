@@ -167,13 +167,12 @@ def profile_counted(
         TargetError: no instruction in scope executes.
     """
     image, code, scope = _code(place)
-    objects = [image.named(name) for name in scope.objects]
-    found = counts([loaded.path for loaded in objects if loaded.path is not None])
+    objects = {image.path_of(name): image.named(name) for name in scope.objects}
     executions = {
-        loaded.bias + offset: count
-        for loaded in objects
-        for offset, count in found.get(loaded.path or "", {}).items()
-        if loaded.bias + offset in scope
+        objects[path].bias + offset: count
+        for path, found in counts(list(objects)).items()
+        for offset, count in found.items()
+        if objects[path].bias + offset in scope
     }
     if not executions:
         raise TargetError(place.name, _NOTHING)

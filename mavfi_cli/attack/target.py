@@ -218,10 +218,6 @@ class JudgedPlace(AttackPlace, Protocol):
     """A place whose runs end by themselves and leave an output."""
 
     @property
-    def target(self) -> AttackTarget:
-        """The target with the facts found so far, so that a worker opens it faster."""
-
-    @property
     def limits(self) -> RunLimits:
         """The limits beyond which a run counts as hung."""
 

@@ -22,13 +22,11 @@ from elftools.elf.elffile import ELFFile
 
 from mavfi_cli.core.errors import FaultError, UnknownName
 from mavfi_cli.fi.tracer.image import (
-    ElfFacts,
     Function,
     Image,
     Location,
     Part,
     Region,
-    elf_facts,
     executable_mapping,
 )
 
@@ -192,7 +190,7 @@ def _octomap() -> KernelScope:
 def _collision_check() -> KernelScope:
     image = Image(os.getpid())
     library = _object_of(image, "libfcl")
-    part = _part([f for f in _facts(image, library).functions_with("OcTree", *_FCL_USED)
+    part = _part([f for f in _functions_with(image, library, "OcTree", *_FCL_USED)
                   if _tests_spheres(f.name)])  # fmt: skip
     entry = image.function(_FCL_COLLIDE, [library])
     return KernelScope(
@@ -216,7 +214,7 @@ def _planner(kernel: str) -> KernelScope:
     motion = f"geometric{name}6Motion"
     wanted = (f"ompl9geometric{name}{end}", motion, *_OMPL_SHARED)
     solve = f"_ZN4ompl9geometric{name}5solveERKNS_4base27PlannerTerminationConditionE"
-    part = _part(_facts(image, library).functions_with(*wanted))
+    part = _part(_functions_with(image, library, *wanted))
     segment, _, region = compiled_region(segment_free)
     return KernelScope(
         kernel=kernel,
@@ -231,17 +229,18 @@ def _nearest(image: Image, library: str, motion: str) -> tuple[Location, ...]:
     """The nearest-neighbour searches that a planner's tree may call."""
     return tuple(
         Location(library, function.start)
-        for function in _facts(image, library).functions_with(motion)
+        for function in _functions_with(image, library, motion)
         if "NearestNeighborsGNATNoThreadSafety" in function.name
         and ("E7nearestE" in function.name or "E8nearestKE" in function.name)
         and "4Node" not in function.name
     )
 
 
-def _facts(image: Image, library: str) -> ElfFacts:
-    path = image.named(library).path
-    assert path is not None
-    return elf_facts(path)
+def _functions_with(image: Image, library: str, *parts: str) -> list[Function]:
+    """The functions of a library whose names contain one of the texts."""
+    facts = image.named(library).facts
+    assert facts is not None
+    return facts.functions_with(*parts)
 
 
 def _object_of(image: Image, prefix: str, folder: str = "") -> str:

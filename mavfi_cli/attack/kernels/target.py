@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import hashlib
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +49,6 @@ class _Layout:
 
     scope: KernelScope
     image: Image
-    digest: str  # hash of the addresses of all code
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +59,6 @@ class KernelTarget:
         kernel: name of one of ours, or the file of a user's kernel.
         inputs: file with inputs of one flight; `flight` names that flight in words.
         tolerance: relative error of an output that still counts as benign.
-        layout: layout of an earlier template, because finding it takes seconds.
     """
 
     kernel: str
@@ -70,7 +67,6 @@ class KernelTarget:
     flight: str = ""
     tolerance: float = 0.0
     mechanism: Mechanism | None = None
-    layout: _Layout | None = None
 
     @property
     def name(self) -> str:
@@ -131,27 +127,23 @@ class KernelPlace:
             self._template = ServedProcess(_PROGRAM, output=self._output)
             undo.callback(self._template.kill)
             count = self._template.begin((target.kernel, inputs), self.name)
-            self.layout = self._look_up(target.layout)
+            self.layout = self._look_up()
             self._closing = undo.pop_all()
-        self.target = replace(target, layout=self.layout)
-        self._number = 0
+        self._target, self._number = target, 0
         self.inputs = [self]
         while len(self.inputs) < count:
             self.inputs.append(copy.copy(self))
             self.inputs[-1]._number = len(self.inputs) - 1
 
-    def _look_up(self, known: _Layout | None) -> _Layout:
-        """Find the memory layout; reuse the known one if it is the same."""
-        pid, process = self._template.pid, self._template
-        digest_of_code = _digest_of_code(pid)
-        if known is not None and known.digest == digest_of_code:
-            return known
+    def _look_up(self) -> _Layout:
+        """Find the memory layout."""
+        process = self._template
         process.connection.send(ASK_SCOPE)
         try:
             scope: KernelScope = receive(process.connection)
         except (OSError, EOFError):
             raise TargetError(self.name, f"cannot be attacked: {process.last_words()}") from None
-        return _Layout(scope=scope, image=Image(pid, scope.regions), digest=digest_of_code)
+        return _Layout(scope=scope, image=Image(process.pid, scope.regions))
 
     def start(self) -> Tracee:
         """Start a run, attached and stopped, that has not called the kernel yet.
@@ -166,7 +158,7 @@ class KernelPlace:
         told = control.recv(PID_BYTES)
         if len(told) < PID_BYTES:
             raise FaultError(f"the process that loads {self.name} has died")
-        tracee = Tracee.attach(int.from_bytes(told, "little"), mechanism=self.target.mechanism)
+        tracee = Tracee.attach(int.from_bytes(told, "little"), mechanism=self._target.mechanism)
         control.send(GO)
         return tracee
 
@@ -181,7 +173,7 @@ class KernelPlace:
     def context(self) -> dict[str, Any]:
         """Entries of every record about the kernel."""
         objects = list(self.layout.scope.objects)
-        return {"scope": objects, "inputs_sha256": self.target.inputs_sha256}
+        return {"scope": objects, "inputs_sha256": self._target.inputs_sha256}
 
     def profile(
         self, rng: np.random.Generator, *, windows: int, watch: Watch | None = None
@@ -235,7 +227,7 @@ class KernelPlace:
         """Judge the last run; `ended` is None if it exceeded its limit."""
         output = self.left()
         left = None if output is None or ended is None else output.data
-        tolerance = self.target.tolerance or None
+        tolerance = self._target.tolerance or None
         outcome, difference = judged(golden, ended, left, self._compare, tolerance=tolerance)
         raised = left is not None and ended is not None and ended.exit_code == RAISED
         size = 0.0 if difference is None else difference.relative
@@ -266,11 +258,3 @@ def _read(inputs: Path) -> bytes:
         return inputs.read_bytes()
     except OSError as error:
         raise RecordError(f"{inputs}: {error.strerror}") from None
-
-
-def _digest_of_code(pid: int) -> str:
-    """Hash of the addresses of everything executable in a process."""
-    maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
-    code = [line.split() for line in maps if "x" in line.split()[1]]
-    known = [f"{part[0]} {part[2]} {part[-1]}" for part in code]
-    return hashlib.sha256("\n".join(known).encode()).hexdigest()

@@ -4,8 +4,8 @@ A location is `(object, offset)`. For an ELF object the offset is the address th
 (what `objdump` and `nm` print), so it does not depend on where the object was loaded. Compiled
 code without a file (numba) is a named region, with offsets from its start.
 
-Functions are searched in the raw symbol tables: a library of 10 MB has tens of thousands of them
-with long names, and a mission waits for the answer.
+Functions are read from the raw symbol tables, because a library of 10 MB has tens of thousands of
+them and a mission waits for the answer.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from elftools.common.exceptions import ELFError
 from elftools.elf.elffile import ELFFile
-from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import FaultError, UnknownName
 
@@ -34,60 +34,12 @@ _SYMBOL = np.dtype(
 _FUNCTION_TYPES = (2, 10)
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Function:
+class Function(NamedTuple):
     """One function, at its linked address."""
 
     start: int
     size: int
     name: str
-
-
-class _Table:
-    """The functions of one symbol table, ascending, with their names in one string."""
-
-    def __init__(self, symbols: NDArray[np.void], names: bytes) -> None:
-        wanted = np.isin(symbols["info"] & 0xF, _FUNCTION_TYPES) & (symbols["value"] != 0)
-        found = symbols[wanted]
-        self._symbols = found[np.argsort(found["value"], kind="stable")]
-        self._names = names
-
-    def _function(self, index: int) -> Function:
-        _, size, at = (int(self._symbols[key][index]) for key in ("value", "size", "name"))
-        name = self._names[at : self._names.index(b"\0", at)].decode(errors="replace")
-        return Function(int(self._symbols["value"][index]), size, name)
-
-    def __iter__(self) -> Iterator[Function]:
-        return map(self._function, range(len(self._symbols)))
-
-    def at(self, address: int) -> Iterator[Function]:
-        """The last functions that start no later than the address."""
-        starts = self._symbols["value"]
-        end = int(np.searchsorted(starts, address, side="right"))
-        first = int(np.searchsorted(starts, starts[end - 1])) if end else 0
-        return map(self._function, range(first, end))
-
-    def named(self, name: str) -> Iterator[Function]:
-        """The functions of exactly this name; a name may be stored as the end of a longer one."""
-        end = name.encode() + b"\0"
-        places = [match.start() for match in re.finditer(re.escape(end), self._names)]
-        return map(self._function, np.flatnonzero(np.isin(self._symbols["name"], places)).tolist())
-
-    def containing(self, part: str) -> NDArray[np.bool_]:
-        """(n,) mask of the functions whose names contain the text."""
-        places = np.array([m.start() for m in re.finditer(re.escape(part.encode()), self._names)])
-        ends = np.flatnonzero(np.frombuffer(self._names, np.uint8) == 0)
-        begins = self._symbols["name"]
-        stops = ends[np.searchsorted(ends, begins)]
-        hits = np.searchsorted(places, begins) < np.searchsorted(places, stops)
-        return np.asarray(hits, np.bool_)
-
-    def with_any(self, parts: Iterable[str]) -> Iterator[Function]:
-        """The functions whose names contain one of the texts."""
-        hits = np.zeros(len(self._symbols), np.bool_)
-        for part in parts:
-            hits |= self.containing(part)
-        return map(self._function, np.flatnonzero(hits).tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,17 +52,13 @@ class ElfFacts:
     first_segment: int  # linked address of file offset 0
 
     @functools.cached_property
-    def _tables(self) -> tuple[_Table, ...]:
-        """The symbol tables, read on first use: few objects of a Python process are needed."""
+    def functions(self) -> tuple[Function, ...]:
+        """All functions, ascending; read on first use, because few objects of a process need it."""
         try:
             with open(self.path, "rb") as stream:
-                return tuple(_read_tables(ELFFile(stream)))
+                return tuple(sorted(set(_functions(ELFFile(stream)))))
         except (OSError, ELFError) as error:
             raise FaultError(f"{self.path}: not a readable ELF object ({error})") from None
-
-    def functions(self) -> list[Function]:
-        """All functions, ascending."""
-        return sorted({function for table in self._tables for function in table})
 
     def function_at(self, address: int) -> Function | None:
         """The function that holds a linked address.
@@ -118,23 +66,23 @@ class ElfFacts:
         If several start at one address, the last of the greatest size and name counts. A
         function without a size reaches to the next.
         """
-        found = [function for table in self._tables for function in table.at(address)]
-        last = max(found, default=None)
-        if last is None or (last.size and address >= last.start + last.size):
+        end = bisect.bisect_right(self.functions, address, key=attrgetter("start"))
+        if not end:
             return None
-        return last
+        last = self.functions[end - 1]
+        return None if last.size and address >= last.start + last.size else last
 
     def function(self, name: str) -> Function | None:
         """The first function of exactly this name."""
-        return min((f for table in self._tables for f in table.named(name)), default=None)
+        return next((each for each in self.functions if each.name == name), None)
 
     def functions_with(self, *parts: str) -> list[Function]:
         """The functions whose names contain one of the texts, ascending."""
-        return sorted({f for table in self._tables for f in table.with_any(parts)})
+        return [each for each in self.functions if any(part in each.name for part in parts)]
 
 
 @functools.lru_cache(maxsize=256)
-def elf_facts(path: str, _modified_ns: int = 0) -> ElfFacts:
+def _elf_facts(path: str, _modified_ns: int) -> ElfFacts:
     """Read an ELF file; the hash of its contents replaces a missing build id.
 
     Raises:
@@ -172,12 +120,18 @@ def _text(elf: Any) -> tuple[range, ...]:
     )
 
 
-def _read_tables(elf: Any) -> Iterator[_Table]:
-    for name in (".symtab", ".dynsym"):
-        section = elf.get_section_by_name(name)
-        if section is not None and section["sh_size"]:
-            names: bytes = elf.get_section(section["sh_link"]).data()
-            yield _Table(np.frombuffer(section.data(), _SYMBOL), names)
+def _functions(elf: Any) -> Iterator[Function]:
+    """The functions of both symbol tables."""
+    for table in (".symtab", ".dynsym"):
+        section = elf.get_section_by_name(table)
+        if section is None or not section["sh_size"]:
+            continue
+        names: bytes = elf.get_section(section["sh_link"]).data()
+        symbols = np.frombuffer(section.data(), _SYMBOL)
+        wanted = np.isin(symbols["info"] & 0xF, _FUNCTION_TYPES) & (symbols["value"] != 0)
+        for at, start, size in symbols[wanted][["name", "value", "size"]].tolist():
+            name = names[at : names.index(b"\0", at)].decode(errors="replace")
+            yield Function(start, size, name)
 
 
 def short_name(symbol: str) -> str:
@@ -217,12 +171,17 @@ class _LoadedObject:
     """An ELF object or a named region in a process."""
 
     name: str
-    path: str | None  # None for a region
+    facts: ElfFacts | None  # None for a region
     bias: int  # address = bias + offset
     start: int
     end: int
     build_id: str
     text: tuple[range, ...]  # offsets
+
+    @property
+    def path(self) -> str | None:
+        """Path of its file; None for a region."""
+        return None if self.facts is None else self.facts.path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -327,9 +286,9 @@ class Image:
     def symbol(self, location: Location) -> str:
         """`function+offset` of a location, or the empty string."""
         loaded = self.find(location.object)
-        if loaded is None or loaded.path is None:
+        if loaded is None or loaded.facts is None:
             return ""
-        found = elf_facts(loaded.path).function_at(location.offset)
+        found = loaded.facts.function_at(location.offset)
         return "" if found is None else f"{found.name}+{location.offset - found.start:#x}"
 
     def function(self, name: str, objects: Iterable[str]) -> Location:
@@ -340,13 +299,12 @@ class Image:
         """
         known: list[str] = []
         for loaded in map(self.named, objects):
-            if loaded.path is None:
+            if loaded.facts is None:
                 continue
-            facts = elf_facts(loaded.path)
-            found = facts.function(name)
+            found = loaded.facts.function(name)
             if found is not None:
                 return Location(loaded.name, found.start)
-            known += [function.name for function in facts.functions()]
+            known += [function.name for function in loaded.facts.functions]
         raise UnknownName("function", name, known[:200])
 
 
@@ -409,13 +367,13 @@ def _load(path: str, mappings: list[_FileMapping]) -> _LoadedObject | None:
         if stream.read(4) != b"\x7fELF":
             return None
     try:
-        facts = elf_facts(path, Path(path).stat().st_mtime_ns)
+        facts = _elf_facts(path, Path(path).stat().st_mtime_ns)
     except FaultError:
         return None
     first = min(mappings, key=lambda mapping: mapping.file_offset)
     return _LoadedObject(
         name=Path(path).name,
-        path=path,
+        facts=facts,
         bias=first.start - first.file_offset - facts.first_segment,
         start=min(mapping.start for mapping in mappings),
         end=max(mapping.end for mapping in mappings),
@@ -433,7 +391,7 @@ def _region(pid: int, name: str, region: Region) -> _LoadedObject:
         build_id = "sha256:" + hashlib.sha256(code).hexdigest()[:40]
     return _LoadedObject(
         name=name,
-        path=None,
+        facts=None,
         bias=span.start,
         start=span.start,
         end=span.stop,
