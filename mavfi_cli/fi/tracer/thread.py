@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Generic, TypeVar
 
 from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Tracee, best_mechanism
@@ -25,33 +26,27 @@ class TracerThread(Generic[T]):
     """
 
     def __init__(self, work: Callable[[Callable[[], None]], T]) -> None:
-        self._armed = threading.Event()
-        self._result: list[T] = []
-        self._error: BaseException | None = None
+        self._armed, self._done = threading.Event(), Future[T]()
 
         def run() -> None:
             try:
-                self._result.append(work(self._armed.set))
+                self._done.set_result(work(self._armed.set))
             except BaseException as error:  # the thread's boundary: `result` raises it again
-                self._error = error
+                self._done.set_exception(error)
             finally:
                 self._armed.set()
 
-        self._thread = threading.Thread(target=run, daemon=True)
-        self._thread.start()
+        threading.Thread(target=run, daemon=True).start()
 
     def await_armed(self) -> None:
         """Wait until the node runs towards the awaited event; raise any earlier error."""
         self._armed.wait()
-        if self._error is not None:
-            raise self._error
+        if self._done.done():
+            self._done.result()
 
     def result(self) -> T:
         """Wait for the end of the work; return its result or raise its error."""
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return self._result[0]
+        return self._done.result()
 
 
 class EntryCounter:
