@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.stats.shares import Share
 
 KERNELS = "kernels.json"
 
@@ -28,6 +30,17 @@ def kernel_summary(path: Path) -> Mapping[str, Any]:
     except (ValueError, KeyError, TypeError) as error:
         raise RecordError(f"{path}: no summary of `mavfi kernels` ({error!r})") from None
     return found
+
+
+def outcome_share(kernel: Mapping[str, Any], outcome: str) -> Share:
+    """The share of an outcome in a kernel of a summary, with the interval of the summary.
+
+    That interval is wider than one of independent runs, because runs of one input are alike.
+    """
+    told = kernel["outcomes"][outcome]
+    low, high = told["wilson95"]
+    share = math.nan if told["share"] is None else told["share"]
+    return Share(count=told["count"], total=told["of"], share=share, low=low, high=high)
 
 
 def silent_of_all(kernel: Mapping[str, Any]) -> tuple[int, int]:

@@ -167,7 +167,7 @@ def profile_counted(
         TargetError: no instruction in scope executes.
     """
     image, code, scope = _code(place)
-    objects = {image.path_of(name): image.named(name) for name in scope.objects}
+    objects = {each.path: each for each in map(image.named, scope.objects) if each.path is not None}
     executions = {
         objects[path].bias + offset: count
         for path, found in counts(list(objects)).items()

@@ -29,7 +29,7 @@ Watch = Callable[[int | str], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunLimits:
-    """When a run counts as hung, and how far to step."""
+    """The limits beyond which a run counts as hung, and how far to step."""
 
     factor: float = 10.0  # multiple of the golden CPU time and duration
     cpu_grace_s: float = 1.0

@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from mavfi_cli.autonomy import planners
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
@@ -16,6 +15,7 @@ from mavfi_cli.campaigns.missions import (
     PlannedMission,
     canonical,
     changes_of,
+    kind_of,
     label_text,
     naming,
 )
@@ -265,7 +265,7 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
     seen: set[str] = set()
     for mission in missions:
         config = mission.config
-        key = canonical(_kind(changes_of(config)))
+        key = kind_of(changes_of(config), _ALIKE)
         simple = changes_of(replace(config.golden, seed=0))
         vehicle = canonical({**simple, "planner": None, "platform": None, "stack": None})
         if key in seen and vehicle in seen:
@@ -273,15 +273,6 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
         with naming(mission.labels):
             check_names(config, start=vehicle not in seen)
         seen |= {key, vehicle}
-
-
-def _kind(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The changes that can be wrong whatever the seeds."""
-    kind = {name: value for name, value in changes.items() if name not in _ALIKE}
-    for name in ("fault", "instruction"):
-        if kind.get(name) is not None:
-            kind[name] = {**kind[name], "seed": 0}
-    return kind
 
 
 def check_names(config: MissionConfig, *, start: bool = True) -> None:

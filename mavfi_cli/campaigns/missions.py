@@ -6,7 +6,7 @@ import contextlib
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
 from operator import attrgetter
@@ -79,6 +79,19 @@ def _plain(value: Any) -> Any:
         return [_plain(each) for each in value]
     names = getattr(value, "__dataclass_fields__", None)
     return value if names is None else {name: _plain(getattr(value, name)) for name in names}
+
+
+def kind_of(changes: Mapping[str, Any], apart: Collection[str]) -> str:
+    """A mission as text without some of its values, and without the seeds of its faults.
+
+    Args:
+        changes: of `changes_of`.
+    """
+    kind = {name: value for name, value in changes.items() if name not in apart}
+    for name in ("fault", "instruction"):
+        if kind.get(name) is not None:
+            kind[name] = {**kind[name], "seed": 0}
+    return canonical(kind)
 
 
 def label_text(labels: Mapping[str, Any]) -> str:

@@ -224,7 +224,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stop:
-    """When a setting has been flown often enough.
+    """The rule that ends a setting which has been flown often enough.
 
     Attributes:
         margin: largest half-width of the Wilson interval of the success rate.

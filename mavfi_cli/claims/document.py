@@ -26,7 +26,7 @@ from mavfi_cli.claims.items import shown_items
 from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.report.paper_figures import draw_strips
-from mavfi_cli.report.tables.paper_table import count_of
+from mavfi_cli.report.tables.paper_table import DETECTOR_TITLES, count_of
 from mavfi_cli.reproduction.figures import OVER_GOLDEN, panel
 from mavfi_cli.reproduction.flights import (
     LONGER,
@@ -42,7 +42,7 @@ from mavfi_cli.reproduction.items import ITEMS, LEFT_OUT, printed_name
 from mavfi_cli.stats.effects import ClaimVerdict, excess_over_mean, judge
 from mavfi_cli.stats.shares import Share, wilson
 
-_DETECTORS = {None: "no detector", "gad": "Gaussian", "aad": "autoencoder"}
+_DETECTORS = {None: "no detector"} | DETECTOR_TITLES
 _LONGEST = 5  # flights of a campaign that are listed although they succeed
 _ISOLATED = "isolated kernels"
 
@@ -76,7 +76,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
         "items": [*shown_items(evidence, flown)],
         "left_out": {printed_name(name): why for name, why in LEFT_OUT.items()},
-        "detectors": ("", "gad", "aad"),
+        "detectors": ("", *DETECTOR_TITLES),
         "upsets_per_hour": upsets_per_hour,
         "hourly": {s: [*hourly_failures(flights[s], upsets_per_hour)] for s in STACKS},
         "arms": [

@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import COSTS, chosen, flags, numbers
 from mavfi_cli.analysis.groups import RESAMPLES
+from mavfi_cli.analysis.kernel_runs import outcome_share
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.tables.paper_table import count_of
 from mavfi_cli.reproduction.flights import (
@@ -281,25 +282,20 @@ def _outcome_beside(
     if kernel not in kernels or not there:
         return Finding()
     choose = max if extreme == "most" else min
-    other = choose(there, key=lambda each: _outcome(kernels, each, outcome).share)
-    shares = {each: _outcome(kernels, each, outcome) for each in (kernel, other)}
+    other = choose(there, key=lambda each: outcome_share(kernels[each], outcome).share)
+    shares = {each: outcome_share(kernels[each], outcome) for each in (kernel, other)}
     told = (f"{kernels[each]['title']} {100 * found.share:.1f} %" for each, found in shares.items())
     return Finding(effect=rate_difference(*shares.values()), told=", ".join(told))
 
 
 def _least_benign(kernels: Kernels, but: str) -> Finding:
     """The least share of benign runs of all kernels but one."""
-    shares = {each: _outcome(kernels, each, "benign") for each in kernels if each != but}
+    shares = {each: outcome_share(kernels[each], "benign") for each in kernels if each != but}
     if not shares:
         return Finding()
     least = min(shares, key=lambda each: shares[each].share)
     told = f"least: {kernels[least]['title']}, {count_of(shares[least])}"
     return Finding(effect=as_interval(shares[least]), told=told)
-
-
-def _outcome(kernels: Kernels, name: str, outcome: str) -> Share:
-    told = kernels[name]["outcomes"][outcome]
-    return wilson(told["count"], told["of"])
 
 
 MEASURES: Mapping[str, Callable[..., Finding]] = {

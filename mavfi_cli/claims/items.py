@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.campaigns.missions import canonical
+from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.claims.sources import STACKS, Evidence
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.reproduction.figures import draw
 from mavfi_cli.reproduction.flights import pooled, ratios, timed
 from mavfi_cli.reproduction.items import ITEMS, Item, Source
 from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
-from mavfi_cli.reproduction.plan import key_of, kinds_of
+from mavfi_cli.reproduction.plan import kinds_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,7 +32,6 @@ _GOLDEN_ONLY = ("fig11",)
 _SETTING = ("world", "platform", "planner", "fault_target", "fault_field", "fault_bits",
             "detector", "protect")  # fmt: skip
 _SEEDS = ("seed", "world_seed", "time_limit_s")
-_FAULTS = ("fault", "instruction")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,18 +125,8 @@ def _over_own(flights: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _of_kind(item: Item, stack: str, table: pa.Table) -> pa.Table:
-    kinds = {_kind(key_of(mission)) for mission in kinds_of([item], stack)}
-    known: dict[str, bool] = {}
-    wanted = [
-        known.setdefault(kind, kind in kinds) for kind in map(_kind, table["changes"].to_pylist())
-    ]
+    """The flights that differ from the item's missions on a stack in _SEEDS only."""
+    kinds = {kind_of(changes_of(mission.config), _SEEDS) for mission in kinds_of([item], stack)}
+    changes = map(json.loads, table["changes"].to_pylist())
+    wanted = [kind_of(each, _SEEDS) in kinds for each in changes]
     return table.filter(pa.array(wanted, pa.bool_()))
-
-
-def _kind(changes: str) -> str:
-    """The configuration without seeds, as text."""
-    config = {name: each for name, each in json.loads(changes).items() if name not in _SEEDS}
-    for name in _FAULTS:
-        if config.get(name):
-            config[name] = {**config[name], "seed": 0}
-    return canonical(config)

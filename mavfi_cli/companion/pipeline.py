@@ -393,7 +393,7 @@ class Companion:
             self.pilot.plan_lost()
 
     def _control_is_up(self) -> None:
-        """If control owned its queue, the pilot requests a new plan."""
+        """The pilot requests a new plan if control owned its queue."""
         if self._stack.control_owns_queue and self._state is not None:
             self._queued = None
             self.pilot.control_lost(self._state)

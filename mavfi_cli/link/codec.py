@@ -38,7 +38,7 @@ MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
 _MARKER = re.compile(rb"[\xfd\xfe]")
 _SIGNED = 0x01
 _INCOMPLETE = -1
-_TOLD = ("_header", "_msgbuf", "_crc")  # attributes of a message that its frame tells
+_OF_FRAME = ("_header", "_msgbuf", "_crc")  # attributes of a message that its frame tells
 _PACKET = "ENCAPSULATED_DATA"  # half of all messages; its array stays in one piece
 
 _KINDS: dict[int, _Kind] = {}
@@ -250,13 +250,13 @@ def _getter(names: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
 def _received(cls: Any) -> Any:
     """Return a subclass for received messages, which differs in its constructor only.
 
-    The constructor takes _TOLD and the fields in the order of the wire. It is generated, as those
-    of dataclasses are. With pymavlink's, a frame takes a third longer to decode, because each
+    The constructor takes _OF_FRAME and the fields in the order of the wire. It is generated, as
+    those of dataclasses are. With pymavlink's, a frame takes a third longer to decode, because each
     message then begins with an empty header and attributes that are equal in the whole class.
     """
     kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
     blank = vars(cls(*(b"" if kind == "char" else 0 for kind in cls.fieldtypes)))
-    lines = [f"self.{name} = {name}" for name in _TOLD]
+    lines = [f"self.{name} = {name}" for name in _OF_FRAME]
     for name in cls.ordered_fieldnames:
         if kinds[name] == "char":
             lines.append(f"self._{name}_raw = {name}")
@@ -264,9 +264,9 @@ def _received(cls: Any) -> Any:
         else:
             lines.append(f"self.{name} = {name}")
     defined: dict[str, Any] = {}
-    arguments = ", ".join(["self", *_TOLD, *cls.ordered_fieldnames])
+    arguments = ", ".join(["self", *_OF_FRAME, *cls.ordered_fieldnames])
     exec(f"def __init__({arguments}):\n    " + "\n    ".join(lines), defined)
-    constants = {name: blank[name] for name in blank if name[0] == "_" and name not in _TOLD}
+    constants = {name: blank[name] for name in blank if name[0] == "_" and name not in _OF_FRAME}
     return type(cls.__name__, (cls,), {**constants, "__init__": defined["__init__"]})
 
 

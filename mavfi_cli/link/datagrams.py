@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from mavfi_cli.link.codec import frame_length
 from mavfi_cli.link.sender_slot import SenderSlot, is_autopilots
 from mavfi_cli.link.sockets import CHUNK, MAX_PEERS, SMALL_CHUNK, Receiver, SocketOwner, text_of
 
@@ -99,9 +100,7 @@ def _split_frames(data: bytes) -> list[bytes]:
         return [data]
     datagrams, start, position = [], 0, 0
     while position < len(data):
-        length = data[position + 1] + 8
-        if data[position] == 0xFD:
-            length += 4 + (13 if data[position + 2] & 1 else 0)
+        length = frame_length(data, position, len(data))
         if position > start and position + length - start > _MTU_PAYLOAD:
             datagrams.append(data[start:position])
             start = position

@@ -121,7 +121,7 @@ class Flight:
 
     @property
     def place_enu_m(self) -> FloatArray:
-        """Where the vehicle stands (3,). Call it after `connect` only."""
+        """The place of the vehicle (3,), known after `connect`."""
         assert self._session.state is not None
         return self._session.state.position_enu_m
 

@@ -67,9 +67,8 @@ class FlightLogger:
             self._phase = session.phase
             news.append(("phase", session.phase.value))
         texts = session.telemetry.texts
-        if texts.total > self._texts:
-            news += [("autopilot", each.text.strip()) for each in texts.since(self._texts)]
-            self._texts = texts.total
+        news += [("autopilot", each.text.strip()) for each in texts.since(self._texts)]
+        self._texts = texts.total
         news += [("fault", text) for text in injection.news()]
         if companion is not None:
             alarms = companion.protection.news()

@@ -22,12 +22,11 @@ from mavfi_cli.report.paper_figures import (
     draw_stack,
     draw_strips,
 )
-from mavfi_cli.report.tables.paper_table import PaperTable
+from mavfi_cli.report.tables.paper_table import DETECTOR_TITLES, PaperTable
 from mavfi_cli.report.top_view import draw_trajectories, panels_of
 from mavfi_cli.reproduction.flights import STAGES, by_value, comparable, faulty, golden
 from mavfi_cli.reproduction.items import printed
 from mavfi_cli.reproduction.layouts import (
-    DETECTORS,
     KERNELS_FLOWN,
     PROTECTED,
     values_and_deltas,
@@ -104,7 +103,7 @@ def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
 def _beside_detectors(title: str, flights: pa.Table, paper: float | None) -> StripPanel:
     """A row for the flights with faults, and one for those with each detector."""
     rows: list[_Row] = [("fault", None, faulty(flights))]
-    rows += [(f"fault, {name.upper()}", name, faulty(flights, name)) for name in DETECTORS]
+    rows += [(f"fault, {name.upper()}", name, faulty(flights, name)) for name in DETECTOR_TITLES]
     return panel(title, rows, paper)
 
 
@@ -128,7 +127,7 @@ def _fig14(flights: pa.Table, columns: str) -> Figure:
         rows: list[_Row] = [("no protection", None, faulty(here))]
         rows += [
             (f"{name.upper()} {_short(stages)}", name, faulty(here, name, protect=stages))
-            for name in DETECTORS
+            for name in DETECTOR_TITLES
             for stages in PROTECTED
         ]
         panels.append(panel(world, rows))

@@ -17,10 +17,11 @@ import numpy as np
 import pyarrow as pa
 
 from mavfi_cli.analysis.flights import chosen, known, numbers
+from mavfi_cli.analysis.kernel_runs import outcome_share
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.record.run_folder import TRACE
-from mavfi_cli.report.tables.paper_table import PaperCell, PaperRow, PaperTable
+from mavfi_cli.report.tables.paper_table import DETECTOR_TITLES, PaperCell, PaperRow, PaperTable
 from mavfi_cli.reproduction.flights import (
     EVERY_STAGE,
     STAGES,
@@ -42,12 +43,10 @@ from mavfi_cli.reproduction.measures import (
     success,
     worst_mean,
 )
-from mavfi_cli.stats.shares import Share
 from mavfi_cli.vpm.model import schemes_with
 from mavfi_cli.vpm.report import Choices, report
 from mavfi_cli.vpm.vehicle import ModelVehicle
 
-DETECTORS = {"gad": "Gaussian", "aad": "autoencoder"}
 WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
 _GOLDEN = "golden"  # begins the labels of rows of golden flights
@@ -195,7 +194,7 @@ def _table3_told(table: PaperTable) -> str:
 def _table4(flights: pa.Table) -> Iterator[PaperRow]:
     """Success in each world: golden, with faults, with each detector."""
     settings = [(_GOLDEN, "golden", golden(flights)), ("injection", "none", faulty(flights))]
-    settings += [(f"{told}-based", x, faulty(flights, x)) for x, told in DETECTORS.items()]
+    settings += [(f"{told}-based", x, faulty(flights, x)) for x, told in DETECTOR_TITLES.items()]
     for title, key, those in settings:
         cells = (
             success(chosen(those, world=world), printed("table4", "success_percent", key, world))
@@ -227,7 +226,7 @@ def _fig12(flights: pa.Table) -> Iterator[PaperRow]:
 def _recovered(flights: pa.Table, item: str, unit: str, place: str) -> Iterator[PaperCell]:
     """What each detector recovers of the worst flight, beside the paper's numbers in this unit."""
     measure = "recovered" if unit == "recovered_points" else "recovered_share"
-    for name in DETECTORS:
+    for name in DETECTOR_TITLES:
         yield recovered(faulty(flights, name), measure, printed(item, unit, name, place))
 
 
@@ -241,7 +240,7 @@ def _fig12_told(table: PaperTable) -> str:
 
 def _fig14(flights: pa.Table) -> Iterator[PaperRow]:
     """Share of the worst increase that each detector recovers, by protected stages."""
-    for detector, told in DETECTORS.items():
+    for detector, told in DETECTOR_TITLES.items():
         for stages in PROTECTED:
             paper = ("fig14", "recovered_percent", detector)
             cells = (
@@ -265,7 +264,7 @@ def _fig14_told(table: PaperTable) -> str:
 
 def _table5(flights: pa.Table) -> Iterator[PaperRow]:
     """Shares of the flight time that detection and recovery take."""
-    for detector in DETECTORS:
+    for detector in DETECTOR_TITLES:
         for title, (columns, keys) in _parts(detector).items():
             cells = (
                 mean_cell(
@@ -438,18 +437,13 @@ def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
     for kernel in summary["kernels"]:
         name = kernel["kernel"]
         paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(name, name))
-        shares = [_share(kernel["outcomes"][outcome]) for outcome in _OUTCOMES]
+        shares = [outcome_share(kernel, outcome) for outcome in _OUTCOMES]
         cells = [share_cell(shares[0], paper), *map(share_cell, shares[1:])]
         rows.append(_row(kernel["title"], cells=cells))
     table = BY_NAME["fig6"].table(rows)
     most = _filled(table, 1)
     told = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""
     return replace(table, result=f"{told} (paper: OctoMap)" if most else "no runs")
-
-
-def _share(row: Mapping[str, Any]) -> Share:
-    low, high = row["wilson95"]
-    return Share(count=row["count"], total=row["of"], share=row["share"] or 0.0, low=low, high=high)
 
 
 # Performance model: Fig. 15 ----------------------------------------------------------------------

@@ -15,7 +15,7 @@ from mavfi_cli.report.tables.paper_table import PaperCell, Printed
 from mavfi_cli.reproduction.flights import ratios, share
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import OWN, worst_case
-from mavfi_cli.stats.shares import Share, rate
+from mavfi_cli.stats.shares import Share
 
 PERCENT = 100.0
 
@@ -35,8 +35,7 @@ def share_cell(share: Share, paper: Printed = None) -> PaperCell:
 
 def success(flights: pa.Table, paper: Printed = None) -> PaperCell:
     """Success rate of all flown missions, in per cent, as the paper counts."""
-    won = share(flights, value=False)
-    return share_cell(rate(won.count, won.total), paper)
+    return share_cell(share(flights, value=False), paper)
 
 
 def mean_cell(values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:

@@ -1,4 +1,4 @@
-"""Where the faults of an evaluation strike, and which bits they may flip."""
+"""The sites that the faults of an evaluation strike, and the bits that they may flip."""
 
 from __future__ import annotations
 

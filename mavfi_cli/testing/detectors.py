@@ -141,7 +141,7 @@ class DetectorContract:
         assert not _alarms(detector, change, Stage.CONTROL)
 
     def test_a_broken_memory_is_never_silent(self, name: str) -> None:
-        """With a NaN in any number that a score depends on, that score raises an alarm."""
+        """A score raises an alarm if any number that it depends on is NaN."""
         for key in base.find_detector(name).memory:
             for place in range(base.find_detector(name).memory[key].size):
                 healthy, broken = base.find_detector(name), base.find_detector(name)

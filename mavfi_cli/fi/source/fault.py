@@ -51,7 +51,7 @@ class Persistence(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger:
-    """When the fault strikes. PHASE uses the name, RANDOM and FORESEEN neither name nor number."""
+    """The moment of the fault. PHASE uses the name, RANDOM and FORESEEN neither name nor number."""
 
     when: When = When.RANDOM
     number: float = 0.0  # seconds, ticks, or the count of the invocation (from 1)

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from mavfi_cli.core.types import Outcome
 from mavfi_cli.fi import bits
 from mavfi_cli.mission.record.quality import QUALITY
 
@@ -74,12 +75,12 @@ class FlightRecord:
     @property
     def succeeded(self) -> bool:
         """True if the vehicle reached the goal."""
-        return self.outcome == "success"
+        return self.outcome == Outcome.SUCCESS.value
 
     @property
     def interrupted(self) -> bool:
         """True if the user interrupted the flight, so that the mission has no outcome."""
-        return self.outcome == "interrupted"
+        return self.outcome == Outcome.INTERRUPTED.value
 
     @property
     def golden(self) -> bool:
@@ -150,7 +151,7 @@ def _alarms(detection: Record) -> dict[str, Any]:
 
 
 def _applied(fault: Record) -> dict[str, Any]:
-    """When the fault was applied first, and to which states, or to which node."""
+    """The first time of the fault, and the states or the node that it was applied to."""
     applied = fault.get("state") == "applied"
     if fault.get("level") == "source":
         strikes = fault.get("strikes") or []

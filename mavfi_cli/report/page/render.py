@@ -14,12 +14,11 @@ from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.report.page.charts import Chart, arm_chart, flow_chart
 from mavfi_cli.report.tables.columns import csv_text
-from mavfi_cli.report.tables.paper_table import as_csv, cells_of, count_of
+from mavfi_cli.report.tables.paper_table import DETECTOR_TITLES, as_csv, cells_of, count_of
 
 _FOLDER = Path(__file__).parent
 _LIBRARIES = ("jinja2", "scipy")  # of the extra `report`
 _NONE = "\N{EN DASH}"
-_DETECTORS = {None: "none", "": "none", "gad": "Gaussian", "aad": "autoencoder"}
 
 
 def require_page(path: Path) -> None:
@@ -140,7 +139,7 @@ def p_value(chance: float | None) -> str:
 
 def detector(name: str | None) -> str:
     """A detector as the page calls it."""
-    return _DETECTORS.get(name, str(name))
+    return DETECTOR_TITLES.get(name, name) if name else "none"
 
 
 def hourly(rates: tuple[float, float, float]) -> str:

@@ -11,6 +11,7 @@ from mavfi_cli.report.tables.columns import WIDTH, blocks, csv_text
 from mavfi_cli.stats.shares import Share
 
 Printed = float | str | None  # a number of the paper, its words for it, or nothing
+DETECTOR_TITLES = {"gad": "Gaussian", "aad": "autoencoder"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
