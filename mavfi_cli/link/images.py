@@ -166,6 +166,7 @@ class ImageReceiver:
         self._closed: deque[int] = deque(maxlen=_REMEMBERED)
         self._first: int | None = None  # first and newest index since the camera's start
         self._newest = 0
+        self._newest_s = 0.0  # stamp of the newest
         self._received_before = 0
         self._lost_before = 0
 
@@ -191,11 +192,11 @@ class ImageReceiver:
     def _captured(self, message: Message) -> list[ImageFrame]:
         """Open a frame. Packets that arrived shortly before may belong to it."""
         self._count += 1
-        if not self._follow(message.image_index):
+        stamp_s = message.time_boot_ms / 1e3
+        if not self._follow(message.image_index, stamp_s):
             return []
         match = _CHECKSUM.fullmatch(message.file_url)
         checksum = int(match[1], 16) if match else None
-        stamp_s = message.time_boot_ms / 1e3
         frame = _Assembly(message.image_index, stamp_s, checksum, self._count)
         for count, place, data in self._recent:
             if place < self._places:
@@ -206,21 +207,27 @@ class ImageReceiver:
             self._close(self._open[0])
         return self._finish(self._open)
 
-    def _follow(self, index: int) -> bool:
-        """Track the index. Return False for a frame that is known or too old."""
-        if self._first is None or abs(index - self._newest) > _LARGEST_GAP:
+    def _follow(self, index: int, stamp_s: float) -> bool:
+        """Track the index. Return False for a frame that is known or too old.
+
+        A camera that counts anew has restarted: the index is smaller, but the stamp is newer.
+        """
+        restarted = index < self._newest and stamp_s > self._newest_s
+        if self._first is None or restarted or abs(index - self._newest) > _LARGEST_GAP:
             self._open.clear()
             self._lost_before = self.lost
             self._received_before = self.received
             self._closed.clear()
             self._first = self._newest = index
+            self._newest_s = stamp_s
             return True
         if index in self._closed or any(frame.index == index for frame in self._open):
             return False
         if index <= self._newest - _REMEMBERED:
             return False
         self._first = min(self._first, index)
-        self._newest = max(self._newest, index)
+        if index > self._newest:
+            self._newest, self._newest_s = index, stamp_s
         return True
 
     def _handshake(self, message: Message) -> list[ImageFrame]:

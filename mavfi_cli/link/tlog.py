@@ -1,8 +1,10 @@
-"""The .tlog of a flight: every frame of both directions in the format of ground stations.
+"""The .tlog of a flight: all frames of both directions in the format of ground stations.
 
-A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame. In
-simulation the time is EPOCH_UNIX_S plus the stamp, so the same flight gives the same bytes. For a
-foreign autopilot it is this computer's UTC, as in the logs of ground stations: what a simulated
+A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame.
+Received frames of messages that the `common` dialect lacks are left out.
+
+In simulation the time is EPOCH_UNIX_S plus the stamp, so the same flight gives the same bytes. For
+a foreign autopilot it is this computer's UTC, as in the logs of ground stations: what a simulated
 autopilot tells in SYSTEM_TIME may be any date.
 """
 

@@ -62,7 +62,8 @@ from sitl.world import load_world
     default=["udpin:127.0.0.1:14540"],
     show_default=True,
     metavar="URL",
-    help="Endpoint of an autopilot or client; repeatable. Frames are forwarded between all links.",
+    help="Endpoint of an autopilot or client; repeatable. Messages of MAVLink's common set are "
+    "forwarded between all links.",
 )
 @click.option(
     "--size", type=Size(), default="64x48", show_default=True, help="Size of the image, pixels."

@@ -189,8 +189,8 @@ class Camera:
         return due
 
     def idle(self) -> list[Message]:
-        """Return the messages to send while there is no pose."""
-        return [_heartbeat()]
+        """Return the messages to send while there is no pose: a heartbeat, unless it has none."""
+        return [] if self._heartbeat is None else [_heartbeat()]
 
     def _reboot(self) -> None:
         for schedule in (self._heartbeat, self._frames, *self._streams.values()):

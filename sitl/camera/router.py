@@ -1,4 +1,7 @@
-"""The camera's links: every frame of a peer goes to all others, as in a MAVLink router."""
+"""The camera's links: every message of a peer goes to all others, as in a MAVLink router.
+
+Frames of messages that the `common` dialect lacks are dropped, as their checksums are unknown.
+"""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class PoseTracker:
         return self._position is not None
 
     @property
-    def has_attitude(self) -> bool:
+    def has_quaternion(self) -> bool:
         """True once ATTITUDE_QUATERNION has arrived, which is preferred to ATTITUDE."""
         return self._has_quaternions
 
@@ -218,12 +218,11 @@ class Station:
 
     def _announce(self) -> None:
         """Send a heartbeat on all links while there is no pose, so that an autopilot answers."""
-        if self._clock() >= self._announce_at_s and not self._has_pose():
+        tracker = self._tracker
+        has_pose = tracker.has_position and tracker.attitude_stamp_s is not None
+        if self._clock() >= self._announce_at_s and not has_pose:
             self._announce_at_s = self._clock() + _ANNOUNCE_S
             self._send(self.camera.idle())
-
-    def _has_pose(self) -> bool:
-        return self._tracker.has_position and self._tracker.has_attitude
 
     def _place(self) -> None:
         """Take the given origin if nobody has told a better one within a second.
@@ -254,7 +253,7 @@ class Station:
         autopilot, interval = (
             dialect.MAV_COMP_ID_AUTOPILOT1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
         )  # fmt: skip
-        if not self._tracker.has_attitude:
+        if not self._tracker.has_quaternion:
             self._command(autopilot, interval, dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
         if not self._tracker.has_position:
             self._command(autopilot, interval, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)

@@ -445,7 +445,7 @@ def _resting_state(measurement: Vector, matrix: Vector) -> Vector:
 def control_step(
     state: Vector, measurement: Vector, setpoint: Vector, gains: Vector, armed: bool
 ) -> tuple[Vector, Vector]:
-    """Return the next controller state (18,) and the motor commands (4,) in [0, 1].
+    """Return the next controller state (21,) and the motor commands (4,) in [0, 1].
 
     The function is pure and does not change `state`. An armed vehicle on the ground
     idles until the setpoint climbs, and idles again after touchdown.

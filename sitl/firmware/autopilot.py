@@ -77,7 +77,7 @@ class FirmwareAutopilot:
     # Clients.
 
     def open_link(self, preset: Preset) -> Link:
-        """Add a client. Whatever its preset, it gets all messages of the firmware."""
+        """Add a client. Whatever its preset, it gets all `common` messages of the firmware."""
         link = Link(preset)
         self._links.append(link)
         return link

@@ -126,6 +126,8 @@ class Client(Peer):
         if not answers:
             return
         self._camera_answers += answers
+        if answers[-1].result != dialect.MAV_RESULT_ACCEPTED:
+            return
         if message.command == dialect.MAV_CMD_IMAGE_START_CAPTURE:
             self._wants_frames = True
         elif message.command == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:

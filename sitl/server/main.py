@@ -375,7 +375,7 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
         *_needs_of_firmware(options),
         "Ctrl-C ends it.",
     ]
-    print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201 - for who starts it by hand
+    click.echo("\n".join(lines), err=True)
 
 
 def _needs_of_firmware(options: ServerOptions) -> list[str]:
@@ -399,13 +399,13 @@ def _commanders(options: ServerOptions) -> str:
 
 
 def _ways_to(url: str) -> list[str]:
-    """The options with which known clients reach an endpoint, a line each."""
-    scheme, _, place = url.partition(":")
-    port = place.rpartition(":")[2]
+    """Return the options with which known clients reach an endpoint, a line each."""
+    at = parse_endpoint(url)
     mavsdk, mavproxy = {
         "udpout": ("udpin", "udpin"), "udpin": ("udpout", "udpout"), "tcpin": ("tcpout", "tcp"),
-    }.get(scheme, ("", ""))  # fmt: skip
+    }.get(at.scheme, ("", ""))  # fmt: skip
     if not mavsdk:
         return []
-    alone = ["QGroundControl by itself"] if (scheme, port) == ("udpout", "14550") else []
+    place = f"[{at.host}]:{at.port}" if ":" in at.host else f"{at.host}:{at.port}"
+    alone = ["QGroundControl by itself"] if (at.scheme, at.port) == ("udpout", 14550) else []
     return [f"MAVSDK    {mavsdk}://{place}", f"MAVProxy  --master={mavproxy}:{place}", *alone]

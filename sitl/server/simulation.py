@@ -41,7 +41,7 @@ class Simulation:
         camera_rows: depth image height, pixels.
         camera_rate_hz: frames per second for clients that request no interval.
         step_s: physics step.
-        autopilot: makes the autopilot of the vehicle at its start; None for our own.
+        autopilot: real firmware in the place of the autopilot; None for our own.
         camera_heartbeat_hz: heartbeats of the camera per second; 0 for none.
         trusted: MAVLink systems that may command; empty for all.
         logs: keep the truth of every tick for `save_truth`.

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.errors import WorldError
 from mavfi_cli.core.frames import Vector
 from sitl.world.world import World, distance_to_boxes, plan_distance_to_boxes
 
@@ -23,6 +24,7 @@ DEFAULT_CLEARANCE_M = 2.0
 """Half-width of the planner's drone box in the released code (MAVBench/MAV_apps, branch mavfi)."""
 
 _CELL_M = 0.5
+_MOST_CELLS = 1e8  # of the grid, 5 km square
 _STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
@@ -44,7 +46,11 @@ class WorldCheck:
 
 
 def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> WorldCheck:
-    """Search a path from start to goal with `clearance_m` to every box."""
+    """Search a path from start to goal with `clearance_m` to every box.
+
+    Raises:
+        WorldError: The world is too large for the grid.
+    """
     height = float(world.goal_enu_m[2])
     free, origin = _free_grid(world, height, clearance_m)
     cells = [_cell(p, origin) for p in (world.start_enu_m, world.goal_enu_m)]
@@ -69,7 +75,13 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> Wo
 def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask, Vector]:
     """Return the free cells (columns, rows) at a height, and the lower corner (2,), ENU m."""
     origin = world.bounds_enu_m[:2]
-    count = np.maximum(1, np.ceil((world.bounds_enu_m[3:5] - origin) / _CELL_M)).astype(int)
+    cells = np.maximum(1.0, np.ceil((world.bounds_enu_m[3:5] - origin) / _CELL_M))
+    if math.prod(cells.tolist()) > _MOST_CELLS:
+        raise WorldError(
+            f"world {world.name!r} is too large to check: its grid would have "
+            f"{cells[0]:g} x {cells[1]:g} cells, more than {_MOST_CELLS:g}"
+        )
+    count = cells.astype(int)
     x = origin[0] + (np.arange(count[0]) + 0.5) * _CELL_M
     y = origin[1] + (np.arange(count[1]) + 0.5) * _CELL_M
     free = np.ones((count[0], count[1]), dtype=np.bool_)

@@ -165,6 +165,22 @@ def test_a_restarted_camera_counts_anew() -> None:
     assert (receiver.received, receiver.lost) == (2, 0)
 
 
+def _stamped(index: int, stamp_ms: int) -> list[Message]:
+    captured, *rest = _frame(index)
+    captured.time_boot_ms = stamp_ms
+    return [captured, *rest]
+
+
+def test_a_camera_that_restarts_early_counts_anew_too() -> None:
+    """Its vehicle's clock goes on, while the index begins again."""
+    receiver = ImageReceiver()
+    for index in range(200):
+        _feed(receiver, _frame(index))
+    later = [frame for k in range(3) for frame in _feed(receiver, _stamped(k, 20_000 + 100 * k))]
+    assert [frame.index for frame in later] == [0, 1, 2]
+    assert (receiver.received, receiver.lost) == (203, 0)
+
+
 def test_a_camera_without_checksums_is_taken_at_its_word() -> None:
     messages = _frame(0)
     messages[0] = _captured(0, 0, "file%d.raw")

@@ -47,7 +47,7 @@ def test_euler_angles_serve_until_quaternions_come() -> None:
     tracker.take(position(0))
     euler = dialect.MAVLink_attitude_message(10, 0.0, 0.0, math.pi / 2.0, 0.0, 0.0, 0.0)
     assert tracker.take(euler)
-    assert not tracker.has_attitude
+    assert not tracker.has_quaternion
     assert yaw_from_quaternion(tracker.pose()[2]) == pytest.approx(0.0, abs=1e-12)
     assert tracker.take(attitude(20, 0.0))
     assert not tracker.take(euler)

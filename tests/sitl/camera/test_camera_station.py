@@ -149,6 +149,34 @@ def test_without_a_pose_it_still_makes_itself_known(scene: Any) -> None:
     assert [m.get_type() for m in autopilot.received()] == ["HEARTBEAT"] * 3
 
 
+@pytest.mark.parametrize(("heartbeat_hz", "beats"), [(0.0, 0), (1.0, 3)])
+def test_its_heartbeat_is_the_cameras_with_and_without_a_pose(
+    heartbeat_hz: float, beats: int
+) -> None:
+    autopilot, now = Peer(7, 1), [0.0]
+    with (
+        contextlib.closing(autopilot.link),
+        contextlib.closing(Router([autopilot.station_url], clock=lambda: now[0])) as router,
+    ):
+        camera = Camera(WORLD.boxes_enu_m, heartbeat_hz=heartbeat_hz)
+        station = Station(camera, PoseTracker(np.zeros(3)), router, clock=lambda: now[0])
+
+        def heard(*messages: Any) -> int:
+            count = 0
+            for tick in range(150):
+                now[0] += 0.02
+                autopilot.send(*(m for m in messages if setattr(m, "time_boot_ms", 20 * tick) or 1))
+                station.serve()
+                count += [m.get_type() for m in autopilot.received()].count("HEARTBEAT")
+            return count
+
+        assert heard() == beats
+        autopilot.send(heartbeat())
+        position = pose(0)[0]
+        # An autopilot may send ATTITUDE only.
+        assert heard(position, dialect.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0)) == beats
+
+
 def test_garbage_on_a_link_does_no_harm(scene: Any) -> None:
     station, autopilot, client, _ = scene
     autopilot.link.send(bytes(range(256)) * 20)

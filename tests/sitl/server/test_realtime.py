@@ -66,6 +66,7 @@ def serve():
                 line = process.stderr.readline()
                 assert line, said
                 said += line
+            process.said = said
             return process
 
         yield start
@@ -114,6 +115,14 @@ def test_several_clients_each_with_own_streams_and_answers(serve, dial):
         client.wait_for("HEARTBEAT", lambda m: m.base_mode & 128)
     first.socket.close()  # one leaves, the others stay
     second.wait_for("HEARTBEAT", lambda m: not m.base_mode & 128)  # disarmed after 10 s
+    interrupt(process)
+
+
+def test_the_ways_to_an_endpoint_are_told_for_any_form_of_its_url(serve):
+    port = free_port(socket.SOCK_DGRAM)
+    process = serve("--link", f"udp://127.0.0.1:{port}")
+    assert f"MAVSDK    udpout://127.0.0.1:{port}\n" in process.said
+    assert f"MAVProxy  --master=udpout:127.0.0.1:{port}\n" in process.said
     interrupt(process)
 
 

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from mavfi_cli.core.errors import WorldError
 from sitl.world.check import check_world
 from sitl.world.world import World, distance_to_boxes
 
@@ -63,6 +64,16 @@ def test_start_too_near_a_box_for_the_clearance() -> None:
     found = check_world(world([1, -1, 0, 2, 1, 20]))
     assert found.start_clearance_m == pytest.approx(1.0)
     assert not found.path_exists
+
+
+def test_a_world_without_end_is_refused_in_one_line() -> None:
+    vast = World(
+        name="vast", seed=0, boxes_enu_m=np.zeros((0, 6)),
+        bounds_enu_m=np.array([-1e200, -1e200, 0.0, 1e200, 1e200, 50.0]),
+        start_enu_m=np.zeros(3), goal_enu_m=np.array([20.0, 0.0, 5.0]),
+    )  # fmt: skip
+    with pytest.raises(WorldError, match="world 'vast' is too large to check"):
+        check_world(vast)
 
 
 def test_goal_on_the_edge_of_the_world() -> None:
