@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sitl.control.cascade import control_step
+from sitl.vehicle.cascade import control_step
 from sitl.vehicle.profile import PROFILES, load_profile
 from sitl.vehicle.vehicle import Quadrotor
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from mavfi_cli.link.codec import frame_length
+from mavfi_cli.link.endpoint import CHUNK, MAX_PEERS, SMALL_CHUNK, Receiver, SocketOwner, text_of
 from mavfi_cli.link.sender_slot import SenderSlot, is_autopilots
-from mavfi_cli.link.sockets import CHUNK, MAX_PEERS, SMALL_CHUNK, Receiver, SocketOwner, text_of
 
 MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
 _JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost

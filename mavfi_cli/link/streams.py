@@ -9,11 +9,11 @@ from collections import deque
 from typing import Any
 
 from mavfi_cli.core.errors import EndpointError
-from mavfi_cli.link.endpoint import Endpoint
-from mavfi_cli.link.sockets import (
+from mavfi_cli.link.endpoint import (
     CHUNK,
     MAX_PEERS,
     SMALL_CHUNK,
+    Endpoint,
     Receiver,
     SocketOwner,
     text_of,

@@ -10,7 +10,6 @@ from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import begins_with_frame
 from mavfi_cli.link.datagrams import UdpListener, UdpTransport
 from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
-from mavfi_cli.link.sockets import inherited_socket, open_socket
 from mavfi_cli.link.streams import FirstClient, SerialPort, StreamTransport, TcpListener
 
 
@@ -87,8 +86,8 @@ def open_transport(
     if endpoint.scheme == "serial":
         return SerialPort(endpoint)
     if endpoint.scheme == "fd":
-        return StreamTransport(inherited_socket(endpoint), url)
-    opened = open_socket(endpoint, beyond=signed or allow_unsigned)
+        return StreamTransport(endpoint.inherited_socket(), url)
+    opened = endpoint.open_socket(beyond=signed or allow_unsigned)
     if opened.type == socket.SOCK_DGRAM:
         return UdpTransport(opened, url, admits if endpoint.scheme == "udpin" else None)
     if endpoint.scheme == "tcp":
@@ -114,10 +113,10 @@ def open_listener(
     """
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "fd":
-        return _OnePeer(StreamTransport(inherited_socket(endpoint), url, patient=False))
+        return _OnePeer(StreamTransport(endpoint.inherited_socket(), url, patient=False))
     if endpoint.scheme not in LISTENING:
         return _OnePeer(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
-    opened = open_socket(endpoint, beyond=signed or allow_unsigned)
+    opened = endpoint.open_socket(beyond=signed or allow_unsigned)
     if endpoint.scheme == "udpin":
         return UdpListener(opened, url, admits)
     return TcpListener(opened, url)

@@ -14,7 +14,6 @@ import numpy as np
 
 from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import Signing, key_from_file
-from sitl.briefing import write_briefing
 from sitl.camera.component import Camera
 from sitl.camera.router import Router
 from sitl.camera.station import PoseTracker, Station
@@ -145,7 +144,7 @@ def _camera(
     signing = None if key_file is None else Signing(key_from_file(key_file), time.time)
     witness = Witness(world, profile, logs=truth is not None)
     if truth is not None:
-        write_briefing(world, made.mount_offset_flu_m, truth)
+        world.write_briefing(made.mount_offset_flu_m, truth)
     stopped = stop_on_signals()
     with contextlib.closing(
         Router(links, signing=signing, allow_unsigned=allow_unsigned)

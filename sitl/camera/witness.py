@@ -11,7 +11,7 @@ import numpy as np
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect
 from sitl.firmware.autopilot import follows_companion
-from sitl.referee.referee import Collision, Referee
+from sitl.referee import Collision, Referee
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import regression_power
 from sitl.world import World

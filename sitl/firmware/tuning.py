@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sitl.control import cascade
-from sitl.control.gains import gains_for
+from sitl.vehicle import cascade
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
 
 _REDUCED = 0.6

@@ -23,15 +23,14 @@ from mavfi_cli.link.codec import Signing, dialect, key_from_file
 from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import memory_pair, open_transport
 from sitl.autopilot.streams import STEP_US, TICK_US, Preset
-from sitl.briefing import write_briefing
 from sitl.command_line import exit_code, stop_on_signals
-from sitl.control.cascade import control_step
 from sitl.firmware.simulation import FirmwareSimulation
 from sitl.firmware.start import PARAMETERS, open_firmware
 from sitl.peers import Peers
 from sitl.server.client import Client
 from sitl.server.options import ServerOptions, parse
 from sitl.server.simulation import Simulation
+from sitl.vehicle.cascade import control_step
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
@@ -275,8 +274,7 @@ def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[
 
 
 def _brief(simulation: Simulation, folder: Path) -> None:
-    mount = simulation.camera.mount_offset_flu_m
-    write_briefing(simulation.referee.world, mount, folder)
+    simulation.referee.world.write_briefing(simulation.camera.mount_offset_flu_m, folder)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -16,7 +16,7 @@ from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.streams import STEP_US, STEPS_A_TICK, TICK_US
 from sitl.camera.component import Camera
 from sitl.firmware.autopilot import FirmwareAutopilot
-from sitl.referee.referee import Referee
+from sitl.referee import Referee
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Quadrotor, Truth
 from sitl.world import World

@@ -1,1 +1,1 @@
-"""The simulated quadrotor: profile, JSBSim model, battery, energy and truth."""
+"""The simulated quadrotor: profile, JSBSim model, flight controller, battery, energy and truth."""

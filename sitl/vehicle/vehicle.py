@@ -9,7 +9,7 @@ import numpy as np
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import Vector, ned_from_enu, ned_yaw_from_enu
-from sitl.control.cascade import (
+from sitl.vehicle.cascade import (
     M_ON_GROUND,
     M_POSITION,
     M_QUATERNION,
@@ -19,7 +19,7 @@ from sitl.control.cascade import (
     STATE_SIZE,
     control_step,
 )
-from sitl.control.gains import gains_for
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.physics import (
     FOOT_M,
     FOOT_POUND_J,

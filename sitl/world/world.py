@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import WorldError
+from mavfi_cli.core.errors import RecordError, WorldError
+from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream, generator
 
@@ -71,6 +73,28 @@ class World:
             "goal": self.goal_enu_m.tolist(),
             "boxes": self.boxes_enu_m.tolist(),
         }
+
+    def write_briefing(self, camera_mount_flu_m: Vector, folder: Path) -> None:
+        """Write what a companion knows before the first message: start, goal, bounds and camera.
+
+        Args:
+            camera_mount_flu_m: Offset of the camera from the vehicle's position (3,).
+            folder: Where `briefing.json` is written.
+
+        Raises:
+            RecordError: The file cannot be written.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordError(f"{folder}: {error.strerror or error}") from None
+        briefing = {
+            "start_enu_m": self.start_enu_m.tolist(),
+            "goal_enu_m": self.goal_enu_m.tolist(),
+            "bounds_enu_m": self.bounds_enu_m.tolist(),
+            "camera_offset_flu_m": camera_mount_flu_m.tolist(),
+        }
+        write_json(folder / "briefing.json", briefing)
 
 
 def _refuse_bad_boxes(world: World) -> None:

@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
-from sitl.referee.sweep import APPROACH_TOLERANCE_M, CONTACT_M, clearance, sweep
+from sitl.sweep import APPROACH_TOLERANCE_M, CONTACT_M, clearance, sweep
 
 metres = st.floats(-5, 5)
 sides = st.floats(1e-3, 3)

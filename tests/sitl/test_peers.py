@@ -7,7 +7,7 @@ import pytest
 
 from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import Codec, dialect
-from mavfi_cli.link.sockets import MAX_PEERS
+from mavfi_cli.link.endpoint import MAX_PEERS
 from mavfi_cli.link.transport import open_transport
 from sitl.peers import Peer, Peers
 

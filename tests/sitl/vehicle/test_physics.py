@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import VehicleProcessError
-from sitl.control.cascade import throttle
-from sitl.control.gains import gains_for
+from sitl.vehicle.cascade import throttle
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.physics import (
     AIRCRAFT,
     FOOT_M,

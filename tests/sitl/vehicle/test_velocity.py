@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.control import cascade
-from sitl.control.cascade import acceleration_target, velocity_target
-from sitl.control.gains import gains_for
+from sitl.vehicle import cascade
+from sitl.vehicle.cascade import acceleration_target, velocity_target
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import load_profile
 
 GAINS = gains_for(load_profile("solo"), 0.004)

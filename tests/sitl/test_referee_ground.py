@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.frames import quaternion_from_euler
-from sitl.referee.referee import GroundRule
+from sitl.referee import GroundRule
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 

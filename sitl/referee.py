@@ -14,7 +14,7 @@ import numpy as np
 from mavfi_cli.core.errors import RecordError, VehicleProcessError
 from mavfi_cli.core.files import write_atomically, write_json
 from mavfi_cli.core.frames import Vector
-from sitl.referee.sweep import clearance, sweep
+from sitl.sweep import clearance, sweep
 from sitl.world.world import World
 
 # Columns of truth.npz, (n,) or (n, 3 or 4), one row per control tick.

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.control import cascade
-from sitl.control.cascade import FARTHEST_M, clean_setpoint, wrap
-from sitl.control.gains import gains_for
+from sitl.vehicle import cascade
+from sitl.vehicle.cascade import FARTHEST_M, clean_setpoint, wrap
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import load_profile
 
 GAINS = gains_for(load_profile("solo"), 0.004)

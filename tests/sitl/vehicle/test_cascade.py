@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.core.frames import quaternion_from_euler
-from sitl.control import cascade
-from sitl.control.cascade import control_step
-from sitl.control.gains import gains_for
+from sitl.vehicle import cascade
+from sitl.vehicle.cascade import control_step
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import PROFILES, load_profile
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}

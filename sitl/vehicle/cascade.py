@@ -48,7 +48,7 @@ S_FLYING = 17  # 0 on the ground with idling rotors, 1 flying
 S_LAGGED_FORWARD = 18  # acceleration feed-forward after the attitude lag, NED, m/s^2
 STATE_SIZE = 21
 
-# Gains (n,), filled by sitl.control.gains
+# Gains (n,), filled by sitl.vehicle.gains
 G_DT = 0
 G_MASS = 1
 G_GRAVITY = 2

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from mavfi_cli.core.frames import Vector
-from sitl.control import cascade
-from sitl.control.cascade import THRUST_RESERVE
+from sitl.vehicle import cascade
+from sitl.vehicle.cascade import THRUST_RESERVE
 from sitl.vehicle.physics import INFLOW_SLOPE
 from sitl.vehicle.profile import GRAVITY_MPS2, LEVEL_SHARE, VehicleProfile
 

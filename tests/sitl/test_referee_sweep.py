@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mavfi_cli.core.frames import quaternion_from_euler
-from sitl.referee.sweep import APPROACH_TOLERANCE_M, CONTACT_M, clearance, pose_at, sweep
+from sitl.sweep import APPROACH_TOLERANCE_M, CONTACT_M, clearance, pose_at, sweep
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 BODY = np.array([0.25, 0.25, 0.08])

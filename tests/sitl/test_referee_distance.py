@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
-from sitl.referee.sweep import body_distance, clearance
+from sitl.sweep import body_distance, clearance
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 BODY = np.array([0.25, 0.2, 0.08])

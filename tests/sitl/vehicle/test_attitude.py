@@ -8,9 +8,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
-from sitl.control import cascade
-from sitl.control.cascade import rotation, specific_force, tilt_rates
-from sitl.control.gains import gains_for
+from sitl.vehicle import cascade
+from sitl.vehicle.cascade import rotation, specific_force, tilt_rates
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import PROFILES, load_profile
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}

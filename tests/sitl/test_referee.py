@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import RecordError, VehicleProcessError
-from sitl.referee.referee import Collision, Referee
+from sitl.referee import Collision, Referee
 from sitl.world.world import World
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

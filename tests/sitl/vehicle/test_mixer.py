@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.control import cascade
-from sitl.control.cascade import LEAST_SHARE, mix, throttle, thrust_shares
-from sitl.control.gains import gains_for
+from sitl.vehicle import cascade
+from sitl.vehicle.cascade import LEAST_SHARE, mix, throttle, thrust_shares
+from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import PROFILES, load_profile
 
 VEHICLES = {name: load_profile(name) for name in PROFILES.names}

@@ -1,1 +1,0 @@
-"""The flight controller: position, velocity, attitude and rate loops, and the mixer."""

@@ -1,1 +1,0 @@
-"""The referee, which knows the true state and detects collisions."""
