@@ -64,7 +64,7 @@ def arms(flights: pa.Table) -> list[Arm]:
             trials.setdefault(name, {})[_trial_of(flight)] = flight
     read = (each for each, x in trials.get(PLAIN, {}).items() if x["activation"] == "read")
     shared = sorted(set(read).intersection(*trials.values()))
-    if not shared:
+    if not shared or len(trials) < 2:
         return []
     order = sorted(trials, key=lambda name: name != PLAIN)
     kept = {name: [trials[name][trial] for trial in shared] for name in order}
@@ -92,7 +92,8 @@ def _arm_of(flight: Row) -> str:
     base, _, changes = flight["stack"].partition(":")
     if base not in (_BASE, f"{_BASE}-protected"):
         return ""
-    name = "all four checks" if base != _BASE else _WORDS["stacks"].get(changes, changes)
+    told = _WORDS["stacks"].get(changes, changes)
+    name = told if base == _BASE else "all four checks" + (f", {told}" if changes else "")
     detector = (flight["detector"] or "").upper()
     if not detector:
         return name

@@ -54,15 +54,16 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         upsets_per_hour: bit flips that reach the injection sites in an hour of flight.
     """
     flown = {stack: evidence.flights(stack) for stack in STACKS}
-    flights = {stack: chosen(those, as_paper=True) for stack, those in flown.items()}
-    kernels = _kernels(evidence)
+    as_paper = {stack: chosen(those, as_paper=True) for stack, those in flown.items()}
+    flights = {stack: chosen(those, at=(None, "random")) for stack, those in as_paper.items()}
+    kernels = evidence.isolated
     silent = {name: silent_of_all(each) for name, each in kernels.items()}
     claims = [_judged(claim, flights, kernels) for claim in CLAIMS]
-    maps = {stack: state_map(flights[stack]) for stack in STACKS}
+    maps = {stack: state_map(as_paper[stack]) for stack in STACKS}
     return {
         "version": __version__,
         "stacks": STACKS,
-        "extent": _extent(evidence, kernels, claims),
+        "extent": _extent(flights, kernels, claims),
         "summary": _summary(flights, claims),
         "problems": evidence.problems,
         "claims": claims,
@@ -87,12 +88,6 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         "sources": evidence.campaigns,
         "kernel_sources": evidence.kernels,
         "missions": [_worth_a_look(each) for each in evidence.campaigns if each.flights.num_rows],
-    }
-
-
-def _kernels(evidence: Evidence) -> Kernels:
-    return {
-        each["kernel"]: each for source in evidence.kernels for each in source.summary["kernels"]
     }
 
 
@@ -127,9 +122,11 @@ def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdi
 # Five sentences -----------------------------------------------------------------------------------
 
 
-def _extent(evidence: Evidence, kernels: Kernels, claims: Sequence[Mapping[str, Any]]) -> str:
+def _extent(
+    flights: Mapping[str, pa.Table], kernels: Kernels, claims: Sequence[Mapping[str, Any]]
+) -> str:
     """What the page judges, and by how much."""
-    missions = evidence.flights().num_rows
+    missions = sum(those.num_rows for those in flights.values())
     runs = sum(each["runs"] for each in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
     return f"{len(claims)} claims are judged by {missions:,} missions{attacked}."
@@ -214,7 +211,8 @@ def _saved_sentence(flights: Mapping[str, pa.Table], level: str, kind: str) -> s
 
 
 def _crash_sentence(flights: Mapping[str, pa.Table]) -> str:
-    lost = [chosen(_instruction_faults(those), lost=True) for those in flights.values()]
+    hit = (chosen(_instruction_faults(those), own_lost=False) for those in flights.values())
+    lost = [chosen(those, lost=True) for those in hit]
     nodes = [each for those in lost for each in those["node_ended"].to_pylist()]
     if not nodes:
         return "No fault in an instruction has lost a mission."
@@ -271,7 +269,8 @@ def worst_flights(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
 
 def _spread(flights: pa.Table) -> dict[str, Any] | None:
     """Every flight with a fault in a state over its own golden one, by world and detector."""
-    hit = chosen(timed(comparable(flights)), level="source", platform="x86", struck=True)
+    seen = {"level": "source", "platform": "x86", "struck": True, "detector": (*_DETECTORS,)}
+    hit = chosen(timed(comparable(flights)), **seen)
     groups = by_value(hit, "world", "detector")
     places = sorted(groups, key=str)
     if not places:

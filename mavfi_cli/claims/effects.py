@@ -242,8 +242,9 @@ def _gaussian_dearer(flights: pa.Table, **where: Any) -> Finding:
     gad, aad = (
         dict(zip(*_overheads(flights, name, where), strict=True)) for name in ("gad", "aad")
     )
-    more = [gad[key] - aad[key] for key in sorted(gad.keys() & aad.keys())]
-    return _mean_cost(gad, more, "the same faults with either detector")
+    both = sorted(gad.keys() & aad.keys())
+    more = [gad[key] - aad[key] for key in both]
+    return _mean_cost(both, more, "the same faults with either detector")
 
 
 def _overheads(

@@ -75,15 +75,16 @@ def shown_items(evidence: Evidence, flights: Mapping[str, pa.Table]) -> Iterator
     Args:
         flights: of each stack, as `Evidence.flights`.
     """
-    summaries = [each.summary for each in evidence.kernels]
+    kernels = [*evidence.isolated.values()]
     for item in ITEMS:
         if item.source is Source.FLIGHTS:
             parts = [_flown(item, stack, flights[stack], evidence) for stack in STACKS]
         elif item.source is Source.MODEL:
             parts = [_drawn("performance model", of_model())]
+        elif kernels:
+            parts = [_drawn("isolated kernels", of_kernels({"kernels": kernels}))]
         else:
-            parts = [_drawn("isolated kernels", of_kernels(each)) for each in summaries]
-            parts = parts or [_OnStack(stack="isolated kernels")]
+            parts = [_OnStack(stack="isolated kernels")]
         yield _ShownItem(item=item, parts=parts)
 
 

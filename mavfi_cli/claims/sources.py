@@ -21,6 +21,7 @@ from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.reproduction.flights import flown_missions, pooled
+from mavfi_cli.reproduction.plan import stored_plan
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
@@ -41,6 +42,7 @@ class CampaignSource:
         versions: of the programs that flew it; empty of an export that does not say.
         host: of the first record; empty of an export that does not say.
         digest: SHA-256 of an exported file; empty of a folder.
+        again: command that flies the rest of its list; empty if it is not known.
     """
 
     path: Path
@@ -52,6 +54,7 @@ class CampaignSource:
     versions: Mapping[str, str] = field(default_factory=dict)
     host: Mapping[str, Any] = field(default_factory=dict)
     digest: str = ""
+    again: str = ""
 
     @property
     def stacks(self) -> list[str]:
@@ -84,6 +87,11 @@ class Evidence:
     campaigns: Sequence[CampaignSource]
     kernels: Sequence[_KernelSource]
     problems: Sequence[str]
+
+    @property
+    def isolated(self) -> Mapping[str, Mapping[str, Any]]:
+        """The summary of each attacked kernel; of several, that of the last source."""
+        return {part["kernel"]: part for each in self.kernels for part in each.summary["kernels"]}
 
     def flights(self, stack: str | None = None) -> pa.Table:
         """The flights of a stack, each mission once and beside its golden flight; None means all.
@@ -121,8 +129,8 @@ def gather(places: Sequence[Path]) -> Evidence:
             problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
     if not any(each.flights.num_rows for each in campaigns) and not kernels:
         raise RecordError("; ".join(each.rstrip(".") for each in problems) or _nothing(campaigns))
-    problems += _incomplete(campaigns)
-    return Evidence(campaigns=campaigns, kernels=kernels, problems=[*problems, *_mixed(campaigns)])
+    problems += [*_incomplete(campaigns), *_mixed(campaigns), *_repeated(kernels)]
+    return Evidence(campaigns=campaigns, kernels=kernels, problems=problems)
 
 
 def _found(place: Path) -> Iterator[Path]:
@@ -158,7 +166,10 @@ def _read(path: Path) -> CampaignSource | _KernelSource:
 def _from_ledger(folder: Path) -> CampaignSource:
     with Ledger(folder) as ledger:
         table, origin, spec = flights(ledger), provenance(ledger), stored_spec(ledger)
-    return _campaign(folder, origin["name"] or folder.name, spec, table, origin)
+        plan = stored_plan(ledger)
+    found = _campaign(folder, origin["name"] or folder.name, spec, table, origin)
+    again = "" if spec is None else f"mavfi campaign run {folder}"
+    return replace(found, again=again if plan is None else plan.command)
 
 
 def _from_export(path: Path) -> CampaignSource:
@@ -210,11 +221,21 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     for each in campaigns:
         over = each.flights.num_rows + each.errors
         if each.planned is not None and over < each.planned:
-            again = f"mavfi campaign run {each.path}" if each.spec else "The command that began it"
-            rest = f" {again} flies the rest." if not each.digest else " An export holds no list."
-            yield f"{each.path}: {over:,} of {each.planned:,} missions have flown.{rest}"
+            rest = f"{each.again or 'The command that began it'} flies the rest."
+            rest = "An export holds no list." if each.digest else rest
+            yield f"{each.path}: {over:,} of {each.planned:,} missions have flown. {rest}"
         if each.errors:
             yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."
+
+
+def _repeated(kernels: Sequence[_KernelSource]) -> Iterator[str]:
+    first: dict[str, Path] = {}
+    for each in kernels:
+        for part in each.summary["kernels"]:
+            name = part["kernel"]
+            if name in first:
+                yield f"{first[name]} and {each.path} both have {name}; the latter counts."
+            first[name] = each.path
 
 
 def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 OVER_GOLDEN = "flight time over the golden flight of the same mission, %"
 _Row = tuple[str, str | None, pa.Table]  # of a panel: label, detector, flights
 _STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
+_NOTHING = "nothing to draw: no mission of the figure has flown yet"
 
 
 def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
@@ -51,8 +52,10 @@ def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
         columns: width, `one` or `two`.
 
     Raises:
-        RecordError: these are not there.
+        RecordError: nothing was flown that it could show, or these folders are not there.
     """
+    if flights is not None and not flights.num_rows:
+        raise RecordError(_NOTHING)
     if flights is None or table.name not in DRAWN:
         return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)
     return DRAWN[table.name](flights, columns)
@@ -93,8 +96,10 @@ def _fig7(flights: pa.Table, columns: str) -> Figure:
 
 def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
     def draw_values(flights: pa.Table, columns: str) -> Figure:
-        groups = by_value(faulty(flights), column).items()
-        rows = ((str(value), None, those) for (value,), those in groups)
+        groups = by_value(faulty(flights), column)
+        if not groups:
+            raise RecordError(_NOTHING)
+        rows = ((str(value), None, those) for (value,), those in groups.items())
         return draw_strips([panel("fault in", rows)], OVER_GOLDEN, columns)
 
     return draw_values

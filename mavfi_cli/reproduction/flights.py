@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import pyarrow as pa
@@ -16,6 +17,7 @@ from mavfi_cli.analysis.flights import COSTS, chosen, flown, known, numbers
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.stats.shares import Share, wilson
 
 STAGES = tuple(stage.value for stage in Stage)
@@ -36,11 +38,14 @@ _COLUMNS: Mapping[str, pa.DataType] = {
 }  # fmt: skip
 _STRUCK = (Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT, Injected.NOT_ACTIVATED)
 _FAULTS = ("fault", "instruction")
-# A mission is one of the paper's if it differs from the defaults in these only, and if its fault is
-# one flip.
+# A mission is one of the paper's if it differs from the defaults in these only, and its fault in
+# _DRAWN only.
 _PAPER = {*_FAULTS, "detector", "isolate", "stack", "world", "seed", "world_seed", "planner",
           "platform", "time_limit_s"}  # fmt: skip
-_FLIP = {"persistence": "transient", "effect": "flip"}
+_DRAWN = {"target", "seed", "field", "bits", "together", "at"}
+_USUAL: Mapping[str, Any] = json.loads(canonical({
+    "fault": asdict(FaultConfig(target="")), "instruction": asdict(InstructionConfig(target="")),
+}))  # fmt: skip
 _NO_FAULT = canonical([None] * len(_FAULTS))
 _NO, _YES = pa.scalar(False), pa.scalar(True)  # noqa: FBT003
 
@@ -51,8 +56,9 @@ def flown_missions(table: pa.Table) -> pa.Table:
     Beside columns of the argument, which are empty if it lacks them:
         fault: the fault that was asked for, as text; equal faults have equal texts.
         together: whether it strikes all components of a group at once.
-        as_paper: whether all but stack and detector's model is as in the paper: vehicle, speed,
-            sensors, one flip, and 13 watched states.
+        at: when a source-level fault strikes; empty without one.
+        as_paper: whether all but stack, detector's model and that moment is as in the paper:
+            vehicle, speed, sensors, one flip of drawn bits, and 13 watched states.
         struck: whether the fault flipped a bit, read or not, as the paper counts.
         lost: whether the mission did not end in success.
 
@@ -69,11 +75,13 @@ def flown_missions(table: pa.Table) -> pa.Table:
     kills = pc.fill_null(pc.starts_with(table["fault_target"], "process."), _NO)
     lost = pc.fill_null(pc.not_equal(table["outcome"], Outcome.SUCCESS.value), _YES)
     faults = (canonical([each.get(name) for name in _FAULTS]) for each in configs)
+    at = ((each.get("fault") or {}).get("at") for each in configs)
     together = (bool((each.get("fault") or {}).get("together")) for each in configs)
     return with_columns(
         table,
         fault=pa.array(faults, pa.string()),
         together=pa.array(together, pa.bool_()),
+        at=pa.array(at, pa.string()),
         as_paper=pa.array(map(_as_paper, configs), pa.bool_()),
         struck=pc.and_not(flips, kills),
         lost=lost,
@@ -88,10 +96,14 @@ def with_columns(table: pa.Table, **columns: Any) -> pa.Table:
 
 
 def _as_paper(config: Mapping[str, Any]) -> bool:
-    fault = config.get("fault") or {}
     watch = (config.get("detector") or {}).get("watch", PAPER)
-    flips = all(fault.get(name, value) == value for name, value in _FLIP.items())
-    return config.keys() <= _PAPER and flips and watch == PAPER
+    changed = {
+        name
+        for level in _FAULTS
+        for name, value in (config.get(level) or {}).items()
+        if value != _USUAL[level].get(name)
+    }
+    return config.keys() <= _PAPER and changed <= _DRAWN and watch == PAPER
 
 
 _NOTHING_FLOWN = flown_missions(pa.table({}))

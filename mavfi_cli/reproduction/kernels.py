@@ -58,14 +58,15 @@ class KernelRuns:
         return self.missing() * _RUN_BYTES
 
     def forecast_s(self) -> float:
-        """Wall time of all runs, from a few runs of the quickest kernel."""
+        """Wall time of the missing runs, from a few runs of the quickest kernel."""
         from mavfi_cli.studies.kernels import kernel_flight, kernel_targets  # loads the mission
 
         with tempfile.TemporaryDirectory(prefix="mavfi-kernels-") as scratch:
             targets = kernel_targets(select([_QUICKEST]), kernel_flight(), Path(scratch))
             (measured,) = run_campaign(Plan(runs=_MEASURED, seed=_SEED), targets)
         run_s = (measured.wall_s - measured.prepare_s) / _MEASURED
-        there_s = _PREPARE_S + _RUN_OF_EACH_S * self.runs / self.jobs
+        of_each = self.missing() / len(select(()))
+        there_s = _PREPARE_S + _RUN_OF_EACH_S * of_each / self.jobs
         return there_s * run_s / _QUICKEST_RUN_S
 
     def run(self, spectator: Spectator, forecast_s: float) -> None:
@@ -79,11 +80,12 @@ class KernelRuns:
         plan = Plan(runs=self.runs, seed=_SEED)
         targets = kernel_targets(select(()), kernel_flight(), self.folder)
         names, begun = [target.name for target in targets], time.monotonic()
+        whole, missing = self.runs * len(names), self.missing()
 
         def show(name: str, done: int) -> None:
             """Tell the runs of the kernel, and the time left from the forecast."""
             place = names.index(name)
-            left = 1.0 - (place * self.runs + done) / (self.runs * len(names))
+            left = min(1.0, (whole - place * self.runs - done) / missing)
             text = f"kernel {place + 1} of {len(names)}, {name}: {done}/{self.runs} runs"
             spectator.on_step(
                 f"{text}, {duration(forecast_s * left)} to go", time.monotonic() - begun

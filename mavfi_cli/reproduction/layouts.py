@@ -380,11 +380,11 @@ def _fig13_told(table: PaperTable) -> str:
 
 
 def _with(struck: pa.Table, protected: pa.Table) -> FloatArray:
-    """Increase of the protected flight whose unprotected one is prolonged most, (1,) or (0,)."""
+    """Increase of the flight with the fault that prolongs most, protected, (1,) or (0,)."""
     if not len(ratios(struck)):
         return np.zeros(0)
-    pair = struck["pair"][int(np.nanargmax(numbers(struck, "over_own")))].as_py()
-    return increases(chosen(protected, pair=pair))
+    worst = struck.slice(int(np.nanargmax(numbers(struck, "over_own"))), 1)
+    return increases(chosen(protected, pair=worst["pair"][0], fault=worst["fault"][0]))
 
 
 # Platforms: Fig. 16 ------------------------------------------------------------------------------

@@ -44,6 +44,11 @@ class FlightsPlan:
         asked = {"stack": self.stack, "scale": self.scale}
         return {"name": self.folder.name, _META: json.dumps(asked)}
 
+    @property
+    def command(self) -> str:
+        """The command that flies the plan's stack for all items."""
+        return f"mavfi reproduce --stack {self.stack} --scale {self.scale:g} --out {self.out}"
+
     def keys(self, *items: Item) -> list[Key]:
         """The missions of items of the plan, without any of all of them."""
         return [key_of(each) for each in missions_of(items or self.items, self.stack, self.scale)]

@@ -108,6 +108,20 @@ def test_arms_are_counted_on_the_faults_that_the_unprotected_flight_read():
     assert plain.p_value is None
 
 
+def test_variants_of_the_stack_with_all_checks_are_arms_of_their_own():
+    rows = [row("planning", seed=1, **LOST)]
+    for stack in ("mavbench-protected", "mavbench-protected:guards_tracking=true"):
+        lost = LOST if ":" in stack else {}
+        rows.append(row("planning", seed=1, config={"stack": stack}, **lost))
+    found = {arm.name: arm.lost.count for arm in arms(flights(rows))}
+    assert found == {"unprotected": 1, "all four checks": 0, "all four checks, tracking guard": 1}
+
+
+def test_the_unprotected_arm_alone_compares_nothing():
+    rows = [row("planning", seed=1, config={"stack": stack}) for stack in ("mavbench", "hardened")]
+    assert arms(flights(rows)) == []
+
+
 def test_one_stack_has_no_arms():
     rows = [row(seed=1), row("planning", seed=1), row("planning", seed=1, detector="gad")]
     assert arms(flights(rows)) == []

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from flown import flights, row
 
+from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.claims import effects
 from mavfi_cli.claims.catalogue import CLAIMS
 from mavfi_cli.reproduction import items
@@ -161,11 +162,17 @@ def test_the_cost_of_detectors():
     rows = []
     for seed in range(1, 31):
         for name, share in (("gad", 0.02), ("aad", 0.0001)):
-            costs = {"check_share": share} | {
-                f"recovery_share_{each}": 0.0 for each in ("perception", "planning", "control")
-            }
+            costs = dict.fromkeys(COSTS, 0.0) | {"check_share": share}
             rows.append(stage("planning", seed, detector=name, **costs))
     those = flights(rows)
     assert verdict("table5-gad", those) is ClaimVerdict.REPRODUCED  # 2 %, at most 2.2 %
     assert verdict("table5-aad", those) is ClaimVerdict.NOT_REPRODUCED  # 0.01 %, at most 0.0062 %
     assert verdict("table5-gad-over-aad", those) is ClaimVerdict.REPRODUCED
+
+
+def test_the_costs_of_one_detector_compare_nothing():
+    shares = dict.fromkeys(COSTS, 0.01)
+    found = BY_CLAIM["table5-gad-over-aad"].find(
+        flights([stage("planning", 1, detector="gad", **shares)])
+    )
+    assert (found.effect, found.told) == (None, "")

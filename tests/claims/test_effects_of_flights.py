@@ -101,8 +101,15 @@ def test_what_is_not_of_the_paper_is_marked():
         row("planning", fault=held),
         row("planning", config={"v_max_mps": 0.6}),
         row("planning", config={"time_limit_s": 99.0}),
+        row("planning", fault={"at": "invocation=1"}),
+        row("planning", fault={"exact_bits": (62,)}),
+        row("planning", fault={"bits": 5, "field": "sign", "together": True}),
+        row("planning", instruction=True),
+        row("planning", instruction=True, fault={"roles": ("destination",)}),
     ]
-    assert flights(rows)["as_paper"].to_pylist() == [True, False, False, True]
+    told = flights(rows)["as_paper"].to_pylist()
+    assert told == [True, False, False, True, True, False, True, True, False]
+    assert flights(rows)["at"].to_pylist()[-6:-3] == ["random", "invocation=1", "random"]
 
 
 def test_flights_are_chosen_by_their_columns():

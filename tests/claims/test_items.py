@@ -24,7 +24,7 @@ def shown(monkeypatch):
     def of(*exports):
         tables = [flown_missions(each) for each in exports]
         evidence = SimpleNamespace(
-            campaigns=[SimpleNamespace(flights=each) for each in tables], kernels=[]
+            campaigns=[SimpleNamespace(flights=each) for each in tables], isolated={}
         )
         flights = {stack: pooled(tables, stack) for stack in STACKS}
         shown = items.shown_items(evidence, flights)

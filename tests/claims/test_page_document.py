@@ -52,6 +52,32 @@ def test_five_sentences_say_what_was_counted(told):
     assert crashes.startswith("All 2 missions that a fault in an instruction loses follow a node")
 
 
+def test_a_mission_that_is_lost_without_a_fault_is_not_lost_by_it():
+    rows = [row(seed=1, outcome="collision")]
+    rows.append(row("planning", seed=1, instruction=True, outcome="collision"))
+    assert document(evidence(rows))["summary"][-1] == (
+        "No fault in an instruction has lost a mission."
+    )
+
+
+def test_missions_unlike_the_papers_judge_no_claim():
+    """A fault at a chosen moment tells nothing of an hour, but where a bit hurts."""
+    where = {"struck_state": "waypoint_x", "struck_bits": "62"}
+    first = {"seed": 1, "fault": {"at": "invocation=1"}, "outcome": "timeout", **where}
+    rows = [row(seed=1), row("planning", seed=1), row("waypoint_x", **first)]
+    told = document(evidence(rows))
+    assert told["extent"] == "43 claims are judged by 2 missions."
+    assert [each.where for each in told["hourly"]["mavbench"]] == ["state: planning, sparse"]
+    assert [each["lost"] for each in told["map_rows"]] == [1]
+
+
+def test_the_picture_of_faults_in_states_has_the_flights_of_its_data():
+    rows = [row(seed=1), row("planning", seed=1)]
+    rows += [row("planning", seed=1, detector=name) for name in ("aad", "range")]
+    spread = document(evidence(rows))["spreads"]["mavbench"]
+    assert {each["detector"] for each in spread["rows"]} == {"", "aad"}
+
+
 def test_what_detectors_save_of_states_has_a_sentence_of_its_own():
     rows = [row(seed=1), row("planning", seed=1, outcome="timeout")]
     rows += [row("planning", seed=1, detector="gad")]

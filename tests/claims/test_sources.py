@@ -1,6 +1,7 @@
 """What is found in folders, what is missing there, and what cannot be read."""
 
 import json
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -15,6 +16,8 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.report.tables.campaign import write_flights
 from mavfi_cli.spec.mission import MissionConfig
+
+KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
 
 
 @pytest.fixture
@@ -76,6 +79,16 @@ def test_an_export_tells_what_its_campaign_does(campaign, tmp_path):
 def test_what_has_not_flown_is_told(campaign):
     (problem,) = gather([campaign("half", 5, 2)]).problems
     assert "2 of 5 missions have flown" in problem
+
+
+def test_the_rest_of_a_reproduction_is_flown_by_naming_no_item(campaign, tmp_path):
+    with Ledger(campaign("mavbench", 5, 2), writing=True) as ledger:
+        ledger.set_meta({"reproduction": '{"stack": "mavbench", "scale": 0.5}'})
+    (problem,) = gather([tmp_path]).problems
+    assert problem.endswith(
+        f"2 of 5 missions have flown. mavfi reproduce --stack mavbench --scale 0.5 --out {tmp_path}"
+        " flies the rest."
+    )
 
 
 def test_campaigns_of_several_builds_are_told(campaign, tmp_path):
@@ -145,6 +158,23 @@ def test_a_part_has_the_specification_beside_it(export, tmp_path):
     assert source.spec.repetitions == 3
     assert source.planned is None
     assert len(source.digest) == 64
+
+
+def test_a_kernel_in_two_places_counts_once(tmp_path):
+    told = json.loads(KERNELS.read_text())
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        told["kernels"] = told["kernels"][:2]
+        (tmp_path / name / "kernels.json").write_text(json.dumps(told))
+        told["kernels"][0]["runs"] = 7
+    found = gather([tmp_path])
+    (first, *_) = found.isolated.values()
+    assert first["runs"] == 7
+    assert len(found.problems) == 2
+    assert found.problems[0].endswith(f"both have {first['kernel']}; the latter counts.")
+    flights = {stack: found.flights(stack) for stack in STACKS}
+    fig6 = next(each for each in shown_items(found, flights) if each.item.name == "fig6")
+    assert [len(part.table.rows) for part in fig6.parts] == [2]
 
 
 def test_a_mission_in_two_places_counts_once(export):

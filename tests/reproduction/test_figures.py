@@ -19,8 +19,8 @@ from mavfi_cli.report.paper_figures import (
     draw_stack,
 )
 from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
-from mavfi_cli.reproduction.figures import DRAWN
-from mavfi_cli.reproduction.layouts import of_flights
+from mavfi_cli.reproduction.figures import DRAWN, draw
+from mavfi_cli.reproduction.layouts import OF_FLIGHTS, of_flights
 
 FLIGHTS = table(*(
     each
@@ -83,7 +83,8 @@ def test_dots_show_ours_and_the_papers():
     axes = draw_dots(small_table(), "two").axes[0]
     values = {tuple(line.get_xdata()) for line in axes.lines}
     assert {(3.0,), (5.0,)} <= values
-    assert {collection.get_paths()[0].vertices[:, 0].tolist()[0] for collection in axes.collections}
+    ends = [each.get_paths()[0].vertices[:, 0].tolist() for each in axes.collections]
+    assert ends == [[2.0, 4.0]] * 2  # an interval a row
 
 
 @pytest.mark.parametrize("suffix", [".svg", ".pdf", ".png"])
@@ -101,6 +102,20 @@ def test_what_is_drawn_is_what_the_table_says():
     worst = of_flights("fig12", FLIGHTS).rows[0].cells[1].value
     drawn = [max(line.get_xdata()) for line in axes.lines if line.get_marker() == "s"]
     assert drawn == [pytest.approx(worst)]
+
+
+@pytest.mark.parametrize("name", OF_FLIGHTS)
+def test_before_a_mission_has_flown_there_is_nothing_to_draw(name):
+    nothing = table()
+    with pytest.raises(RecordError, match="no mission of the figure has flown yet"):
+        draw(of_flights(name, nothing), nothing, "one")
+
+
+@pytest.mark.parametrize("name", ["fig8", "fig9"])
+def test_faults_by_place_need_a_fault(name):
+    golden = table(flight("a", 20.0))
+    with pytest.raises(RecordError, match="no mission of the figure has flown yet"):
+        draw(of_flights(name, golden), golden, "one")
 
 
 def test_trajectories_need_a_kept_run():

@@ -157,6 +157,9 @@ def test_fig_13_follows_one_flight_into_its_recovery():
     assert cell(found, "planning", "worst, %").value == pytest.approx(50.0)
     assert cell(found, "planning", "worst, %").paper == 24.5
     assert cell(found, "planning", "the same with AAD, %").value == pytest.approx(5.0)
+    milder = struck("b", 28.0, detector="aad", fault_seed=2)  # of the same mission
+    found = of_flights("fig13", table(flight("b", 20.0), struck("b", 30.0, fault_seed=1), milder))
+    assert math.isnan(cell(found, "planning", "the same with AAD, %").value)
 
 
 def test_fig_16_compares_platforms():

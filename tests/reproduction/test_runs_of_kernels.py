@@ -39,7 +39,11 @@ def test_runs_are_made_once_and_become_the_table(tmp_path):
     (row,) = of_kernels(kernel_summary(tmp_path / "kernels" / KERNELS)).rows
     assert row.cells[0].count <= RUNS
     assert (tmp_path / "kernels" / "kernels.svg").is_file()
-    assert KernelRuns(out=tmp_path, runs=RUNS + 2, jobs=1).missing() == 2
+    more = KernelRuns(out=tmp_path, runs=RUNS + 2, jobs=1)
+    assert more.missing() == 2
+    more.run(steps, 60.0)
+    assert steps.texts[-1].endswith(f"{RUNS + 2}/{RUNS + 2} runs, 0:00 min to go")
+    assert f"{RUNS + 1}/{RUNS + 2} runs, 0:30 min to go" in steps.texts[-2]
 
 
 def test_without_runs_the_command_that_makes_them_is_named(tmp_path):
