@@ -260,7 +260,7 @@ def completed(planned: Mapping[str, Any], result: RunResult) -> Record:
 
 # -- worker processes
 
-_CHUNK = 32  # tasks that are sent at once
+_CHUNK = 32  # tasks that are sent to a worker at once
 Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn at its moment
 
 
@@ -396,12 +396,10 @@ class _AttackWorkers:
             FaultError: something killed a worker.
             TargetError: the target cannot be sent to a worker.
         """
-        size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
-        jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
         if self._pool is None:
-            for job in jobs:
+            for task in tasks:
                 with one_processor():
-                    results = _work(job)
+                    results = _work((bench, [task]))
                 yield from results
             return
         try:
@@ -409,6 +407,8 @@ class _AttackWorkers:
         except Exception as error:  # the target may raise anything
             problem = f"cannot be handed to a worker process: {error}"
             raise TargetError(bench.target.name, problem) from None
+        size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
+        jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
         try:
             for results in self._pool.map(_work, jobs):
                 yield from results

@@ -7,13 +7,14 @@ where it stopped.
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import write_atomically, write_json
+from mavfi_cli.core.files import write_atomically, write_json, writing
 
 PLAN, RUNS = "plan.json", "runs.jsonl"
 _DRAWN = ("object", "offset", "trigger", "k", "instruction_bytes", "corruption", "build_ids")
@@ -42,10 +43,8 @@ class Journal:
         """
         self._folder = folder
         path = folder / PLAN
-        try:
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecordError(f"{folder}: {error.strerror}") from None
         if path.is_file():
             stored = read_plan(folder)
             differs = sorted(key for key in {*known, *stored} if stored.get(key) != known.get(key))
@@ -53,6 +52,13 @@ class Journal:
                 raise ConfigError(f"holds another campaign; it differs in {differs}", path=folder)
         self._require_all(runs, kernels)
         write_json(path, known)
+        self._end_last_line()
+
+    def _end_last_line(self) -> None:
+        """Keep the next run off a line that an interruption has cut."""
+        path = self._folder / RUNS
+        if path.is_file() and not path.read_bytes().endswith(b"\n"):
+            self._write(b"\n")
 
     def _require_all(self, runs: int, kernels: Sequence[str] | None) -> None:
         """Refuse to leave out existing runs, because the summary covers the whole folder."""
@@ -91,13 +97,12 @@ class Journal:
 
     def append(self, entry: Mapping[str, Any]) -> None:
         """Append a run that is over."""
+        self._write((json.dumps(entry) + "\n").encode())
+
+    def _write(self, data: bytes) -> None:
         path = self._folder / RUNS
-        line = (json.dumps(entry) + "\n").encode()
-        try:
-            with path.open("ab", buffering=0) as file:
-                file.write(line)
-        except OSError as error:
-            raise RecordError(f"{path}: {error.strerror}") from None
+        with writing(path), path.open("ab") as file:
+            file.write(data)
 
 
 def read_plan(folder: Path) -> dict[str, Any]:
@@ -116,25 +121,25 @@ def read_plan(folder: Path) -> dict[str, Any]:
     return plan
 
 
-def read_runs(folder: Path) -> Iterator[dict[str, Any]]:
-    """Read the completed records of a folder; an incomplete last line is left out.
+def read_runs(folder: Path) -> list[dict[str, Any]]:
+    """Read the completed records of a folder; incomplete lines are left out.
+
+    A run that was repeated, because the program was built anew, replaces the earlier one.
 
     Raises:
         RecordError: the file cannot be read.
     """
     path = folder / RUNS
     if not path.is_file():
-        return
-    try:
+        return []
+    with writing(path):
         lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise RecordError(f"{path}: {error.strerror}") from None
+    found: dict[tuple[Any, int], dict[str, Any]] = {}
     for line in lines:
-        try:
-            entry: dict[str, Any] = json.loads(line)
-        except ValueError:
-            continue
-        yield entry
+        with contextlib.suppress(ValueError):
+            entry = json.loads(line)
+            found[entry.get("kernel"), entry["run"]] = entry
+    return list(found.values())
 
 
 def _same_fault(entry: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:

@@ -65,7 +65,8 @@ def absolute_arguments(
     own = {str(PurePosixPath(name)) for name in written}
     for argument in argv:
         path = directory / argument
-        named = path.is_file() or ("/" in argument and path.is_dir())
+        # Unlike Path's, these two take any text, however long.
+        named = os.path.isfile(path) or ("/" in argument and os.path.isdir(path))
         if str(PurePosixPath(argument)) in own or argument.startswith("/") or not named:
             yield argument
         else:

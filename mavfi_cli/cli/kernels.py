@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import shlex
 import tempfile
@@ -91,6 +92,9 @@ def kernels(**options: Any) -> None:
 
     Outcomes: benign, crash, hang, SDC (silent data corruption), not injected.
     """
+    for name in ("memory", "tolerance"):
+        if not math.isfinite(options[name]):
+            raise ConfigError("must be a finite number", key=name)
     if options["compat"] is not None:
         chosen = ("sampling", "site", "role", "field", "bits")
         refuse_given(chosen, "goes without --compat, which chooses it by its own rule")

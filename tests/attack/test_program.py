@@ -5,6 +5,9 @@ import io
 import json
 import math
 import re
+from dataclasses import replace
+from operator import itemgetter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +16,10 @@ from click.testing import CliRunner
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.journal import read_runs
 from mavfi_cli.attack.outcome import RunOutcome, Struck, shares
 from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.target import RunLimits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
@@ -330,12 +335,45 @@ def test_a_campaign_that_was_cut_off_goes_on(target, tmp_path):
     (tmp_path / "runs.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
     second = go_on(8)
     assert [entry["run"] for entry in second] == list(range(8))
+    assert sorted(read_runs(tmp_path), key=itemgetter("run")) == list(second)
     assert second[:3] == first[:3]
     assert [entry["outcome"] for entry in second[:6]] == [entry["outcome"] for entry in first]
     with pytest.raises(ConfigError, match="holds 8 runs already, 7 are asked for"):
         go_on(7)
     with pytest.raises(ConfigError, match=r"another campaign; it differs in \['seed'\]"):
         go_on(8, seed=10)
+
+
+def test_every_run_is_on_the_disk_at_its_end(target, tmp_path):
+    kept = []
+
+    def stop_at_the_fourth(_name, done):
+        kept.append(len(read_runs(tmp_path)))
+        if done == 4:
+            raise KeyboardInterrupt
+
+    plan = Plan(runs=12, seed=9)
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(plan, [target("counting", "30")], folder=tmp_path, progress=stop_at_the_fourth)
+    assert kept == [0, 1, 2, 3, 4]
+
+
+def test_runs_of_a_program_that_was_built_anew_replace_the_earlier_ones(target, tmp_path):
+    program = target("counting", "30")
+    path = Path(program.command.argv[0])
+    copy = tmp_path / "counting"
+    copy.write_bytes(path.read_bytes())
+    copy.chmod(0o755)
+    built = replace(program, command=Program.of([str(copy), "30"]))
+    folder = tmp_path / "out"
+    attacked(built, folder=folder, runs=3, seed=9)
+    runs = folder / "runs.jsonl"
+    ours = '"build_ids": {"counting": "'
+    runs.write_text(runs.read_text().replace(ours, f"{ours}0"))
+    again = attacked(built, folder=folder, runs=3, seed=9).records
+    assert len(runs.read_text().splitlines()) == 6
+    assert read_runs(folder) == list(again)
+    assert [replay.differs for replay in replay_runs(folder)] == [()] * 3
 
 
 def test_a_record_of_another_build_is_refused(target, start):

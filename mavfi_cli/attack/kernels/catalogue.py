@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -233,6 +234,7 @@ def _own(path: Path) -> Kernel:
         raise TargetError(str(path), "no such file")
     sys.path.insert(0, str(path.parent))  # as for a script: modules beside it can be imported
     module = importlib.util.module_from_spec(spec)
+    sys.modules.setdefault(path.stem, module)  # dataclasses look up their module there
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # the user's file may raise anything
@@ -250,7 +252,7 @@ def select(names: Iterable[str]) -> tuple[str, ...]:
 
     Raises:
         UnknownName: there is no kernel of a name; names the nearest.
-        TargetError: a file has no kernel.
+        TargetError: a file has no kernel, or several kernels have one name.
     """
     chosen = list(names)
     files = [str(Path(name).resolve()) for name in chosen if name.endswith(".py")]
@@ -259,4 +261,8 @@ def select(names: Iterable[str]) -> tuple[str, ...]:
     wanted = {find(name).name for name in chosen if not name.endswith(".py")}
     if not chosen:
         wanted = set(KERNELS)
-    return (*(name for name in KERNELS if name in wanted), *dict.fromkeys(files))
+    found = (*(name for name in KERNELS if name in wanted), *dict.fromkeys(files))
+    for name, count in Counter(find(each).name for each in found).items():
+        if count > 1:
+            raise TargetError(name, "several kernels have this name")
+    return found

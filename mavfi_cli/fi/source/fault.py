@@ -19,7 +19,7 @@ from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import BY_NAME, State, of_stage
 from mavfi_cli.core.types import Stage
-from mavfi_cli.fi.bits import NUMPY_TYPES, Field, mask_of
+from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, Field, mask_of
 
 
 class When(Enum):
@@ -134,18 +134,29 @@ def draw_fault(
     rng = generator(seed, Stream.FAULT, "site")
     states = _states(target, rng, together, corruption.field)
     for state in states:
-        kind = NUMPY_TYPES[state.dtype.value]
-        if bits is not None:
-            mask_of(bits, kind)
-        elif corruption.effect is Effect.FLIP and corruption.bits > len(
-            kind.field_bits(corruption.field)
-        ):
-            raise FaultSpecError(
-                f"{state.name} is {kind.name}: its field {corruption.field.value} has no "
-                f"{corruption.bits} bits"
-            )
+        require_bits(state.name, NUMPY_TYPES[state.dtype.value], corruption, bits)
     chosen = None if bits is None else tuple(tuple(sorted(bits)) for _ in states)
     return SourceFault(states=states, trigger=trigger, corruption=corruption, bits=chosen)
+
+
+def require_bits(
+    name: str, kind: BitType, corruption: Corruption, bits: Sequence[int] | None
+) -> None:
+    """Refuse a fault whose bits a value does not have.
+
+    Raises:
+        BitOutsideWidth, FieldUnavailable: an exact bit or the field is missing.
+        FaultSpecError: the field has too few bits.
+    """
+    if bits is not None:
+        mask_of(bits, kind)
+    elif corruption.effect is Effect.FLIP and corruption.bits > len(
+        kind.field_bits(corruption.field)
+    ):
+        raise FaultSpecError(
+            f"{name} is {kind.name}: its field {corruption.field.value} has no "
+            f"{corruption.bits} bits"
+        )
 
 
 def _states(

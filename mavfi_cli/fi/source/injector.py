@@ -27,7 +27,15 @@ from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.states import Message, Scalar, State
 from mavfi_cli.core.types import CollisionReport, Command, Trajectory
 from mavfi_cli.fi import bits as bit_operations
-from mavfi_cli.fi.source.fault import Corruption, Effect, Persistence, SourceFault, Trigger, When
+from mavfi_cli.fi.source.fault import (
+    Corruption,
+    Effect,
+    Persistence,
+    SourceFault,
+    Trigger,
+    When,
+    require_bits,
+)
 
 M = TypeVar("M")
 
@@ -371,7 +379,7 @@ class MemoryInjector(Injector):
     Raises:
         UnknownName: there is no such array.
         BitOutsideWidth, FieldUnavailable: the array's elements do not have these bits.
-        FaultSpecError: the array has no elements.
+        FaultSpecError: the array has no elements, or the field too few bits.
     """
 
     _awaits = "control tick"
@@ -401,10 +409,7 @@ class MemoryInjector(Injector):
         self.array = array
         self.element = int(rng.integers(memory[array].size))
         self._kind = bit_operations.NUMPY_TYPES[memory[array].dtype.name]
-        if bits is not None:
-            bit_operations.mask_of(bits, self._kind)
-        elif corruption.effect is Effect.FLIP:
-            self._kind.field_bits(corruption.field)
+        require_bits(array, self._kind, corruption, bits)
         self._memory = memory
         chosen = None if bits is None else tuple(sorted(bits))
         self._pattern = _Pattern(corruption, rng, chosen)

@@ -199,19 +199,20 @@ def _registers(
         site = site_of(use.register)
         if not (use.mask and site in model.sites and (use.explicit or model.implicit)):
             continue
-        mask, name = use.mask & _field_mask(instruction, model, site), use.operand
+        mask, name = use.mask & _field_mask(instruction, model, role, site), use.operand
         if use.register in merged:  # the flags of one instruction are one operand
             mask, name = mask | merged[use.register][1], use.register
         merged[use.register] = _operand(site, role, mask, name, use.register)
     return [operand for operand in merged.values() if operand[1]]
 
 
-def _field_mask(instruction: Instruction, model: FaultModel, site: Site) -> int:
+def _field_mask(instruction: Instruction, model: FaultModel, role: Role, site: Site) -> int:
     if model.field is Field.ANY:
         return -1
-    if site is not Site.VECTOR or instruction.element is None:
+    element = instruction.elements[role is Role.DESTINATION]
+    if site is not Site.VECTOR or element is None:
         return 0
-    kind = bits.NUMPY_TYPES[instruction.element]
+    kind = bits.NUMPY_TYPES[element]
     lane = bits.mask_of(kind.field_bits(model.field), kind)
     if instruction.scalar:
         return lane

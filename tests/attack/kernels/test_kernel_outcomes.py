@@ -11,6 +11,7 @@ import pytest
 from mavfi_cli.attack import served
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, run_campaign
+from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.core.errors import TargetError
@@ -127,6 +128,27 @@ def test_a_kernel_that_does_not_load_says_why(known_target):
     Path(target.kernel).with_name("broken.py").write_text("import nothing_of_that_name")
     with pytest.raises(TargetError, match=r"cannot be loaded: .*nothing_of_that_name"):
         KernelTarget(kernel=str(Path(target.kernel).with_name("broken.py")), inputs=KNOWN).open()
+
+
+def test_a_kernel_may_have_dataclasses_with_postponed_annotations(known_target):
+    """They look for their module among those that are imported."""
+    path = Path(known_target("return 7;").kernel)
+    record = "@dataclass\nclass Record:\n    name: str\n"
+    begin = "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+    path.write_text(f"{begin}{path.read_text()}\n{record}")
+    assert catalogue.select([str(path)]) == (str(path),)
+
+
+def test_two_kernels_of_one_name_are_refused(known_target):
+    path = Path(known_target("return 7;").kernel)
+    other = path.with_name("other.py")
+    other.write_text(path.read_text())
+    with pytest.raises(TargetError, match="known: several kernels have this name"):
+        catalogue.select([str(path), str(other)])
+    other.write_text(path.read_text().replace('"known"', '"control"'))
+    catalogue.find.cache_clear()
+    with pytest.raises(TargetError, match="control: several kernels have this name"):
+        catalogue.select(["control", str(other)])
 
 
 def test_a_run_that_is_given_up_disturbs_no_other(known):

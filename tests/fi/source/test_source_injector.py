@@ -19,7 +19,7 @@ from mavfi_cli.fi.source.fault import (
     When,
     draw_fault,
 )
-from mavfi_cli.fi.source.injector import Moment, SourceInjector, Strike
+from mavfi_cli.fi.source.injector import MemoryInjector, Moment, SourceInjector, Strike
 
 TRAJECTORY = Trajectory(
     stamp_s=0.0,
@@ -310,3 +310,27 @@ def test_of_a_stage_only_states_that_have_the_field_are_drawn(stage, field):
     assert {state.dtype.value for state in drawn} == {"float64"}
     able = {state.name for state in of_stage(Stage(stage)) if state.dtype.value == "float64"}
     assert {state.name for state in drawn} == able
+
+
+@pytest.mark.parametrize(
+    ("corruption", "bits", "error", "message"),
+    [
+        (Corruption(bits=2, field=Field.SIGN), None, FaultSpecError, "field sign has no 2 bits"),
+        (Corruption(bits=65), None, FaultSpecError, "mean is float64: its field any has no 65"),
+        (Corruption(), [64], BitOutsideWidth, "64"),
+    ],
+)
+def test_bits_that_a_memory_does_not_have_are_refused_before_the_flight(
+    corruption, bits, error, message
+):
+    with pytest.raises(error, match=message):
+        MemoryInjector(
+            {"mean": np.zeros(3)},
+            None,
+            trigger=Trigger(),
+            corruption=corruption,
+            bits=bits,
+            seed=1,
+            shortest_flight_s=10.0,
+            listener=lambda _: None,
+        )

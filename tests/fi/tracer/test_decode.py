@@ -82,13 +82,20 @@ def test_lea_touches_no_memory():
 
 
 @pytest.mark.parametrize(
-    ("code", "offset", "reads"), [("50", -8, False), ("58", 0, True), ("c3", 0, True)]
+    ("code", "offset", "reads"),
+    [("50", -8, False), ("58", 0, True), ("c3", 0, True), ("f3c3", 0, True), ("f2c3", 0, True)],
 )
 def test_push_pop_and_ret_use_the_stack(code, offset, reads):
     instruction = of(code)
     use = instruction.memory[-1]
     assert address_of(use, instruction, {"rsp": 0x7000}.get) == 0x7000 + offset
     assert (use.reads, use.writes) == (reads, not reads)
+
+
+def test_a_return_with_a_prefix_is_stepped_like_any_other():
+    """Compilers wrote `rep ret` for years; the instruction behind it may never execute."""
+    assert of("f3c3").branches
+    assert not of("f3c3").run_over
 
 
 def test_no_instruction_is_none():

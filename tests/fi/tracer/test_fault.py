@@ -76,6 +76,35 @@ def test_an_instruction_without_the_field_is_not_drawn():
     assert drawn(ADD, FaultModel(field=Field.EXPONENT), 1) == [None]
 
 
+def fields(code, role, field=Field.EXPONENT):
+    model = FaultModel(field=field, roles=frozenset((role,)))
+    return {bit for each in drawn(of(code), model) if each for bit in each.bits}
+
+
+EXPONENT = {"double": set(range(52, 63)), "single": set(range(23, 31))}
+
+
+@pytest.mark.parametrize(
+    ("code", "read", "written"),
+    [
+        ("f20f5ac1", EXPONENT["double"], EXPONENT["single"]),  # cvtsd2ss xmm0, xmm1
+        ("f30f5ac1", EXPONENT["single"], EXPONENT["double"]),  # cvtss2sd xmm0, xmm1
+        ("f20f2cc1", EXPONENT["double"], set()),  # cvttsd2si eax, xmm1
+        ("f20f2ac0", set(), EXPONENT["double"]),  # cvtsi2sd xmm0, eax
+        ("660f383dc1", set(), set()),  # pmaxsd xmm0, xmm1: integers
+        ("660f381ec1", set(), set()),  # pabsd xmm0, xmm1
+    ],
+)
+def test_a_field_is_that_of_the_float_that_is_read_or_written(code, read, written):
+    assert fields(code, Role.SOURCE) == read
+    assert fields(code, Role.DESTINATION) == written
+
+
+def test_a_broadcast_writes_a_float_to_every_lane():
+    assert fields("c4e27918c1", Role.SOURCE, Field.SIGN) == {31}  # vbroadcastss xmm0, xmm1
+    assert fields("c4e27918c1", Role.DESTINATION, Field.SIGN) == {31, 63, 95, 127}
+
+
 def test_several_bits_are_distinct():
     for corruption in drawn(ADDSD, FaultModel(count=3), 50):
         assert len(set(corruption.bits)) == 3

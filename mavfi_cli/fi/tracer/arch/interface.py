@@ -49,7 +49,7 @@ class Instruction:
     reads: tuple[RegisterUse, ...]
     writes: tuple[RegisterUse, ...]
     memory: tuple[MemoryUse, ...]
-    element: str | None  # float64 or float32 where the instruction computes with them
+    elements: tuple[str | None, str | None]  # float64 or float32, if it reads or writes them
     scalar: bool  # it computes with the lowest element of its registers only
     branches: bool  # it is a jump, a call or a return
     run_over: bool  # one single step is not enough or leaves a trace: run past it

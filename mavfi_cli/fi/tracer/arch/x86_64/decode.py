@@ -7,6 +7,7 @@ call and ret, and what the tracer has to know of an instruction to step over it.
 from __future__ import annotations
 
 import functools
+import re
 from typing import Any
 
 import capstone
@@ -41,29 +42,35 @@ def _decode(code: bytes, address: int) -> Instruction | None:
         reads=tuple(operands.reads.values()),
         writes=tuple(operands.writes.values()),
         memory=(*_memory(found, operands), *_stack(found)),
-        element=_element(found.mnemonic),
-        scalar=found.mnemonic.endswith(("sd", "ss")),
+        elements=_elements(found.mnemonic),
+        scalar=found.mnemonic.endswith(("sd", "ss")) and "broadcast" not in found.mnemonic,
         branches=branches(found),
-        run_over=_run_over(found.mnemonic),
+        run_over=_run_over(found),
     )
 
 
-def _run_over(mnemonic: str) -> bool:
+def _run_over(found: Any) -> bool:
     """True if one single step is not enough, or leaves a trace.
 
-    A step executes one iteration of a repeated string instruction. After a step over a pop of the
-    flags, Linux takes the trap flag for the program's own (`enable_single_step` in
-    arch/x86/kernel/step.c), and would leave it set.
+    A step executes one iteration of a repeated string instruction. `rep ret` is a plain return.
+    After a step over a pop of the flags, Linux takes the trap flag for the program's own
+    (`enable_single_step` in arch/x86/kernel/step.c), and would leave it set.
     """
-    return mnemonic.startswith("rep") or mnemonic in ("popfq", "popf")
+    repeated = found.mnemonic.startswith("rep") and not branches(found)
+    return repeated or found.mnemonic in ("popfq", "popf")
 
 
-def _element(mnemonic: str) -> str | None:
-    if mnemonic.startswith(("mov", "vmov")) and mnemonic.endswith(("dqa", "dqu")):
-        return None
-    if mnemonic.endswith(("sd", "pd")):
-        return "float64"
-    return "float32" if mnemonic.endswith(("ss", "ps")) else None
+_FLOATS = {"sd": "float64", "pd": "float64", "ss": "float32", "ps": "float32"}
+_CONVERSION = re.compile(r"v?cvtt?(\w+)2(\w+)$")
+_INTEGERS = re.compile(r"v?p\w*s[ds]$")  # of signed doublewords: pmaxsd, pabsd
+
+
+def _elements(mnemonic: str) -> tuple[str | None, str | None]:
+    """The floats that an instruction reads and writes."""
+    if match := _CONVERSION.match(mnemonic):
+        return _FLOATS.get(match[1]), _FLOATS.get(match[2])
+    element = None if _INTEGERS.match(mnemonic) else _FLOATS.get(mnemonic[-2:])
+    return element, element
 
 
 def _memory(found: Any, operands: Operands) -> list[MemoryUse]:
@@ -91,7 +98,7 @@ def _memory(found: Any, operands: Operands) -> list[MemoryUse]:
 
 
 def _stack(found: Any) -> list[MemoryUse]:
-    mnemonic = found.mnemonic
+    mnemonic = found.mnemonic.split()[-1]  # without rep, bnd or notrack
     if mnemonic.startswith(("push", "call")):
         displacement, reads = -8, False
     elif mnemonic.startswith(("pop", "ret", "leave")) and not mnemonic.startswith("popcnt"):
