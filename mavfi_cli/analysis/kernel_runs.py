@@ -24,7 +24,7 @@ def kernel_summary(path: Path) -> Mapping[str, Any]:
         found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         found["plan"]["rule"], found["plan"]["compat"], found["plan"]["model"]
         for each in found["kernels"]:
-            each["kernel"], each["outcomes"]["sdc"]["of"]
+            each["kernel"], silent_of_all(each)
     except OSError as error:
         raise RecordError(f"{path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError) as error:

@@ -170,7 +170,8 @@ def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) 
         by: labels by which settings are grouped; empty means all.
 
     Returns:
-        Plain values. `cells`: one row per setting. `faults`, `protection`: see `comparison`.
+        Plain values. `cells`: one row per setting. `faults`: as of `against_golden`. `protection`:
+        as of the function of that name.
 
     Raises:
         UnknownName: no setting has such a label.

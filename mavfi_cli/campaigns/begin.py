@@ -54,7 +54,7 @@ def chosen(
         what: a preset, a TOML file, or the folder of an existing campaign.
         out: the folder; None means campaigns/NAME, or the named folder.
         scale: fraction of the repetitions; for a folder, only the one it was begun with.
-        changes: factors to replace, as `specification.changes`; the default folder's name has them.
+        changes: factors to replace, as `replaced` takes them; the default folder's name has them.
 
     Raises:
         ConfigError: the specification or the scale cannot be used; or a preset without `out`

@@ -262,9 +262,14 @@ class Ledger:
         """The setting of each mission, in the order of the list."""
         return [cell for (cell,) in self._rows("SELECT cell FROM missions ORDER BY number")]
 
-    def fates(self) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
-        """Number, outcome and fate of the fault of every mission that is over."""
-        for number, *fate in self._rows("SELECT number, outcome, injected FROM results"):
+    def fates(self, *, errors: bool = True) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
+        """Number, outcome and fate of the fault of every mission that is over.
+
+        Args:
+            errors: missions that could not begin count as over.
+        """
+        over = "" if errors else " WHERE state <> 'error'"
+        for number, *fate in self._rows(f"SELECT number, outcome, injected FROM results{over}"):
             yield number, (fate[0], fate[1])
 
     def over(self) -> int:

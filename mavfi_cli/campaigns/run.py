@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +73,10 @@ class Options:
     cluster: str | None = None
     only: frozenset[int] | None = None
     kept: frozenset[int] = frozenset()
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.limit_s < math.inf:
+            raise ConfigError(f"must be above 0 and finite, got {self.limit_s:g}", key="limit")
 
 
 def run_campaign(
@@ -200,9 +206,8 @@ class _Run:
         self._options = options
         self._spectator = spectator
         self._folder = ledger.folder.absolute()
-        self._gate = (
-            None if stop is None else BatchLimiter(stop, ledger.cell_of_each(), ledger.fates())
-        )
+        over = partial(ledger.fates, errors=not options.errors)
+        self._gate = None if stop is None else BatchLimiter(stop, ledger.cell_of_each(), over())
         self._jobs = options.jobs or len(os.sched_getaffinity(0))
         only = options.only
         missing = ledger.missing(errors=options.errors)
@@ -214,10 +219,8 @@ class _Run:
         self._setting_of, self._outcomes = _settings(ledger)
         self._errors = self._repeated = 0
         self._inside_s = 0.0
-        self._total, self._before = ledger.planned(), ledger.over()
-        if only is not None:
-            self._total = len(only)
-            self._before = sum(number in only for number, _ in ledger.fates())
+        self._total = ledger.planned() if only is None else len(only)
+        self._before = sum(only is None or number in only for number, _ in over())
         self._over = self._before
         self._begun = time.monotonic()
 

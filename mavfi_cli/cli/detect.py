@@ -68,7 +68,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_fault("--field", "fields", default="sign,exponent,mantissa,integer", show_default=True,
         help="Fields of the bits at source level; integer means states that have no other "
              "field.")  # fmt: skip
-@_fault("--seed", default=1, show_default=True, help="Seed of the faults.")
+@_fault("--seed", default=1, show_default=True, type=click.IntRange(min=0),
+        help="Seed of the faults.")  # fmt: skip
 @_detector("--detector", "detectors", metavar="NAME,NAME",
            help="Detectors to evaluate  [none,range,l2,gad,aad].")  # fmt: skip
 @_detector("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")

@@ -38,7 +38,7 @@ _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
     help="Detector to fit: gad, aad, range, l2. May be repeated  [all].",
 )
 @click.option("--n-sigma", type=float, help="Threshold of the Gaussian model  [its default].")
-@click.option("--seed", default=1, show_default=True,
+@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0),
               help="Seed of the split and of the autoencoder's initial weights.")  # fmt: skip
 @click.option("--jobs", type=click.IntRange(min=1),
               help="Number of parallel missions  [one per core].")  # fmt: skip

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.config import structure
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.mission.record.measures import measures_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
@@ -59,6 +59,9 @@ def mission_of(campaign: Path, number: int) -> _CampaignMission:
 
 def _of_export(path: Path, number: int) -> _CampaignMission:
     table = read_parquet(path, "export of a campaign")
+    if missing := {"number", "outcome", "changes"} - {*table.column_names}:
+        told = f"no export of a campaign: it has no column {', '.join(sorted(missing))}"
+        raise RecordError(f"{path}: {told}")
     for row in table.filter(pc.equal(table["number"], number)).to_pylist():
         if row["outcome"] is not None:
             config = structure(json.loads(row["changes"]), MissionConfig)

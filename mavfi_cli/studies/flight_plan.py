@@ -38,6 +38,17 @@ class FlightPlan:
     files: Mapping[Path, str]
     limits: SchemeLimits
 
+    def write(self) -> None:
+        """Write the files.
+
+        Raises:
+            RecordError: a file cannot be written.
+        """
+        for path, text in self.files.items():
+            with writing(path.parent):
+                path.parent.mkdir(parents=True, exist_ok=True)
+            write_text(path, text)
+
 
 def flight_plan(
     setting: ModelInputs,
@@ -93,18 +104,6 @@ def flight_plan(
         cut=tuple(filter(None, (cut_v, cut_a, cut_r, cut_f))),
     )
     return FlightPlan(mission=mission, files=dict((vehicle, computer)), limits=limits)
-
-
-def write_files(plan: FlightPlan) -> None:
-    """Write the TOML files of the plan's missions.
-
-    Raises:
-        RecordError: a file cannot be written.
-    """
-    for path, text in plan.files.items():
-        with writing(path.parent):
-            path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, text)
 
 
 def _vehicle(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> dict[str, Any]:

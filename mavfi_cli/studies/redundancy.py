@@ -21,7 +21,7 @@ from mavfi_cli.core.errors import CannotLift, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan, write_files
+from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan
 from mavfi_cli.studies.flying import fly
 from mavfi_cli.studies.redundancy_plan import RedundancyPlan
 from mavfi_cli.studies.train import train
@@ -53,7 +53,7 @@ def _plans_of(
             each = flight_plan(setting, scheme, platform, chain_s, folder, models, plan.stack)
             if each.mission.detector is not None:
                 detector_of(each.mission.detector, each.mission.stack)
-            write_files(each)
+            each.write()
             if scheme.copies not in refused:
                 ask_vehicle(replace(each.mission, world=plan.worlds[0], seed=plan.first_seed))
                 refused[scheme.copies] = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,8 +52,9 @@ def train(
         check(plan.kinds, len(plan.missions()), plan.n_sigma)
         plan = replace(plan, base=with_firmware(plan.base))
         flights, failed = fly_training(plan, folder, options, spectator)
+        autopilots = {plan.base.autopilot}
     else:
-        flights, failed = collect_flown(plan.flown, stack)
+        flights, failed, autopilots = collect_flown(plan.flown, stack)
         check(plan.kinds, len(flights), plan.n_sigma)
     if not flights:
         raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
@@ -64,7 +65,7 @@ def train(
     for kind in plan.kinds:
         spectator.on_note(f"fitting {kind}")
         model = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
-        fitted[kind] = _flown_by(plan.base.autopilot, model)
+        fitted[kind] = _flown_by(autopilots, model)
     models = {}
     for kind, model in fitted.items():  # all of them, or none
         path = folder / f"{kind}.json"
@@ -73,8 +74,9 @@ def train(
     return _TrainedDetectors(dataset=dataset, models=models, failed=failed)
 
 
-def _flown_by(autopilot: str, model: Model) -> Model:
-    """Return the model with a real autopilot in its provenance."""
-    if autopilot == OWN_AUTOPILOT:
+def _flown_by(autopilots: Collection[str], model: Model) -> Model:
+    """Return the model with the autopilots in its provenance, unless only ours has flown."""
+    if {*autopilots} == {OWN_AUTOPILOT}:
         return model
-    return replace(model, provenance={**model.provenance, "autopilot": autopilot})
+    told = ", ".join(sorted(autopilots))
+    return replace(model, provenance={**model.provenance, "autopilot": told})

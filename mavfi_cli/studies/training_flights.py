@@ -21,7 +21,7 @@ from mavfi_cli.detect.offline import columns_of, flight_of
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.mission.record.run_folder import RESULT, Run, load_run
 from mavfi_cli.mission.record.tables import read_plans
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.stack import load_stack
 
 WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
@@ -73,16 +73,13 @@ def fly_training(
     Returns:
         The samples, and the number of other flights.
     """
-    missions = plan.missions()
-    ledger = run_campaign(
-        missions, folder / FLIGHTS_FOLDER, replace(options, keep=Keep.ALL), spectator
-    )
-    flights: list[FlightSamples] = []
-    with ledger:
-        for entry in ledger.results():
-            world = missions[entry.number].config.world
-            if entry.outcome == Outcome.SUCCESS.value and entry.path is not None:
-                flights.append(_samples(load_run(folder / FLIGHTS_FOLDER / entry.path), world))
+    missions, options = plan.missions(), replace(options, keep=Keep.ALL)
+    with run_campaign(missions, folder / FLIGHTS_FOLDER, options, spectator) as ledger:
+        flights = [
+            _samples(load_run(entry.path), entry.mission.config.world)
+            for entry in ledger.results()
+            if entry.outcome == Outcome.SUCCESS.value and entry.path is not None
+        ]
     return flights, len(missions) - len(flights)
 
 
@@ -92,12 +89,13 @@ def _samples(run: Run, name: str) -> FlightSamples:
     return flight_of(columns, name, run.record.config["seed"], PreprocessParams(), plans)
 
 
-def collect_flown(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int]:
+def collect_flown(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int, set[str]]:
     """Collect the samples of the error-free flights among the run folders of a folder.
 
     Returns:
-        The samples, and the number of other flights. A flight has the name of its world, or that
-        of its run folder if the world and the seed have been flown before.
+        The samples, the number of other flights, and the autopilots that flew. A flight has the
+        name of its world, or that of its run folder if the world and the seed have been flown
+        before.
     """
     runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
     usable = [run for run in runs if _is_error_free(run, stack)]
@@ -110,7 +108,8 @@ def collect_flown(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], i
         world = config["world"]
         name = run.folder.path.name if (world, config["seed"]) in flights else world
         flights[name, config["seed"]] = _samples(run, name)
-    return list(flights.values()), len(runs) - len(usable)
+    autopilots = {run.record.config.get("autopilot", OWN_AUTOPILOT) for run in usable}
+    return list(flights.values()), len(runs) - len(usable), autopilots
 
 
 def _is_error_free(run: Run, stack: StackMark) -> bool:

@@ -309,13 +309,21 @@ def test_failure_given_a_kernels_corruption(book, tmp_path):
     assert "failure given corruption 0.625 (" in "\n".join(campaign_lines({"failures": [row]}))
 
 
+def test_no_setting_to_count_failures_of_is_told():
+    assert "none: no setting" in campaign_lines({"failures": []})[-1]
+
+
 def test_kernels_that_other_faults_struck_are_refused(book, tmp_path):
     native(book, range(2), bits=3)
     with pytest.raises(ConfigError, match=r"kernels.json: .*not the same population"):
         failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
 
 
-@pytest.mark.parametrize("text", [None, "no json", "{}", '{"plan": [], "kernels": []}'])
+COUNTLESS = """{"plan": {"rule": "", "compat": null, "model": {}},
+"kernels": [{"kernel": "octomap", "outcomes": {"sdc": {"of": 100}}}]}"""
+
+
+@pytest.mark.parametrize("text", [None, "no json", "{}", '{"plan": [], "kernels": []}', COUNTLESS])
 def test_a_folder_without_kernels_is_refused(book, tmp_path, text):
     native(book, range(2))
     if text is not None:

@@ -3,6 +3,8 @@
 import csv
 import io
 import math
+import shlex
+from dataclasses import replace
 
 import pytest
 from flown_twice import PLAN, SEEDS, figures_of, flight
@@ -141,6 +143,16 @@ def test_a_fault_that_cost_nothing_is_not_recommended():
     )
     assert "no fault made a flight longer on tx2" in text
     assert "mavfi fly" not in text
+
+
+def test_the_command_that_repeats_the_worst_flight_can_be_pasted():
+    plan = replace(PLAN, world="my worlds/a b.toml")
+    flights = [flight(p, s, 21.0 if setting == "none" else 20.0, setting) for p in PLAN.platforms
+               for s in SEEDS for setting in PLAN.settings]  # fmt: skip
+    lines = platform_lines({"plan": plan.told(), "errors": [], **figures_of(PLAN, flights)})
+    again = next(line for line in lines if "mavfi fly" in line)
+    words = ["mavfi", "fly", "--world", "my worlds/a b.toml", "--seed"]
+    assert shlex.split(again)[:5] == words
 
 
 def test_nothing_flown_gives_no_number_and_no_error():

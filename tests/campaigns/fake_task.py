@@ -37,7 +37,7 @@ def perform(changes, out):
             os.kill(os.getpid(), int(value))
     elif world == "exit":
         os._exit(int(value))
-    elif world == "blocked":
+    elif world == "blocked" or (out.parents[2] / f"blocked-{seed}").exists():
         raise WorldError("the start is blocked")
     elif world == "full":
         raise RecordError("result.json: No space left on device")

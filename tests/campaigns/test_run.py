@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import signal
 from dataclasses import replace
@@ -146,6 +147,14 @@ def test_errors_are_flown_again_when_asked_for(campaign):
     assert len(campaign.notes.lines) == 1
     campaign.run(missions, errors=True).close()
     assert len(campaign.notes.lines) == 2
+    last = campaign.notes.last
+    assert (last.before, last.over, last.total) == (1, 2, 2)
+
+
+@pytest.mark.parametrize("limit_s", [0.0, math.nan, math.inf])
+def test_a_limit_that_ends_all_missions_or_none_is_refused(campaign, limit_s):
+    with pytest.raises(ConfigError, match="limit: must be above 0 and finite"):
+        campaign.run(planned("fly"), limit_s=limit_s)
 
 
 def test_no_mission_at_all_ends_the_campaign(campaign):

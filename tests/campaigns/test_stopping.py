@@ -81,3 +81,14 @@ def test_a_campaign_stops_where_it_is_sure_enough(campaign, jobs):
     missions = planned(*["fly"] * 60)
     with campaign.run(missions, jobs=jobs, stop=STOP) as ledger:
         assert [result.number for result in ledger.results()] == list(range(20))
+
+
+def test_a_mission_that_could_not_begin_counts_once_when_it_is_flown_again(campaign):
+    (campaign.folder.parent / "blocked-0").touch()
+    missions = planned(*["fly"] * 40)
+    campaign.run(missions[:15]).close()
+    (campaign.folder.parent / "blocked-0").unlink()
+    with campaign.run(missions, append=True, stop=STOP, errors=True) as ledger:
+        found = [(result.number, result.outcome) for result in ledger.results()]
+    assert found == [(number, "success") for number in range(20)]
+    assert (campaign.notes.last.before, campaign.notes.last.over) == (14, 20)

@@ -157,8 +157,8 @@ def test_a_bad_profile_is_one_line(command_line, tmp_path, old, new, said):
 
 @pytest.mark.parametrize(
     "arguments",
-    [("--overhead", "aad"), ("--range", "0"), ("--response=-1",), ("--json", "--csv"),
-     ("--distance", "nan"), ("--range", "inf")],
+    [("--overhead", "aad"), ("--overhead", "a" * 300), ("--range", "0"), ("--response=-1",),
+     ("--json", "--csv"), ("--distance", "nan"), ("--range", "inf")],
 )  # fmt: skip
 def test_usage(command_line, arguments):
     code, out, err = command_line("vpm", *arguments)

@@ -68,6 +68,9 @@ def test_no_such_mission(folder, export, tmp_path):
             mission_of(place, 7)
     with pytest.raises(RecordError):
         mission_of(tmp_path, 0)
+    pq.write_table(pa.table({"number": [0]}), tmp_path / "foreign.parquet")
+    with pytest.raises(RecordError, match="no export of a campaign: it has no column changes, out"):
+        mission_of(tmp_path / "foreign.parquet", 0)
 
 
 def test_a_debugger_needs_a_run_folder(folder, mavfi):

@@ -41,8 +41,9 @@ def test_seeds_of_the_training_are_refused_by_name(mavfi, tmp_path):
 
 
 def test_usage_errors(mavfi, tmp_path):
-    done = mavfi("detect", "evaluate", "--json", "--csv", cwd=tmp_path)
-    assert done.returncode == 2
+    for words in (("--json", "--csv"), ("--seed", "-1")):
+        done = mavfi("detect", "evaluate", *words, cwd=tmp_path)
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert not list(tmp_path.iterdir())
 
 

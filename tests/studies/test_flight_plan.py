@@ -7,7 +7,7 @@ import pytest
 
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies.flight_plan import flight_plan, write_files
+from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.studies.redundancy_plan import RedundancyPlan
 from mavfi_cli.vpm.model import SCHEMES, hover_power_w, named, outcome
 from mavfi_cli.vpm.report import Choices, setting_of
@@ -27,7 +27,7 @@ def plan(tmp_path):
 
 
 def files_of(plan):
-    write_files(plan)
+    plan.write()
     mission = plan.mission
     return [tomllib.loads(Path(path).read_text()) for path in (mission.vehicle, mission.platform)]
 
@@ -85,7 +85,7 @@ def test_a_named_platform_flies_as_it_is(plan):
     tx2 = load_platform("tx2")
     chain_s = sum(kernel.latency_s for kernel in tx2.kernels.values())
     planned, _ = plan("airsim", "none", Choices(platform=tx2), tx2, chain_s)
-    write_files(planned)
+    planned.write()
     flown = load_platform(planned.mission.platform).kernels
     for name, kernel in tx2.kernels.items():
         assert flown[name].latency_s == pytest.approx(kernel.latency_s)

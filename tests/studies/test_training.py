@@ -81,6 +81,7 @@ def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
             "unknown detector 'gud'; did you mean 'gad'? Known: aad, gad, l2, range",
         ),
         (["--n-sigma", "-1"], "n sigma: must be a finite number above 0, got -1.0"),
+        (["--seed", "-1"], "Invalid value for '--seed': -1 is not in the range x>=0."),
         (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
         (
             ["--autopilot", "px4"],
@@ -94,7 +95,7 @@ def test_what_cannot_be_fitted_to_is_said_before_anything_is_flown(
 ):
     monkeypatch.delenv("PX4_SITL", raising=False)
     done = mavfi("train", *words, "--out", tmp_path / "training", "--quiet")
-    code = 2 if problem.startswith(("unknown", "--firmware")) else 1
+    code = 2 if problem.startswith(("unknown", "--firmware", "Invalid")) else 1
     assert (done.returncode, done.stdout, done.stderr) == (code, "", f"error: {problem}\n")
     assert not (tmp_path / "training").exists()
 
@@ -103,7 +104,7 @@ def test_what_cannot_be_fitted_to_is_said_before_anything_is_flown(
 def flown(short_flight, tmp_path):
     """A folder of ten copies of an error-free flight, and of three that are none of the stack."""
     wrong = {"outcome": "timeout"}, {"fault": {"target": "planning"}}, {"stack": "mavbench"}
-    for number, changes in enumerate([{}] * 10 + list(wrong)):
+    for number, changes in enumerate([{}] * 8 + [{"autopilot": "px4"}] * 2 + list(wrong)):
         copy = shutil.copytree(short_flight.path, tmp_path / "runs" / f"link-5-{number:03}")
         result = json.loads((copy / "result.json").read_text())
         section = result if "outcome" in changes else result["config"]
@@ -121,6 +122,7 @@ def test_a_detector_is_fitted_to_the_error_free_flights_of_a_folder(mavfi, flown
     told = Model.read(tmp_path / "new" / "gad.json")
     assert told.stack.name == "hardened"
     assert {"farm/5", "link-5-009/5"} <= flights_of(told.provenance)
+    assert told.provenance["autopilot"] == "ours, px4"
 
 
 def test_a_folder_without_flights_of_the_stack_is_told(mavfi, flown):

@@ -47,6 +47,8 @@ def campaign_lines(told: Row) -> list[str]:
         lines += _overhead(told["overhead"], confidence)
     if "failures" in told:
         lines += ["", "injected faults that fail missions which succeed without:"]
+        if not told["failures"]:
+            lines.append("  none: no setting has struck missions and golden flights of them")
         for each in told["failures"]:
             lines += [f"  {each['name']}", *(f"    {part}" for part in _parts(each))]
     return lines

@@ -133,7 +133,7 @@ def csv_text(rows: Iterable[Mapping[str, Any]], names: Sequence[str] = ()) -> st
     """One line per row, below the names of the columns.
 
     Args:
-        names: names of the columns; None takes the keys of all rows, in order.
+        names: names of the columns; empty takes the keys of all rows, in order.
     """
     told = list(rows)
     keys = names or list(dict.fromkeys(key for row in told for key in row))

@@ -202,15 +202,14 @@ def _again(told: Row) -> list[str]:
 def _command_of(plan: Row, row: Row) -> str:
     """The command that repeats the worst flight of a setting without detector."""
     flight = row["worst_flight"]
-    parts = [
-        f"mavfi fly --world {plan['world']} --seed {flight['seed']} --platform {row['platform']}"
-    ]
+    words = ["mavfi", "fly", "--world", plan["world"], "--seed", f"{flight['seed']}"]
+    words += ["--platform", row["platform"]]
     if plan["stack"] != DEFAULT:
-        parts.append(f"--stack {shlex.quote(plan['stack'])}")
+        words += ["--stack", plan["stack"]]
     if flight["target"]:
-        parts.append(f"--inject {flight['target']} --fault-seed {flight['fault_seed']}")
-        parts += [] if plan["field"] is None else [f"--field {plan['field']}"]
-    return " ".join(parts)
+        words += ["--inject", flight["target"], "--fault-seed", f"{flight['fault_seed']}"]
+        words += [] if plan["field"] is None else ["--field", plan["field"]]
+    return shlex.join(words)
 
 
 # Rows -----------------------------------------------------------------------------------------
