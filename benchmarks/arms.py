@@ -17,7 +17,7 @@ from pathlib import Path
 
 from exported import arguments
 
-from mavfi_cli.claims.arms import PLAIN, Arm, arms
+from mavfi_cli.claims.beyond import PLAIN, Arm, arms
 from mavfi_cli.claims.sources import gather
 from mavfi_cli.stats.shares import Share
 

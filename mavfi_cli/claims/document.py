@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,17 +12,16 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.analysis.kernel_runs import silent_of_all
-from mavfi_cli.claims.arms import arms
 from mavfi_cli.claims.beyond import (
     BIT_CLASSES,
     Fate,
     StateCell,
+    arms,
     hourly_failures,
     kernel_flows,
     state_map,
 )
-from mavfi_cli.claims.catalogue import CLAIMS, Claim
-from mavfi_cli.claims.effects import Finding, Kernels, protected
+from mavfi_cli.claims.catalogue import CLAIMS, Claim, Finding, Kernels, protected
 from mavfi_cli.claims.items import shown_items
 from mavfi_cli.claims.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.core.installed import __version__
@@ -68,7 +68,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         "problems": evidence.problems,
         "claims": claims,
         "verdicts": {where: _counted(claims, where) for where in (*STACKS, _ISOLATED)},
-        "worst": [row for stack in STACKS for row in worst_flights(stack, flights[stack])],
+        "worst": [row for stack in STACKS for row in _worst_flights(stack, flights[stack])],
         "spreads": {stack: _spread(flights[stack]) for stack in STACKS},
         "flows": {stack: kernel_flows(flights[stack], silent) for stack in STACKS},
         "fates": [*Fate],
@@ -107,11 +107,8 @@ def _cell(claim: Claim, found: Finding) -> dict[str, Any]:
     verdict = judge(found.effect, claim.low, claim.high)
     if verdict is ClaimVerdict.NOT_FLOWN and found.told:
         verdict = ClaimVerdict.NOT_JUDGED
-    return {
-        "verdict": verdict,
-        "effect": found.effect,
-        "told": found.told,
-    }
+    known = found.effect is not None and not math.isnan(found.effect.low)
+    return {"verdict": verdict, "effect": found.effect if known else None, "told": found.told}
 
 
 def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdict, int]:
@@ -241,7 +238,7 @@ def _rate(found: Share) -> str:
 # Worst cases and spreads --------------------------------------------------------------------------
 
 
-def worst_flights(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
+def _worst_flights(stack: str, flights: pa.Table) -> Iterator[dict[str, Any]]:
     """The longest flights of each setting, paired and unpaired, as the paper may have read them."""
     hit = chosen(timed(comparable(flights)), struck=True, detector=(*_DETECTORS,))
     groups = by_value(hit, "detector", "level", "world", "platform")

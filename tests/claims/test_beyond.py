@@ -3,8 +3,7 @@
 import pytest
 from flown import flights, row
 
-from mavfi_cli.claims.arms import arms
-from mavfi_cli.claims.beyond import Fate, hourly_failures, kernel_flows, state_map
+from mavfi_cli.claims.beyond import Fate, arms, hourly_failures, kernel_flows, state_map
 
 LOST = {"outcome": "timeout"}
 

@@ -8,7 +8,7 @@ import pytest
 from flown import flights, row
 
 from mavfi_cli.analysis.flights import COSTS
-from mavfi_cli.claims import effects
+from mavfi_cli.claims import catalogue
 from mavfi_cli.claims.catalogue import CLAIMS
 from mavfi_cli.reproduction import items
 from mavfi_cli.reproduction.items import BY_NAME, printed
@@ -82,7 +82,7 @@ def test_a_longest_flight_is_as_long_as_its_words_say(claim):
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_counts_of_table_iv_are_its_printed_rates(world):
-    told = tomllib.loads((Path(effects.__file__).parent / "claims.toml").read_text())["claim"]
+    told = tomllib.loads((Path(catalogue.__file__).parent / "claims.toml").read_text())["claim"]
     (counts,) = (each["paper_counts"] for each in told if each["name"] == f"table4-{world}")
     for kind, runs, found in zip(("golden", "none"), ("golden_runs", "runs"), counts, strict=True):
         missions = printed("table4", runs)

@@ -4,8 +4,7 @@ import pytest
 from flown import flights, row
 
 from mavfi_cli.analysis.flights import chosen
-from mavfi_cli.claims.document import worst_flights
-from mavfi_cli.claims.effects import MEASURES, protected
+from mavfi_cli.claims.catalogue import MEASURES, protected
 from mavfi_cli.reproduction.flights import share, struck
 
 PLANNING = {"target": "planning", "fault": {"field": "exponent"}}
@@ -42,18 +41,6 @@ def test_success_lost_is_paired_and_counts_faults_that_nothing_read():
     assert found.effect.value == pytest.approx(1 / 9)
     assert found.effect.count == 9
     assert found.told == "1 of 9 lost; golden 0 of 9"
-
-
-def test_the_longest_flight_is_paired_and_unpaired():
-    rows = pairs(30.0, 20.0)
-    rows[2] = {**rows[2], "flight_time_s": 10.0}  # the second golden flight is short
-    rows[3] = {**rows[3], "flight_time_s": 18.0}
-    those = flights(rows)
-    (worst,) = worst_flights("mavbench", those)
-    assert worst["paired"] == pytest.approx(0.8)  # 18 over its own 10
-    assert worst["unpaired"] == pytest.approx(1.0)  # 30 over the mean of 20 and 10
-    assert worst["golden"] == pytest.approx(20 / 15 - 1)
-    assert (worst["longer"], worst["flights"]) == (1.0, 2)
 
 
 def test_a_longest_flight_is_as_probable_as_flights_are_as_long():

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from flown import row, table
 
+from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.claims.document import document
 from mavfi_cli.claims.sources import CampaignSource, Evidence
 from mavfi_cli.reproduction.flights import flown_missions
@@ -78,6 +79,17 @@ def test_the_picture_of_faults_in_states_has_the_flights_of_its_data():
     assert {each["detector"] for each in spread["rows"]} == {"", "aad"}
 
 
+def test_the_longest_flight_is_paired_and_unpaired():
+    times = {1: (20.0, 30.0), 2: (10.0, 18.0)}  # golden, with a fault
+    rows = [row(seed=seed, time_s=own) for seed, (own, _) in times.items()]
+    rows += [row("planning", seed=seed, time_s=longer) for seed, (_, longer) in times.items()]
+    (worst,) = document(evidence(rows))["worst"]
+    assert worst["paired"] == pytest.approx(0.8)  # 18 over its own 10
+    assert worst["unpaired"] == pytest.approx(1.0)  # 30 over the mean of 20 and 10
+    assert worst["golden"] == pytest.approx(20 / 15 - 1)
+    assert (worst["longer"], worst["flights"]) == (1.0, 2)
+
+
 def test_what_detectors_save_of_states_has_a_sentence_of_its_own():
     rows = [row(seed=1), row("planning", seed=1, outcome="timeout")]
     rows += [row("planning", seed=1, detector="gad")]
@@ -107,6 +119,15 @@ def test_every_claim_has_a_cell_for_each_stack(told):
     assert dense["cells"]["hardened"]["verdict"] is ClaimVerdict.NOT_FLOWN
     model = next(each for each in told["claims"] if each["item"] == "fig15")
     assert model["cells"]["mavbench"]["verdict"] is ClaimVerdict.NOT_JUDGED
+
+
+def test_an_effect_without_an_interval_is_no_number():
+    """The mean cost of one flight."""
+    costs = dict.fromkeys(COSTS, 0.01)
+    told = document(evidence([row("planning", instruction=True, detector="gad", **costs)]))
+    (gad,) = (each for each in told["claims"] if each["name"] == "table5-gad")
+    assert gad["cells"]["mavbench"]["effect"] is None
+    assert gad["cells"]["mavbench"]["verdict"] is ClaimVerdict.NOT_JUDGED
 
 
 def test_failures_an_hour_are_at_the_rate(told):

@@ -10,8 +10,7 @@ import pytest
 from committed import everything
 
 from mavfi_cli.claims.catalogue import CLAIMS
-from mavfi_cli.report.page.render import effect, ends, hourly, p_value, percent, render
-from mavfi_cli.report.tables.paper_table import count_of
+from mavfi_cli.report.page.render import FILTERS, render
 from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.shares import wilson
 
@@ -81,6 +80,9 @@ def test_every_lost_mission_has_its_command(told, page):
 
 
 def test_numbers_as_words():
+    count_of, percent, ends, p_value, hourly, effect = (
+        FILTERS[name] for name in ("of", "percent", "ends", "p", "hourly", "effect")
+    )
     share = wilson(3, 98)
     assert count_of(share) == "3 of 98"
     assert percent(share.share, 1) == "3.1 %"
