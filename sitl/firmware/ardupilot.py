@@ -1,4 +1,4 @@
-"""ArduPilot's JSON backend: servo outputs in, the vehicle's state out, over UDP.
+"""ArduPilot: its JSON backend (servo outputs in, the vehicle's state out, over UDP), and its start.
 
 ArduPilot sends its outputs and waits for the state, whose timestamp is its clock. It simulates
 barometer, magnetometer and GPS itself.
@@ -9,14 +9,21 @@ from __future__ import annotations
 import json
 import socket
 import struct
+import tempfile
 import time
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mavfi_cli.core.errors import EndpointError, VehicleProcessError
 from mavfi_cli.core.frames import Vector
+from sitl.firmware.process import FirmwareProcess, require_program
 from sitl.firmware.sensors import Sensors
+from sitl.geodesy import Origin
+from sitl.vehicle.gains import RateLoops
+from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Truth
 
 PORT = 9002
@@ -26,6 +33,9 @@ _SERVOS = struct.Struct("<HHI16H")
 _MAGIC = 18458
 _LEAST_US, _SPAN_US = 1000.0, 1000.0
 ANSWER_LIMIT_S = 10.0
+_EPOCH_S = 1_600_000_000  # start of its clock: the same in every flight
+_FULL_SHARE = 0.5  # share of the rotors' torque that its mixer gives at full command
+_SPIN_MIN, _SPIN_ARM = 0.05, 0.03  # throttles of the rotors in flight and on the ground
 
 
 class ArduPilotLink:
@@ -41,6 +51,7 @@ class ArduPilotLink:
 
     step_s = STEP_S
     settle_s = 0.0  # its boot takes the same simulated time in every flight
+    echoes = False
 
     def __init__(self, sensors: Sensors, port: int = PORT) -> None:
         self._sensors = sensors
@@ -53,6 +64,68 @@ class ArduPilotLink:
         self._peer: Any = None
         self._frame = -1
         self._throttles = np.zeros(4)
+
+    @classmethod
+    def open(cls, sensors: Sensors, *, ours: bool) -> ArduPilotLink:
+        """Open ArduPilot's port, or any if we start it. Raises EndpointError."""
+        return cls(sensors, 0 if ours else PORT)
+
+    @staticmethod
+    def parameters(profile: VehicleProfile) -> dict[str, float]:
+        """Return ArduCopter's parameters for a vehicle: frame, thrust curve and rate loops."""
+        loops = RateLoops.of(profile)
+        return {
+            "FRAME_CLASS": 1,
+            "FRAME_TYPE": 1,
+            "MOT_THST_EXPO": loops.curve,
+            "MOT_THST_HOVER": loops.hover_share,
+            "MOT_HOVER_LEARN": 0,
+            "MOT_SPIN_ARM": _SPIN_ARM,
+            "MOT_SPIN_MIN": _SPIN_MIN,
+            "MOT_SPIN_MAX": 1.0,
+            "SIM_RATE_HZ": 400,
+            "LOG_BACKEND_TYPE": 0,
+            "FS_THR_ENABLE": 0,  # no radio control
+            "ARMING_CHECK": 1,
+            **loops.parameters("ATC_RAT_{axis}_{term}", ("RLL", "PIT", "YAW"), [_FULL_SHARE] * 3),
+        }
+
+    def start(
+        self,
+        binary: Path,
+        parameters: Mapping[str, float],
+        *,
+        system_id: int,
+        mavlink_port: int,
+        heading_deg: float,
+    ) -> FirmwareProcess:
+        """Start ArduCopter's SITL binary, which calls this link.
+
+        Args:
+            binary: The program.
+            parameters: Those of the vehicle, set before it starts.
+            system_id: Its MAVLink system id.
+            mavlink_port: UDP port to which it sends MAVLink.
+            heading_deg: Heading at the start.
+
+        Raises:
+            VehicleProcessError: It cannot be started.
+        """
+        program, origin = require_program(binary), Origin()
+        folder = Path(tempfile.mkdtemp(prefix="mavfi-ardupilot-"))
+        lines = [f"{name} {value:.6g}\n" for name, value in parameters.items()]
+        (folder / "vehicle.parm").write_text("".join(lines))
+        home = (origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m, heading_deg)
+        arguments = [
+            "--model", f"JSON:{_LOOPBACK}", "--wipe", "--speedup", "100",
+            "--defaults", "vehicle.parm", "--sysid", str(system_id),
+            "--home", ",".join(f"{value:.7f}" for value in home),
+            "--start-time", str(_EPOCH_S),
+            "--sim-port-out", str(self.port), "--sim-port-in", "0", "--rc-in-port", "0",
+            "--serial0", f"udpclient:{_LOOPBACK}:{mavlink_port}", "--serial1", "none:",
+            "--serial2", "none:",
+        ]  # fmt: skip
+        return FirmwareProcess(program, arguments, folder, {})
 
     @property
     def port(self) -> int:

@@ -44,7 +44,6 @@ class FirmwareAutopilot:
 
     Args:
         transport: Link to the firmware.
-        origin: Geographic origin of the world.
         system_id: System id of the firmware.
         echoes: The firmware answers TIMESYNC while its clock stands still. Then a client's frame
             has been read before simulated time goes on.
@@ -57,14 +56,11 @@ class FirmwareAutopilot:
 
     restart_asked = False  # a reboot is the firmware's own
 
-    def __init__(
-        self, transport: Transport, origin: Origin, *, system_id: int = 1, echoes: bool = True
-    ) -> None:
+    def __init__(self, transport: Transport, *, system_id: int = 1, echoes: bool = True) -> None:
         self.system_id = system_id
         self.state_stamp_us = -1
         self.armed = self.terminated = False
         self._transport = transport
-        self._origin = origin
         self._echoes = echoes
         self._codec = Codec(system_id, CAMERA)
         self._follows = False
@@ -178,7 +174,7 @@ class FirmwareAutopilot:
     def _prepare(self) -> None:
         """Ask for the streams and set the origin, at each heartbeat until positions arrive."""
         self._prepared = self.state_stamp_us >= 0
-        place = self._origin
+        place = Origin()
         frames = [
             dialect.MAVLink_set_gps_global_origin_message(
                 self.system_id, round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7),

@@ -1,4 +1,4 @@
-"""The simulator's side of PX4's lockstep link: sensors out, motor outputs back, over TCP.
+"""PX4: its lockstep link (sensors out, motor outputs back, over TCP), and its start.
 
 PX4 is the client. HIL_SENSOR sets its clock, and HIL_ACTUATOR_CONTROLS answers it once the
 controllers have run. PX4 sends no answer while no controller runs, so a missing one must not stop
@@ -7,16 +7,25 @@ the simulation.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import socket
+import tempfile
 import time
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.core.errors import LinkLost, VehicleProcessError
+from mavfi_cli.core.errors import EndpointError, LinkLost, VehicleProcessError
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import Codec, Message, dialect
-from mavfi_cli.link.transport import Transport
+from mavfi_cli.link.transport import Transport, open_transport
+from sitl.firmware.process import FirmwareProcess, require_program
 from sitl.firmware.sensors import Sensors, pressure_altitude_m
+from sitl.vehicle.gains import RateLoops
+from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Truth
 
 PORT = 4560
@@ -38,6 +47,22 @@ ANSWER_LIMIT_S = 1.0  # wait for an answer after an answered step
 SILENT_WAIT_S = 0.004  # wait after an unanswered one
 _GONE = "PX4 closed the simulator link"
 
+_INSTANCES = 100  # of PX4 on one machine
+_SOCKET = "/tmp/px4-sock-{}"  # on which a running instance serves its commands
+_LOCAL_PORT = 14_580  # of the first instance's MAVLink
+_TILT_SHARE = math.sqrt(0.5)  # share of each rotor's thrust at full roll or pitch
+_ROTORS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))  # forward, right, sense
+
+# PX4 sources these scripts instead of its own: the parameters of the vehicle before its modules
+# start, and one link to a companion without others.
+_SIMULATOR_SCRIPT = """#!/bin/sh
+{settings}
+simulator_mavlink start -c {port}
+"""
+_LINKS_SCRIPT = """#!/bin/sh
+mavlink start -x -u {local} -r 4000000 -f -m onboard -o {remote}
+"""
+
 
 class Px4Link:
     """One PX4 on the simulator link.
@@ -45,17 +70,21 @@ class Px4Link:
     Args:
         transport: End of the TCP connection that PX4 calls.
         sensors: Sensors of the vehicle.
+        port: TCP port of the connection.
 
     Attributes:
+        port: TCP port of the connection, which numbers the instances of PX4.
         unanswered: Number of steps without an answer since the first answer. Lockstep held in all
             others.
     """
 
     step_s = STEP_S
     settle_s = SETTLE_S
+    echoes = True
 
-    def __init__(self, transport: Transport, sensors: Sensors) -> None:
+    def __init__(self, transport: Transport, sensors: Sensors, port: int = PORT) -> None:
         self._transport = transport
+        self.port = port
         self._sensors = sensors
         self._codec = Codec(1, dialect.MAV_COMP_ID_AUTOPILOT1)
         self._throttles = np.zeros(4)
@@ -63,6 +92,87 @@ class Px4Link:
         self._heard = False
         self._answers = False
         self.unanswered = 0
+
+    @classmethod
+    def open(cls, sensors: Sensors, *, ours: bool) -> Px4Link:
+        """Open the first free port of PX4's instances, of the first one unless we start it.
+
+        Raises:
+            EndpointError: All of them are in use.
+        """
+        *others, last = range(PORT, PORT + (_INSTANCES if ours else 1))
+        for port in others:
+            if _is_running(port - PORT):
+                continue
+            with contextlib.suppress(EndpointError):
+                return cls(open_transport(f"tcpin:127.0.0.1:{port}"), sensors, port)
+        return cls(open_transport(f"tcpin:127.0.0.1:{last}"), sensors, last)
+
+    @staticmethod
+    def parameters(profile: VehicleProfile) -> dict[str, float]:
+        """Return PX4's parameters for a vehicle: rotors, thrust curve and rate loops."""
+        loops, offset_m = RateLoops.of(profile), profile.rotor.arm_m / math.sqrt(2.0)
+        parameters: dict[str, float] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4}
+        for rotor, (forward, right, sense) in enumerate(_ROTORS):
+            parameters[f"CA_ROTOR{rotor}_PX"] = forward * offset_m
+            parameters[f"CA_ROTOR{rotor}_PY"] = right * offset_m
+            parameters[f"CA_ROTOR{rotor}_KM"] = sense * profile.rotor.torque_per_thrust_m
+            parameters[f"PWM_MAIN_FUNC{rotor + 1}"] = 101 + rotor
+        axes, shares = ("ROLL", "PITCH", "YAW"), (_TILT_SHARE, _TILT_SHARE, 1.0)
+        return {
+            **parameters,
+            **loops.parameters("MC_{axis}RATE_{term}", axes, shares),
+            "MC_ROLL_P": loops.tilt_p,
+            "MC_PITCH_P": loops.tilt_p,
+            "THR_MDL_FAC": loops.curve,
+            "MPC_THR_HOVER": loops.hover_share,
+            "MPC_USE_HTE": 0,  # no estimate of the hover thrust: it is known
+            "IMU_INTEG_RATE": 250,
+            "EKF2_GPS_DELAY": 0,
+            "SDLOG_BACKEND": 0,
+        }
+
+    def start(
+        self,
+        binary: Path,
+        parameters: Mapping[str, float],
+        *,
+        system_id: int,
+        mavlink_port: int,
+        heading_deg: float,
+    ) -> FirmwareProcess:
+        """Start PX4's SITL binary, which lies in `bin/` beside its startup files in `etc/`.
+
+        Args:
+            binary: The program.
+            parameters: Those of the vehicle, set before it starts.
+            system_id: Its MAVLink system id.
+            mavlink_port: UDP port to which it sends MAVLink.
+            heading_deg: Unused. The magnetometer tells PX4 its heading.
+
+        Raises:
+            VehicleProcessError: It cannot be started.
+        """
+        program = require_program(binary)
+        startup = program.parent.parent / "etc"
+        if not (startup / "init.d-posix" / "rcS").is_file():
+            raise VehicleProcessError(f"{binary} is no PX4: it has no startup files in {startup}")
+        folder = Path(tempfile.mkdtemp(prefix="mavfi-px4-"))
+        instance = self.port - PORT
+        settings = [
+            f"param set {name} {value:.6g}"
+            for name, value in {**parameters, "MAV_SYS_ID": system_id}.items()
+        ]
+        simulator = _SIMULATOR_SCRIPT.format(settings="\n".join(settings), port=self.port)
+        (folder / "px4-rc.simulator").write_text(simulator)
+        links = _LINKS_SCRIPT.format(local=_LOCAL_PORT + instance, remote=mavlink_port)
+        (folder / "px4-rc.mavlink").write_text(links)
+        environment = {
+            "PX4_SIM_MODEL": "none_iris",
+            "PATH": f"{folder}:{program.parent}:{os.environ.get('PATH', '')}",
+        }
+        arguments = ["-d", "-i", str(instance), "-w", str(folder), str(startup)]
+        return FirmwareProcess(program, arguments, folder, environment)
 
     def heard(self, timeout_s: float) -> bool:
         """Return True once PX4 has sent a message, waiting at most `timeout_s`."""
@@ -155,3 +265,9 @@ def _throttles(message: Message) -> Vector:
     if not message.mode & _ARMED:
         return np.zeros(4)
     return np.clip(np.nan_to_num(np.array(message.controls[:4], dtype=np.float64)), 0.0, 1.0)
+
+
+def _is_running(instance: int) -> bool:
+    """Return True if a PX4 of this number runs on this machine. It would not start a second."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        return probe.connect_ex(_SOCKET.format(instance)) == 0

@@ -1,23 +1,38 @@
-"""Vehicle, camera and referee of a flight that real firmware flies."""
+"""Vehicle, camera and referee of a flight that real firmware flies (`--hil`, `--json`)."""
 
 from __future__ import annotations
 
+import contextlib
+import math
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
+from mavfi_cli.link.transport import open_transport
 from sitl.autopilot.streams import TICK_US
-from sitl.firmware.start import Firmware
+from sitl.firmware.ardupilot import ArduPilotLink
+from sitl.firmware.autopilot import FirmwareAutopilot
+from sitl.firmware.process import FirmwareProcess
+from sitl.firmware.px4 import Px4Link
+from sitl.firmware.sensors import Sensors
 from sitl.server.simulation import Simulation
 from sitl.vehicle.profile import VehicleProfile
 from sitl.world import World
 
+LINKS: Mapping[str, type[Px4Link] | type[ArduPilotLink]] = {
+    "px4": Px4Link, "ardupilot": ArduPilotLink,
+}  # fmt: skip
+"""The simulator links of the firmware that can fly."""
+
 _REMEMBERED_S = 1.0
 _POSITION_LIMIT_US = 120_000_000
+_START_LIMIT_S, _LOOK_S = 60.0, 0.2
 
 
 class FirmwareSimulation(Simulation):
@@ -29,26 +44,62 @@ class FirmwareSimulation(Simulation):
     Args:
         world: World of the flight.
         profile: Profile of the vehicle.
-        firmware: The firmware, which `close` ends.
+        kind: Which firmware, one of LINKS.
+        binary: Its SITL program, which `close` ends; None if somebody else starts it.
+        seed: Seed of the sensors' noise.
+        url: Link on which a firmware that somebody else starts sends its MAVLink.
+        system_id: MAVLink system id of the firmware.
         options: Further arguments of `Simulation`.
+
+    Raises:
+        EndpointError: A port is in use.
+        VehicleProcessError: The binary cannot be started.
     """
 
     awaits_setpoints = False  # ArduPilot takes none before it follows the companion
 
     def __init__(
-        self, world: World, profile: VehicleProfile, firmware: Firmware, **options: Any
+        self,
+        world: World,
+        profile: VehicleProfile,
+        kind: str,
+        binary: Path | None,
+        *,
+        seed: int,
+        url: str,
+        system_id: int,
+        **options: Any,
     ) -> None:
-        self._firmware = firmware
-        self._link = link = firmware.link
-        self._step_us = round(link.step_s * 1e6)
-        self._throttles = np.zeros(4)
-        self._photographed_us = -1
-        self._poses: deque[tuple[int, Vector, Vector]] = deque(
-            maxlen=round(_REMEMBERED_S / link.step_s)
-        )
-        super().__init__(
-            world, profile, step_s=link.step_s, autopilot=firmware.autopilot, **options
-        )
+        with contextlib.ExitStack() as undo:
+            mavlink = open_transport(url if binary is None else "udpin:127.0.0.1:0")
+            undo.callback(mavlink.close)
+            self._link = link = LINKS[kind].open(Sensors(seed), ours=binary is not None)
+            undo.callback(link.close)
+            self._process: FirmwareProcess | None = None
+            if binary is not None:
+                to_goal = world.goal_enu_m - world.start_enu_m
+                self._process = link.start(
+                    binary,
+                    link.parameters(profile),
+                    system_id=system_id,
+                    mavlink_port=int(mavlink.port),  # type: ignore[attr-defined]
+                    heading_deg=math.degrees(math.atan2(to_goal[0], to_goal[1])) % 360.0,
+                )
+                undo.callback(self._process.end)
+            self._step_us = round(link.step_s * 1e6)
+            self._throttles = np.zeros(4)
+            self._photographed_us = -1
+            self._poses: deque[tuple[int, Vector, Vector]] = deque(
+                maxlen=round(_REMEMBERED_S / link.step_s)
+            )
+            self._firmware = firmware = FirmwareAutopilot(
+                mavlink, system_id=system_id, echoes=link.echoes
+            )
+            super().__init__(
+                world, profile, system_id=system_id, step_s=link.step_s, autopilot=firmware,
+                **options,
+            )  # fmt: skip
+            undo.pop_all()
 
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Wait until the firmware calls and knows where it is, or until stopped.
@@ -56,8 +107,8 @@ class FirmwareSimulation(Simulation):
         Raises:
             VehicleProcessError: It has ended, did not call within a minute, or gave no position.
         """
-        self._firmware.wait(stopped)
-        autopilot = self._firmware.autopilot
+        self._await_call(stopped)
+        autopilot = self._firmware
         while not stopped() and (
             self.stamp_us < self._link.settle_s * 1e6 or autopilot.state_stamp_us < 0
         ):
@@ -67,11 +118,24 @@ class FirmwareSimulation(Simulation):
         autopilot.forget()
 
     def close(self) -> None:
-        """End the firmware."""
+        """End the process, if we started it, and close the links."""
+        if self._process is not None:
+            self._process.end()
         self._firmware.close()
+        self._link.close()
+
+    def _await_call(self, stopped: Callable[[], bool]) -> None:
+        """Wait until the firmware calls, or until stopped; for a minute if we started it."""
+        deadline_s = time.monotonic() + _START_LIMIT_S
+        while not stopped() and not self._link.heard(_LOOK_S):
+            if self._process is None:
+                continue
+            self._process.require_running()
+            if time.monotonic() > deadline_s:
+                raise VehicleProcessError(f"no firmware called within {_START_LIMIT_S:g} s")
 
     def _fly(self, _between: Callable[[int], None] | None) -> None:
-        autopilot = self._firmware.autopilot
+        autopilot = self._firmware
         autopilot.deliver()
         for stamp_us in range(
             self.stamp_us + self._step_us, self.stamp_us + TICK_US + 1, self._step_us
@@ -88,7 +152,7 @@ class FirmwareSimulation(Simulation):
                 self._throttles = self._link.exchange(stamp_us, truth)
 
     def _photograph(self, _position_enu_m: Vector, _quaternion_flu_enu: Vector) -> list[Any]:
-        stamp_us = self._firmware.autopilot.state_stamp_us
+        stamp_us = self._firmware.state_stamp_us
         if stamp_us <= self._photographed_us or not self._poses:
             return []
         self._photographed_us = stamp_us

@@ -24,15 +24,14 @@ from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import memory_pair, open_transport
 from sitl.autopilot.streams import STEP_US, TICK_US, Preset
 from sitl.command_line import exit_code, stop_on_signals
-from sitl.firmware.simulation import FirmwareSimulation
-from sitl.firmware.start import PARAMETERS, open_firmware
+from sitl.firmware.simulation import LINKS, FirmwareSimulation
 from sitl.peers import Peers
 from sitl.server.client import Client
 from sitl.server.options import ServerOptions, parse
 from sitl.server.simulation import Simulation
 from sitl.vehicle.cascade import control_step
-from sitl.vehicle.profile import load_profile
-from sitl.world import load_world
+from sitl.vehicle.profile import VehicleProfile, load_profile
+from sitl.world import World, load_world
 
 _PATIENCE_S = 0.5
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
@@ -207,7 +206,7 @@ class _Realtime:
         """Run until stopped, or until an inherited connection closes."""
         self._simulation.begin(stopped)
         if (kind := self._options.firmware_kind) is not None and not stopped():
-            click.echo(f"{kind.value} is ready: clients may connect", err=True)
+            click.echo(f"{kind} is ready: clients may connect", err=True)
         self._clients.serve(until_s=0.0)
         while not stopped() and not self._clients.over:
             self._clients.each(Client.send_tick)
@@ -286,10 +285,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _serve(options: ServerOptions) -> None:
     """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
     stopped = stop_on_signals()
+    world, profile = _world(options), load_profile(options.vehicle)
     if not options.lockstep and not in_cache(control_step):
         click.echo("the first start compiles the vehicle, about half a minute", err=True)
         warm_up()
-    simulation = _simulation(options, logs=options.truth is not None)
+    simulation = _simulation(options, world, profile, logs=options.truth is not None)
     if options.truth is not None:
         _brief(simulation, options.truth)
     run = _lockstep if options.lockstep else _realtime
@@ -311,7 +311,8 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
     Raises:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
     """
-    simulation = _simulation(parse(arguments), logs=True)
+    options = parse(arguments)
+    simulation = _simulation(options, _world(options), load_profile(options.vehicle), logs=True)
     _brief(simulation, truth_folder)
     return _EmbeddedVehicle(simulation, truth_folder)
 
@@ -323,15 +324,19 @@ def warm_up() -> None:
         simulation.advance()
 
 
-def _simulation(options: ServerOptions, *, logs: bool) -> Simulation:
-    world = load_world(
+def _world(options: ServerOptions) -> World:
+    return load_world(
         options.world,
         seed=options.seed,
         start_enu_m=options.start_enu_m,
         goal_enu_m=options.goal_enu_m,
     )
+
+
+def _simulation(
+    options: ServerOptions, world: World, profile: VehicleProfile, *, logs: bool
+) -> Simulation:
     columns, rows = options.camera_size
-    profile = load_profile(options.vehicle)
     settings: dict[str, Any] = {
         "system_id": options.system_id,
         "camera_columns": columns,
@@ -343,20 +348,15 @@ def _simulation(options: ServerOptions, *, logs: bool) -> Simulation:
     }
     if options.firmware_kind is None:
         return Simulation(world, profile, **settings)
-    firmware = open_firmware(
-        options.firmware_kind,
-        options.firmware,
+    return FirmwareSimulation(
         world,
         profile,
+        options.firmware_kind,
+        options.firmware,
         seed=options.firmware_seed,
-        system_id=options.system_id,
         url=options.firmware_link,
+        **settings,
     )
-    try:
-        return FirmwareSimulation(world, profile, firmware, **settings)
-    except BaseException:
-        firmware.close()
-        raise
 
 
 def _announce(options: ServerOptions, simulation: Simulation) -> None:
@@ -381,9 +381,9 @@ def _needs_of_firmware(options: ServerOptions) -> list[str]:
     kind = options.firmware_kind
     if kind is None or options.firmware is not None:
         return []
-    parameters = PARAMETERS[kind](load_profile(options.vehicle))
+    parameters = LINKS[kind].parameters(load_profile(options.vehicle))
     return [
-        f"waits for {kind.value}, which sends its MAVLink to {options.firmware_link} "
+        f"waits for {kind}, which sends its MAVLink to {options.firmware_link} "
         "and needs these parameters:",
         *(f"  {name} {value:.6g}" for name, value in parameters.items()),
     ]

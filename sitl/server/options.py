@@ -21,8 +21,8 @@ from sitl.command_line import (
     camera_heartbeat,
     key_file,
 )
-from sitl.firmware.start import LINK, FirmwareKind
 
+_FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where a firmware that somebody else starts sends
 # As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
 _DEFAULT_LINKS = (
     "onboard=udpout:127.0.0.1:14540",
@@ -72,7 +72,7 @@ class ServerOptions:
     system_id: int
     key_file: Path | None
     allow_unsigned: bool
-    firmware_kind: FirmwareKind | None  # None: our own autopilot flies
+    firmware_kind: str | None  # None: our own autopilot flies
     firmware: Path | None
     firmware_link: str
     firmware_seed: int
@@ -136,7 +136,7 @@ class ServerOptions:
     help="SITL binary to start  [somebody else starts it].",
 )  # fmt: skip
 @click.option(
-    "--firmware-link", metavar="URL", default=LINK, show_default=True,
+    "--firmware-link", metavar="URL", default=_FIRMWARE_LINK, show_default=True,
     help="Where a firmware that somebody else starts sends its MAVLink.",
 )  # fmt: skip
 @click.option(
@@ -179,7 +179,7 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
     return dataclasses.replace(options, links=links, speed=speed)
 
 
-def _firmware_kind(given: dict[str, Any]) -> FirmwareKind | None:
+def _firmware_kind(given: dict[str, Any]) -> str | None:
     """Return the firmware that flies, and remove its two options.
 
     Raises:
@@ -194,4 +194,4 @@ def _firmware_kind(given: dict[str, Any]) -> FirmwareKind | None:
         raise click.UsageError("--trust is for our own autopilot")
     if named and given["lockstep"]:
         raise click.UsageError("--lockstep is for our own autopilot")
-    return FirmwareKind(named[0]) if named else None
+    return named[0] if named else None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -102,3 +104,65 @@ def _mixer(gains: Vector, profile: VehicleProfile) -> None:
         rotor.max_rpm / rotor.motor_kv_rpmpv / full_v,
         torque_nm / rotor.torque_constant_nmpa * rotor.motor_resistance_ohm / full_v,
     )
+
+
+_REDUCED = 0.6  # real firmware filters its gyroscope, and its answer is a step late
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RateLoops:
+    """Rate loops for real firmware: ours with reduced gains, and what its units are made of.
+
+    A firmware's gain is torque as a share of what its mixer gives at full command.
+    """
+
+    p: Vector  # (3,) N m of torque for each rad/s
+    i: Vector  # (3,) N m for each rad
+    d: Vector  # (3,) N m for each rad/s^2
+    tilt_nm: float  # torque of all rotors at full differential thrust, round a level axis
+    yaw_nm: float
+    tilt_p: float  # 1/s
+    hover_share: float  # thrust in hover / maximum thrust
+    curve: float  # f in thrust share = f u^2 + (1 - f) u for a motor command u
+
+    @classmethod
+    def of(cls, profile: VehicleProfile) -> RateLoops:
+        """Return the loops of a vehicle."""
+        gains = gains_for(profile, 0.004)
+        inertia = gains[cascade.G_INERTIA : cascade.G_INERTIA + 3]
+        thrust_n = 4.0 * float(gains[cascade.G_ROTOR_THRUST])
+        return cls(
+            p=inertia * gains[cascade.G_RATE_P : cascade.G_RATE_P + 3] * _REDUCED,
+            i=inertia * gains[cascade.G_RATE_I : cascade.G_RATE_I + 3] * _REDUCED,
+            d=inertia * gains[cascade.G_RATE_D : cascade.G_RATE_D + 3] * _REDUCED,
+            tilt_nm=thrust_n * float(gains[cascade.G_ROTOR_OFFSET]),
+            yaw_nm=thrust_n * float(gains[cascade.G_TORQUE_PER_THRUST]),
+            tilt_p=float(gains[cascade.G_TILT_P]) * _REDUCED,
+            hover_share=profile.total_mass_kg * GRAVITY_MPS2 / thrust_n,
+            curve=_throttle_curve(gains),
+        )
+
+    def parameters(
+        self, pattern: str, axes: Sequence[str], shares: Sequence[float]
+    ) -> dict[str, float]:
+        """Return the gains by their names, such as "MC_{axis}RATE_{term}".
+
+        Args:
+            pattern: Name of a gain, with places for axis and term.
+            axes: Names of roll, pitch and yaw.
+            shares: Share of `tilt_nm` or `yaw_nm` that full command gives round each axis (3,).
+        """
+        full = (self.tilt_nm, self.tilt_nm, self.yaw_nm)
+        return {
+            pattern.format(axis=axis, term=term): gain[number] / (full[number] * shares[number])
+            for number, axis in enumerate(axes)
+            for term, gain in (("P", self.p), ("I", self.i), ("D", self.d))
+        }
+
+
+def _throttle_curve(gains: Vector) -> float:
+    """Fit f by least squares to the motors' throttle curve."""
+    shares = np.linspace(0.05, 1.0, 40)
+    commands = np.array([cascade.throttle(share, gains) for share in shares])
+    bend = commands**2 - commands
+    return float(bend @ (shares - commands) / (bend @ bend))

@@ -11,7 +11,6 @@ from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport
 from sitl.autopilot.streams import Preset
 from sitl.firmware.autopilot import FirmwareAutopilot
-from sitl.geodesy import Origin
 from sitl.vehicle.vehicle import Truth
 from tests.sitl.firmware.recorded import PX4_HEARTBEAT, PX4_POSITION
 
@@ -20,7 +19,7 @@ Wire = tuple[Transport, socket.socket]
 
 @pytest.fixture
 def wired(wire: Wire) -> tuple[FirmwareAutopilot, socket.socket]:
-    return FirmwareAutopilot(wire[0], Origin(), echoes=False), wire[1]
+    return FirmwareAutopilot(wire[0], echoes=False), wire[1]
 
 
 def _heard(theirs: socket.socket) -> list[Message]:
@@ -125,7 +124,7 @@ def test_a_silent_firmware_is_told(
 
 def test_an_echo_proves_that_a_frame_was_read(wire: Wire) -> None:
     transport, theirs = wire
-    autopilot = FirmwareAutopilot(transport, Origin())
+    autopilot = FirmwareAutopilot(transport)
     link = autopilot.open_link(Preset.LOCKSTEP)
     codec = Codec(1, 1)
     # The answer to the first question, which lies ready: `deliver` must find it.

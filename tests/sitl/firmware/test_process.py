@@ -12,17 +12,20 @@ import pytest
 from live_processes import gone
 
 from mavfi_cli.core.errors import EndpointError, VehicleProcessError
-from sitl.firmware import process, px4, start
+from sitl.firmware import px4
 from sitl.firmware.process import FirmwareProcess
+from sitl.firmware.px4 import Px4Link
 from sitl.firmware.sensors import Sensors
-from sitl.firmware.start import Firmware, FirmwareKind, open_firmware
+from sitl.firmware.simulation import FirmwareSimulation
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
 
-def _open(kind: FirmwareKind, binary: Path | None) -> Firmware:
+def _open(kind: str, binary: Path | None) -> FirmwareSimulation:
     world, profile = load_world("dense", seed=3), load_profile("solo")
-    return open_firmware(kind, binary, world, profile, seed=1, system_id=1, url="udpin:127.0.0.1:0")
+    return FirmwareSimulation(
+        world, profile, kind, binary, seed=1, system_id=7, url="udpin:127.0.0.1:0"
+    )
 
 
 def _program(path: Path, text: str) -> Path:
@@ -34,34 +37,44 @@ def _program(path: Path, text: str) -> Path:
 
 def test_a_path_without_a_file(tmp_path: Path) -> None:
     with pytest.raises(VehicleProcessError, match="no firmware at"):
-        _open(FirmwareKind.PX4, tmp_path / "px4")
+        _open("px4", tmp_path / "px4")
 
 
 def test_a_file_that_must_not_be_executed(tmp_path: Path) -> None:
     path = tmp_path / "px4"
     path.write_text("")
     with pytest.raises(VehicleProcessError, match="no permission to execute"):
-        _open(FirmwareKind.PX4, path)
+        _open("px4", path)
 
 
 def test_a_program_without_startup_files_is_no_px4(tmp_path: Path) -> None:
     program = _program(tmp_path / "bin" / "px4", "#!/bin/sh\n")
     with pytest.raises(VehicleProcessError, match="is no PX4: it has no startup files"):
-        _open(FirmwareKind.PX4, program)
+        _open("px4", program)
 
 
 def test_a_file_that_is_no_program(tmp_path: Path) -> None:
     program = _program(tmp_path / "arducopter", "no program")
     with pytest.raises(VehicleProcessError, match="is no firmware: Exec format error"):
-        _open(FirmwareKind.ARDUPILOT, program)
+        _open("ardupilot", program)
 
 
 def test_a_program_that_ends_is_no_firmware(tmp_path: Path) -> None:
     program = _program(tmp_path / "arducopter", "#!/bin/sh\necho no such model\nexit 3\n")
-    firmware = _open(FirmwareKind.ARDUPILOT, program)
+    firmware = _open("ardupilot", program)
     try:
         with pytest.raises(VehicleProcessError, match="ended with code 3: no such model"):
-            firmware.wait(lambda: False)
+            firmware.begin()
+    finally:
+        firmware.close()
+
+
+def test_ardupilot_is_told_its_system_id(tmp_path: Path) -> None:
+    program = _program(tmp_path / "arducopter", '#!/bin/sh\necho "$@"\nexit 3\n')
+    firmware = _open("ardupilot", program)
+    try:
+        with pytest.raises(VehicleProcessError, match="--sysid 7 "):
+            firmware.begin()
     finally:
         firmware.close()
 
@@ -84,12 +97,12 @@ def test_the_end_takes_children_and_folder_along(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "family", "port"),
     [
-        (FirmwareKind.PX4, socket.SOCK_STREAM, 4560),
-        (FirmwareKind.ARDUPILOT, socket.SOCK_DGRAM, 9002),
+        ("px4", socket.SOCK_STREAM, 4560),
+        ("ardupilot", socket.SOCK_DGRAM, 9002),
     ],
     ids=["px4", "ardupilot"],
 )
-def test_a_port_in_use_is_told(kind: FirmwareKind, family: int, port: int) -> None:
+def test_a_port_in_use_is_told(kind: str, family: int, port: int) -> None:
     with socket.socket(socket.AF_INET, family) as holder:
         with contextlib.suppress(OSError):  # somebody else's, and so in use
             holder.bind(("127.0.0.1", port))
@@ -102,14 +115,14 @@ def test_a_port_in_use_is_told(kind: FirmwareKind, family: int, port: int) -> No
 def test_a_number_that_another_px4_has_is_left_to_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "_PX4_SOCKET", str(tmp_path / "px4-{}"))
+    monkeypatch.setattr(px4, "_SOCKET", str(tmp_path / "px4-{}"))
     monkeypatch.setattr(px4, "PORT", 45_600)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
         other.bind(str(tmp_path / "px4-0"))
         other.listen()
-        link, port = start._px4_link(Sensors(1), ours=True)
+        link = Px4Link.open(Sensors(1), ours=True)
         link.close()
-    assert port > 45_600
-    link, port = start._px4_link(Sensors(1), ours=True)
+    assert link.port > 45_600
+    link = Px4Link.open(Sensors(1), ours=True)
     link.close()
-    assert port == 45_600
+    assert link.port == 45_600

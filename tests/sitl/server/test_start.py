@@ -7,7 +7,13 @@ import sys
 
 import pytest
 
-from sitl.server.main import main
+from sitl.server.main import main, warm_up
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled():
+    """Else the first start also tells that it compiles."""
+    warm_up()
 
 
 @pytest.fixture
