@@ -47,22 +47,6 @@ class Size(click.ParamType[tuple[int, int]]):
         return int(columns), int(rows)
 
 
-class Positive(click.ParamType[float]):
-    """A finite number above 0."""
-
-    name = "X"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Return the number, or fail with a usage error."""
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not 0.0 < number < math.inf:
-            self.fail(f"{value!r} is not a number above 0", param, ctx)
-        return number
-
-
 key_file = click.option(
     "--key-file",
     type=click.Path(path_type=Path),

@@ -33,7 +33,7 @@ _AIRBORNE_M = 0.3  # height of the lowest corner above which the vehicle is in t
 
 
 @dataclass(slots=True, kw_only=True)
-class GroundRule:
+class _GroundRule:
     """Classifies ground contacts from take-off to landing.
 
     A vehicle in contact before its first take-off stands on the ground. A later contact is a crash
@@ -140,7 +140,7 @@ class Referee:
         self._rows: list[tuple[float | Vector, ...]] = []
         self._half = np.array([length, width, height]) / 2.0
         self._boxes = np.array(world.boxes_enu_m)  # writable: one compiled signature
-        self._ground = GroundRule(half_m=(length / 2.0, width / 2.0, height / 2.0))
+        self._ground = _GroundRule(half_m=(length / 2.0, width / 2.0, height / 2.0))
         self._stamp_s = 0.0
         self._position: Vector | None = None
         self._quaternion = level = np.array([1.0, 0.0, 0.0, 0.0])

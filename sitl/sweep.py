@@ -37,7 +37,7 @@ def _point_distance(point: Vector, box: Vector) -> float:
 
 
 @compiled
-def body_distance(centre: Vector, rotation: Vector, half: Vector, box: Vector) -> float:
+def _body_distance(centre: Vector, rotation: Vector, half: Vector, box: Vector) -> float:
     """Return the distance, m, of an oriented box to an axis-aligned one; zero if they overlap.
 
     The oriented box has a centre (3,) in the world, half sides (3,), and a rotation (3, 3) from
@@ -182,7 +182,7 @@ APPROACH_TOLERANCE_M = 1e-3
 
 
 @compiled
-def pose_at(
+def _pose_at(
     share: float, p0: Vector, q0: Vector, p1: Vector, q1: Vector, centre: Vector, rotation: Vector
 ) -> None:
     """Write the pose at a fraction 0..1 of the motion: centre (3,) and rotation (3, 3)."""
@@ -211,7 +211,7 @@ def clearance(
 ) -> tuple[float, int]:
     """Return distance, m, from the body to the nearest box, and its index (-1: no box)."""
     centre, rotation = np.empty(3), np.empty((3, 3))
-    pose_at(0.0, position, quaternion, position, quaternion, centre, rotation)
+    _pose_at(0.0, position, quaternion, position, quaternion, centre, rotation)
     reach = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
     best, nearest, likely = math.inf, -1, 0
     for index in range(boxes.shape[0]):
@@ -222,7 +222,7 @@ def clearance(
     for turn in range(boxes.shape[0]):
         index = (likely + turn) % boxes.shape[0]
         if _point_distance(centre, boxes[index]) - reach < best:
-            gap = body_distance(centre, rotation, half, boxes[index])
+            gap = _body_distance(centre, rotation, half, boxes[index])
             if gap < best:
                 best, nearest = gap, index
     return best, nearest
@@ -271,8 +271,8 @@ def _first_touch(
     centre, rotation = np.empty(3), np.empty((3, 3))
     share = 0.0
     while True:
-        pose_at(share, p0, q0, p1, q1, centre, rotation)
-        gap = body_distance(centre, rotation, half, box)
+        _pose_at(share, p0, q0, p1, q1, centre, rotation)
+        gap = _body_distance(centre, rotation, half, box)
         if gap <= CONTACT_M:
             return share
         if share >= 1.0 or gap > (1.0 - share) * travel:
@@ -294,10 +294,10 @@ def _approach(
     """Return the smallest distance during the motion, at most `least_m`."""
     centre, rotation = np.empty(3), np.empty((3, 3))
     lows, highs, gaps_low, gaps_high = np.empty(64), np.empty(64), np.empty(64), np.empty(64)
-    pose_at(0.0, p0, q0, p1, q1, centre, rotation)
-    gaps_low[0] = body_distance(centre, rotation, half, box)
-    pose_at(1.0, p0, q0, p1, q1, centre, rotation)
-    gaps_high[0] = body_distance(centre, rotation, half, box)
+    _pose_at(0.0, p0, q0, p1, q1, centre, rotation)
+    gaps_low[0] = _body_distance(centre, rotation, half, box)
+    _pose_at(1.0, p0, q0, p1, q1, centre, rotation)
+    gaps_high[0] = _body_distance(centre, rotation, half, box)
     lows[0], highs[0] = 0.0, 1.0
     least_m = min(least_m, gaps_low[0], gaps_high[0])
     waiting = 1
@@ -309,8 +309,8 @@ def _approach(
         if bound >= least_m - APPROACH_TOLERANCE_M or waiting > 60:
             continue
         middle = 0.5 * (low + high)
-        pose_at(middle, p0, q0, p1, q1, centre, rotation)
-        gap = body_distance(centre, rotation, half, box)
+        _pose_at(middle, p0, q0, p1, q1, centre, rotation)
+        gap = _body_distance(centre, rotation, half, box)
         least_m = min(least_m, gap)
         lows[waiting], highs[waiting] = low, middle
         gaps_low[waiting], gaps_high[waiting] = gap_low, gap

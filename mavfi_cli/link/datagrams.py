@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from mavfi_cli.link.codec import frame_length
+from mavfi_cli.link.codec import Codec, frame_length
 from mavfi_cli.link.endpoint import CHUNK, MAX_PEERS, SMALL_CHUNK, Receiver, SocketOwner, text_of
-from mavfi_cli.link.sender_slot import SenderSlot, is_autopilots
+from mavfi_cli.link.sender_slot import SenderSlot, is_of_autopilot
 
 MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
 _JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost
@@ -63,7 +63,7 @@ class UdpTransport(SocketOwner, Receiver):
             self._slot.take(sender)
             self.address = text_of(sender)
             return True
-        if is_autopilots(data):
+        if any(map(is_of_autopilot, Codec(0, 0).decode(data, datagram=True))):
             self._slot.challenge(sender)
         return False
 

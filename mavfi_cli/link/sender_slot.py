@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from mavfi_cli.link.codec import Codec, Message, dialect
+from mavfi_cli.link.codec import Message, dialect
 
 Sender = TypeVar("Sender")
 SILENCE_S = 5.0  # time after which another sender may take a silent one's place
@@ -16,11 +16,6 @@ TWO_AUTOPILOTS = "two autopilots send here"
 def is_of_autopilot(message: Message) -> bool:
     """Return True if an autopilot has sent the message, by its component id."""
     return bool(message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1)
-
-
-def is_autopilots(data: bytes) -> bool:
-    """Return True if a datagram holds a frame of an autopilot."""
-    return any(map(is_of_autopilot, Codec(0, 0).decode(data, datagram=True)))
 
 
 def two_autopilots(address: str, rival_address: str) -> str:

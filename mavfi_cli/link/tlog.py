@@ -44,7 +44,7 @@ def unix_time_of_stamp_0(path: Path) -> float:
     return EPOCH_UNIX_S
 
 
-class TlogWriter:
+class _TlogWriter:
     """Writes a .tlog. A kill leaves whole records and loses the last second or 64 KiB at most.
 
     Args:
@@ -140,7 +140,7 @@ class RecordedLink:
         self._transport = transport
         self._clock = clock
         self._codec = Codec(system, component, signing=signing)
-        self._tlog: TlogWriter | None = None
+        self._tlog: _TlogWriter | None = None
         self._early: list[tuple[float, list[bytes]]] = []
 
     @contextlib.contextmanager
@@ -151,7 +151,7 @@ class RecordedLink:
             RecordError: The file cannot be written, now or at any later message.
         """
         epoch_unix_s = EPOCH_UNIX_S if self._clock is None else 0
-        with contextlib.closing(TlogWriter(path, epoch_unix_s)) as self._tlog:
+        with contextlib.closing(_TlogWriter(path, epoch_unix_s)) as self._tlog:
             for stamp_s, frames in self._early:
                 self._tlog.write(stamp_s, *frames)
             self._early.clear()

@@ -16,8 +16,7 @@ from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import Signing, key_from_file
 from sitl.camera.component import Camera
 from sitl.camera.router import Router
-from sitl.camera.station import PoseTracker, Station
-from sitl.camera.witness import Witness
+from sitl.camera.station import PoseTracker, Station, Witness
 from sitl.command_line import (
     CONTEXT,
     Place,

@@ -42,7 +42,7 @@ _UNKNOWN = 0x7FFF_FFFF
 
 
 @dataclass(slots=True, kw_only=True)
-class PeriodicSchedule:
+class _Schedule:
     """Due at the first poll and then every `interval_s` in phase with it.
 
     A late poll does not shift the phase. Missed times are skipped.
@@ -124,12 +124,10 @@ class Camera:
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
         self._pose: tuple[Vector, Vector] | None = None  # optical centre (3,) and attitude (4,)
         self._stamp_s = 0.0
-        self._heartbeat = (
-            PeriodicSchedule(interval_s=1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
-        )
-        self._frames: PeriodicSchedule | None = None
+        self._heartbeat = _Schedule(interval_s=1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
+        self._frames: _Schedule | None = None
         self._frames_left = 0  # 0: unlimited
-        self._streams: dict[int, PeriodicSchedule] = {}
+        self._streams: dict[int, _Schedule] = {}
         self._commands: dict[int, Callable[[Message], int]] = {
             dialect.MAV_CMD_IMAGE_START_CAPTURE: self._start_capture,
             dialect.MAV_CMD_IMAGE_STOP_CAPTURE: self._stop_capture,
@@ -310,7 +308,7 @@ class Camera:
         if math.isnan(interval_s) or interval_s == 0.0:
             interval_s = self._default_interval_s
         interval_s = round(interval_s, 6)  # a float32 of 0.1 would drift against ticks
-        self._frames = PeriodicSchedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
+        self._frames = _Schedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
         self._frames_left = count
         return int(dialect.MAV_RESULT_ACCEPTED)
 
@@ -332,7 +330,7 @@ class Camera:
         self._streams.pop(message_id, None)
         if interval_us > 0:
             interval_s = max(interval_us / 1e6, 1.0 / MAX_RATE_HZ)
-            self._streams[message_id] = PeriodicSchedule(interval_s=interval_s)
+            self._streams[message_id] = _Schedule(interval_s=interval_s)
         return int(dialect.MAV_RESULT_ACCEPTED)
 
 

@@ -99,18 +99,7 @@ class ArduPilotLink:
         mavlink_port: int,
         heading_deg: float,
     ) -> FirmwareProcess:
-        """Start ArduCopter's SITL binary, which calls this link.
-
-        Args:
-            binary: The program.
-            parameters: Those of the vehicle, set before it starts.
-            system_id: Its MAVLink system id.
-            mavlink_port: UDP port to which it sends MAVLink.
-            heading_deg: Heading at the start.
-
-        Raises:
-            VehicleProcessError: It cannot be started.
-        """
+        """Start ArduCopter's SITL binary, which calls this link. See `Px4Link.start`."""
         program, origin = require_program(binary), Origin()
         folder = Path(tempfile.mkdtemp(prefix="mavfi-ardupilot-"))
         lines = [f"{name} {value:.6g}\n" for name, value in parameters.items()]

@@ -40,7 +40,7 @@ _LAPSE_PER_M = 2.25577e-5
 _EXPONENT = 5.25588
 
 
-def pressure_pa(altitude_amsl_m: float) -> float:
+def _pressure_pa(altitude_amsl_m: float) -> float:
     """Return the pressure of the standard atmosphere at an altitude."""
     return float(_SEA_LEVEL_PA * (1.0 - _LAPSE_PER_M * altitude_amsl_m) ** _EXPONENT)
 
@@ -50,7 +50,7 @@ def pressure_altitude_m(pressure: float) -> float:
     return float((1.0 - (pressure / _SEA_LEVEL_PA) ** (1.0 / _EXPONENT)) / _LAPSE_PER_M)
 
 
-def specific_force(truth: Truth) -> Vector:
+def _specific_force(truth: Truth) -> Vector:
     """Return what an ideal accelerometer measures (3,), body FRD, m/s^2."""
     felt_ned = truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2
     force: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ felt_ned
@@ -84,7 +84,7 @@ class Sensors:
         """Return rates (3,), rad/s, and specific force (3,), m/s^2, both in body FRD."""
         noise = self._noise.standard_normal(6)
         rates = truth.rates_frd_radps + GYRO_RADPS * noise[:3]
-        return rates, specific_force(truth) + ACCELEROMETER_MPS2 * noise[3:]
+        return rates, _specific_force(truth) + ACCELEROMETER_MPS2 * noise[3:]
 
     def magnetic_field(self, truth: Truth) -> Vector:
         """Return the magnetic field (3,), body FRD, gauss."""
@@ -94,7 +94,7 @@ class Sensors:
     def pressure(self, truth: Truth) -> float:
         """Return the air pressure, Pa."""
         altitude_m = self._origin.altitude_amsl_m - float(truth.position_ned_m[2])
-        return pressure_pa(altitude_m) + BAROMETER_PA * float(self._noise.standard_normal())
+        return _pressure_pa(altitude_m) + BAROMETER_PA * float(self._noise.standard_normal())
 
     def fix(self, truth: Truth) -> _Fix:
         """Return position and velocity of the GPS receiver."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,6 @@ from sitl.autopilot.streams import Preset
 from sitl.command_line import (
     CONTEXT,
     Place,
-    Positive,
     Size,
     Triple,
     allow_unsigned,
@@ -48,6 +48,22 @@ class _Link(click.ParamType[tuple[Preset, str]]):
         if name not in known:
             self.fail(f"unknown preset {name!r}; known: {', '.join(known)}", param, ctx)
         return Preset(name), url
+
+
+class _Positive(click.ParamType[float]):
+    """A finite number above 0."""
+
+    name = "X"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        """Return the number, or fail with a usage error."""
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not 0.0 < number < math.inf:
+            self.fail(f"{value!r} is not a number above 0", param, ctx)
+        return number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,10 +121,10 @@ class ServerOptions:
 @click.option("--lockstep", is_flag=True, help="Wait for the companion on --fd at every tick.")
 @click.option("--realtime", is_flag=True, help="The same as --speed 1.")
 @click.option(
-    "--speed", type=Positive(), help="Times real time  [1; in lockstep as fast as it goes]."
+    "--speed", type=_Positive(), help="Times real time  [1; in lockstep as fast as it goes]."
 )
 @click.option(
-    "--answer-limit", "answer_limit_s", type=Positive(), default=120.0, show_default=True,
+    "--answer-limit", "answer_limit_s", type=_Positive(), default=120.0, show_default=True,
     help="Time that the companion in lockstep may take for a tick, s.",
 )  # fmt: skip
 @click.option("--truth", type=click.Path(path_type=Path), help="Folder for the referee's truth.")
@@ -116,7 +132,7 @@ class ServerOptions:
     "--camera-size", type=Size(), default="64x48", show_default=True, help="Depth image, pixels."
 )
 @click.option(
-    "--camera-rate", "camera_rate_hz", type=Positive(), default=10.0, show_default=True,
+    "--camera-rate", "camera_rate_hz", type=_Positive(), default=10.0, show_default=True,
     help="Frame rate for clients that ask for no interval, Hz.",
 )  # fmt: skip
 @camera_heartbeat

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import json
 import subprocess
@@ -13,28 +12,36 @@ import pymavlink
 import pytest
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.link.codec import Codec, dialect
-from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter, unix_time_of_stamp_0
+from mavfi_cli.link.codec import Codec, Message, dialect
+from mavfi_cli.link.tlog import EPOCH_UNIX_S, RecordedLink, unix_time_of_stamp_0
+from mavfi_cli.link.transport import memory_pair
 
 MAVLOGDUMP = Path(pymavlink.__file__).parent / "tools" / "mavlogdump.py"
 
 
-def _frames(count: int) -> list[bytes]:
-    vehicle, companion = Codec(1, 1), Codec(1, 191)
-    frames = []
-    for number in range(count):
-        position = dialect.MAVLink_local_position_ned_message(20 * number, 1, 2, -3, 0, 0, 0)
-        target = dialect.MAVLink_set_position_target_local_ned_message(
-            20 * number, 1, 1, 1, 2503, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0.5, 0
-        )
-        frames += [vehicle.encode(position), companion.encode(target)]
+def _position(number: int) -> Message:
+    return dialect.MAVLink_local_position_ned_message(20 * number, 1, 2, -3, 0, 0, 0)
+
+
+def _target(number: int) -> Message:
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        20 * number, 1, 1, 1, 2503, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0.5, 0
+    )
+
+
+def _write(path: Path, ticks: int) -> list[bytes]:
+    """Record that many states and the setpoints in answer. Return the frames on the wire."""
+    ours, theirs = memory_pair("memory")
+    vehicle, frames = Codec(1, 1), []
+    link = RecordedLink(ours, 1, 191)
+    with link.recording(path):
+        for number in range(ticks):
+            frames.append(vehicle.encode(_position(number)))
+            theirs.send(frames[-1])
+            assert len(link.messages(link.receive(0.0), number * 0.02)) == 1
+            link.send([_target(number)], number * 0.02)
+            frames.append(theirs.receive(0.0))
     return frames
-
-
-def _write(path: Path, frames: list[bytes]) -> None:
-    with contextlib.closing(TlogWriter(path)) as log:
-        for number, frame in enumerate(frames):
-            log.write(number // 2 * 0.02, frame)
 
 
 def _records(data: bytes) -> list[tuple[int, bytes]]:
@@ -51,7 +58,7 @@ def _records(data: bytes) -> list[tuple[int, bytes]]:
 
 def test_mavlogdump_reads_both_directions(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
-    _write(path, _frames(50))
+    _write(path, 50)
     done = subprocess.run(
         [sys.executable, str(MAVLOGDUMP), "--format", "json", str(path)],
         capture_output=True,
@@ -75,62 +82,60 @@ def test_the_epoch_is_a_fixed_day() -> None:
 
 def test_the_same_flight_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one", "two"):
-        _write(tmp_path / name, _frames(20))
+        _write(tmp_path / name, 20)
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
 def test_every_frame_is_there_as_it_was_on_the_wire(tmp_path: Path) -> None:
-    frames = _frames(20)
-    _write(tmp_path / "log", frames)
+    frames = _write(tmp_path / "log", 20)
     records = _records((tmp_path / "log").read_bytes())
     assert [frame for _, frame in records] == frames
     assert records[2][0] == EPOCH_UNIX_S * 1_000_000 + 20_000
 
 
+RECORDING = """
+import os, resource, signal
+from pathlib import Path
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.link.codec import dialect
+from mavfi_cli.link.tlog import RecordedLink
+from mavfi_cli.link.transport import memory_pair
+ends = memory_pair("memory")
+link = RecordedLink(ends[0], 1, 1)
+message = dialect.MAVLink_local_position_ned_message(1, 1, 2, 3, 4, 5, 6)
+"""
+
+
 def test_a_kill_leaves_whole_records_of_all_but_the_last_second(tmp_path: Path) -> None:
     path = tmp_path / "log"
-    program = (
-        "import os, signal\n"
-        "from pathlib import Path\n"
-        "from mavfi_cli.link.codec import Codec, dialect\n"
-        "from mavfi_cli.link.tlog import TlogWriter\n"
-        f"log = TlogWriter(Path({str(path)!r}))\n"
-        "for k in range(1000):\n"
-        "    m = dialect.MAVLink_local_position_ned_message(20 * k, 1, 2, 3, 4, 5, 6)\n"
-        "    log.write(0.02 * k, Codec(1, 1).encode(m))\n"
-        "os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
+    program = f"""{RECORDING}
+with link.recording(Path({str(path)!r})):
+    for k in range(1000):
+        link.send([message], 0.02 * k)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == -9, done.stderr
     assert 949 <= len(_records(path.read_bytes())) <= 1000
 
 
 def test_a_full_disk_is_one_clear_line() -> None:
-    log = TlogWriter(Path("/dev/full"))
-    log.write(0.0, _frames(1)[0])
     with pytest.raises(RecordError, match="/dev/full: cannot write: No space left on device"):
-        log.flush()
-    log.close()  # and it does not complain twice
+        _write(Path("/dev/full"), 1)
 
 
 def test_a_disk_that_fills_up_keeps_whole_records(tmp_path: Path) -> None:
     path = tmp_path / "log"
-    program = (
-        "import resource, signal, sys\n"
-        "from pathlib import Path\n"
-        "from mavfi_cli.core.errors import RecordError\n"
-        "from mavfi_cli.link.codec import Codec, dialect\n"
-        "from mavfi_cli.link.tlog import TlogWriter\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (10_001, 10_001))\n"
-        f"log = TlogWriter(Path({str(path)!r}))\n"
-        "m = dialect.MAVLink_local_position_ned_message(1, 1, 2, 3, 4, 5, 6)\n"
-        "try:\n"
-        "    for k in range(1000):\n"
-        "        log.write(0.1 * k, Codec(1, 1).encode(m))\n"
-        "except RecordError as error:\n"
-        "    print(error)\n"
-    )
+    program = f"""{RECORDING}
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_001, 10_001))
+try:
+    with link.recording(Path({str(path)!r})):
+        for k in range(1000):
+            link.send([message], 0.1 * k)
+except RecordError as error:
+    print(error)
+"""
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert "cannot write: File too large" in done.stdout, done.stderr
     assert len(_records(path.read_bytes())) > 100
@@ -138,14 +143,18 @@ def test_a_disk_that_fills_up_keeps_whole_records(tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="No such file or directory"):
-        TlogWriter(tmp_path / "nowhere" / "log")
+        _write(tmp_path / "nowhere" / "log", 0)
 
 
 def test_a_foreign_flight_tells_its_date_by_its_first_state(tmp_path: Path) -> None:
-    path = tmp_path / "flight.tlog"
-    with contextlib.closing(TlogWriter(path, epoch_unix_s=0)) as log:
-        log.write(1_790_000_000.0, Codec(1, 1).encode(dialect.MAVLink_ping_message(0, 0, 0, 0)))
-        log.write(1_790_000_007.5, _frames(3)[4])  # its stamp is 0.04 s
+    path, now_s = tmp_path / "flight.tlog", [1_790_000_000.0]
+    ours, theirs = memory_pair("memory")
+    link = RecordedLink(ours, 1, 191, clock=lambda: now_s[0])
+    with link.recording(path):
+        link.send([dialect.MAVLink_ping_message(0, 0, 0, 0)], 0.0)
+        now_s[0] += 7.5
+        theirs.send(Codec(1, 1).encode(_position(2)))  # its stamp is 0.04 s
+        link.messages(link.receive(0.0), 0.0)
     assert unix_time_of_stamp_0(path) == pytest.approx(1_790_000_007.46)
     path.write_bytes(b"")
     assert unix_time_of_stamp_0(path) == EPOCH_UNIX_S

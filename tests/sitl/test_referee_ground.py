@@ -6,17 +6,23 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.frames import quaternion_from_euler
-from sitl.referee import GroundRule
+from sitl.referee import Referee
+from sitl.world import World
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def rule() -> GroundRule:
-    return GroundRule(half_m=(0.25, 0.25, 0.08))
+def rule() -> Referee:
+    world = World(
+        name="empty", seed=0, boxes_enu_m=np.zeros((0, 6)),
+        bounds_enu_m=np.array([-9.0, -9.0, 0.0, 9.0, 9.0, 9.0]),
+        start_enu_m=np.zeros(3), goal_enu_m=np.array([5.0, 0.0, 5.0]),
+    )  # fmt: skip
+    return Referee(world, (0.5, 0.5, 0.16))
 
 
 def watch(
-    ground: GroundRule,
+    ground: Referee,
     height: float,
     *,
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -24,13 +30,17 @@ def watch(
     on_ground: bool = False,
     may_land: bool = False,
 ) -> bool:
-    return ground.crashed(
+    """Return True if a pose is a crash of an armed vehicle."""
+    collision = ground.observe(
+        0.0,
         np.array([0.0, 0.0, height]),
         quaternion_from_euler(tilt, 0.0, 0.5) if tilt else LEVEL,
         np.array(velocity),
+        armed=True,
         on_ground=on_ground,
         may_land=may_land,
     )
+    return collision is not None
 
 
 @pytest.mark.parametrize("height", [0.0, 0.11])

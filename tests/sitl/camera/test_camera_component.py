@@ -79,6 +79,31 @@ def test_the_wires_rounding_of_the_interval_does_not_shift_frames_in_a_long_flig
     assert frame_stamps(fly(camera, 200.0)) == pytest.approx(np.arange(2000) * 0.1)
 
 
+@pytest.mark.parametrize(("interval", "expected"), [(0.1, 100), (0.02, 500), (0.15, 67), (3.0, 4)])
+def test_ten_seconds_of_ticks_hold_as_many_frames_as_intervals(
+    interval: float, expected: int
+) -> None:
+    camera, log, stamp = Camera(BOXES, columns=1, rows=1), [], 7.0
+    camera.handle(command(2000, 0, interval))
+    for _ in range(500):
+        log.append((stamp, camera.poll(stamp, POSITION, ATTITUDE)))
+        stamp += 0.02  # summed, with its rounding
+    assert len(frame_stamps(log)) == expected
+
+
+def heartbeats(stamps: list[float]) -> list[float]:
+    camera = Camera(BOXES)
+    return [s for s in stamps if "HEARTBEAT" in kinds(camera.poll(s, POSITION, ATTITUDE))]
+
+
+def test_a_late_poll_neither_shifts_the_phase_nor_is_made_up_for() -> None:
+    assert heartbeats([0.0, 0.5, 3.7, 3.9, 4.0, 4.9, 5.0]) == [0.0, 3.7, 4.0, 5.0]
+
+
+def test_after_a_restart_it_is_due_at_once() -> None:
+    assert heartbeats([100.0, 1.0, 1.5, 2.0]) == [100.0, 1.0, 2.0]
+
+
 def test_a_counted_capture_ends_by_itself() -> None:
     camera = Camera(BOXES)
     camera.handle(command(2000, 0, 0.1, 3))

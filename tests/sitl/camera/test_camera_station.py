@@ -19,8 +19,7 @@ from mavfi_cli.link.transport import Transport, open_transport
 from sitl.camera.__main__ import main
 from sitl.camera.component import Camera
 from sitl.camera.router import Router
-from sitl.camera.station import PoseTracker, Station
-from sitl.camera.witness import Witness
+from sitl.camera.station import PoseTracker, Station, Witness
 from sitl.vehicle.profile import load_profile
 from sitl.vehicle.vehicle import regression_power
 from sitl.world import load_world
