@@ -20,9 +20,9 @@ from mavfi_cli.claims.sources import STACKS, Evidence
 from mavfi_cli.report.tables.paper_table import PaperTable
 from mavfi_cli.reproduction.figures import draw
 from mavfi_cli.reproduction.flights import pooled, ratios, timed
-from mavfi_cli.reproduction.items import ITEMS, Item, Source
-from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
-from mavfi_cli.reproduction.plan import kinds_of
+from mavfi_cli.reproduction.items import ITEMS, FlightsPlan, Item, Source
+from mavfi_cli.reproduction.layouts import of_flights
+from mavfi_cli.reproduction.status import of_kernels, of_model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,7 +127,10 @@ def _over_own(flights: pa.Table) -> Iterator[dict[str, Any]]:
 
 def _of_kind(item: Item, stack: str, table: pa.Table) -> pa.Table:
     """The flights that differ from the item's missions on a stack in _SEEDS only."""
-    kinds = {kind_of(changes_of(mission.config), _SEEDS) for mission in kinds_of([item], stack)}
+    kinds = {
+        kind_of(changes_of(mission.config), _SEEDS)
+        for mission in FlightsPlan(items=[item], stack=stack).kinds()
+    }
     changes = map(json.loads, table["changes"].to_pylist())
     wanted = [kind_of(each, _SEEDS) in kinds for each in changes]
     return table.filter(pa.array(wanted, pa.bool_()))

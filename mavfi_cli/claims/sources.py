@@ -21,7 +21,7 @@ from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.reproduction.flights import flown_missions, pooled
-from mavfi_cli.reproduction.plan import stored_plan
+from mavfi_cli.reproduction.items import FlightsPlan
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
@@ -166,7 +166,7 @@ def _read(path: Path) -> CampaignSource | _KernelSource:
 def _from_ledger(folder: Path) -> CampaignSource:
     with Ledger(folder) as ledger:
         table, origin, spec = flights(ledger), provenance(ledger), stored_spec(ledger)
-        plan = stored_plan(ledger)
+        plan = FlightsPlan.stored(ledger)
     found = _campaign(folder, origin["name"] or folder.name, spec, table, origin)
     again = "" if spec is None else f"mavfi campaign run {folder}"
     return replace(found, again=again if plan is None else plan.command)

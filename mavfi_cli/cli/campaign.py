@@ -160,14 +160,12 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
     from mavfi_cli.report.drawing import PICTURES, write_figure
     from mavfi_cli.report.tables.paper_table import FORMATS
     from mavfi_cli.reproduction.figures import draw
-    from mavfi_cli.reproduction.status import asked_item, item_flights, table_of
+    from mavfi_cli.reproduction.status import shown
 
     if output is not None:
         require_output(output, PICTURES)
     with Ledger(folder_of(what)) as ledger:
-        shown = asked_item(ledger, item)
-        flights = item_flights(shown, ledger)
-        table = table_of(ledger, shown, flights)
+        table, flights = shown(ledger, item)
         click.echo(FORMATS[form](table), nl=False)
         if output is not None:
             write_figure(draw(table, flights, columns), output)
@@ -326,13 +324,7 @@ def _show(
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.tables.campaign import campaign_lines
     from mavfi_cli.report.tables.paper_table import as_text
-    from mavfi_cli.reproduction.status import (
-        item_flights,
-        item_of,
-        progress_lines,
-        short,
-        table_of,
-    )
+    from mavfi_cli.reproduction.status import progress_lines, short, shown
 
     if as_json:
         told = _summary(ledger, by, confidence, more or {})
@@ -345,8 +337,7 @@ def _show(
     if full:
         lines += campaign_lines(_summary(ledger, by, confidence, more or {}))
     else:
-        item = item_of(ledger)
-        table = table_of(ledger, item, item_flights(item, ledger))
+        table, _ = shown(ledger)
         lines += ["", as_text(short(table)).rstrip()]
     click.echo("\n".join(lines))
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
-
-if TYPE_CHECKING:
-    from mavfi_cli.reproduction.flying import Forecast
 
 _what = partial(click.option, cls=GroupedOption, group="Missions")
 _execution = partial(click.option, cls=GroupedOption, group="Execution")
@@ -42,8 +39,7 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.report.tables.paper_table import as_text
     from mavfi_cli.reproduction.flying import reproduce as run
-    from mavfi_cli.reproduction.items import items_named
-    from mavfi_cli.reproduction.plan import FlightsPlan
+    from mavfi_cli.reproduction.items import FlightsPlan, items_named
     from mavfi_cli.reproduction.status import tables
 
     plan = FlightsPlan(
@@ -57,7 +53,7 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
             plan,
             Options(jobs=options["jobs"] or 0),
             view,
-            lambda forecast: view.on_note(forecast_line(forecast)),
+            lambda forecast: view.on_note(forecast.told),
         )
     for table in tables(plan):
         one_line = f"{table.title}\n  {table.result}\n"
@@ -65,20 +61,3 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     if any(item.preset for item in plan.items):
         click.echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
         click.echo(f"The page            mavfi report {plan.out} -o report.html")
-
-
-def forecast_line(forecast: Forecast) -> str:
-    """What is left to fly, and what it takes."""
-    from mavfi_cli.campaigns.progress import duration
-
-    left = forecast.missions - forecast.over
-    parts = [f"{forecast.missions} missions, {forecast.over} of them flown"]
-    parts += [f"{forecast.runs} runs of kernels"] if forecast.runs else []
-    done = "; ".join(parts)
-    if not (left or forecast.runs):
-        return done
-    measured = f", from {forecast.measured} missions" if left else ""
-    return (
-        f"{done}; what is left takes about {duration(forecast.seconds)} on this machine "
-        f"({forecast.jobs} at a time{measured}) and {forecast.disk_bytes / 1e6:.0f} MB"
-    )

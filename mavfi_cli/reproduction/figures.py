@@ -28,11 +28,12 @@ from mavfi_cli.reproduction.flights import STAGES, by_value, comparable, faulty,
 from mavfi_cli.reproduction.items import printed
 from mavfi_cli.reproduction.layouts import (
     KERNELS_FLOWN,
+    PERCENT,
     PROTECTED,
+    increases,
     values_and_deltas,
     worlds_of,
 )
-from mavfi_cli.reproduction.measures import PERCENT, increases
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

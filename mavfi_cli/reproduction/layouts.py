@@ -1,6 +1,6 @@
-"""The layout of each item: from flown missions, or from another source, to the paper's table.
+"""The layout of each item that is flown: from missions to the paper's table.
 
-A layout of flights takes the item's missions as `reproduction.flights.beside_golden`. It reads
+A layout takes the item's missions as `reproduction.flights.beside_golden`. It reads
 configuration and record only, never labels, so that it serves any campaign with such missions. It
 gives the cells of each row; paper.toml has headings, columns and notes.
 """
@@ -11,17 +11,22 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from mavfi_cli.analysis.flights import chosen, known, numbers
-from mavfi_cli.analysis.kernel_runs import outcome_share
+from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.record.run_folder import TRACE
-from mavfi_cli.report.tables.paper_table import DETECTOR_TITLES, PaperCell, PaperRow, PaperTable
+from mavfi_cli.report.tables.paper_table import (
+    DETECTOR_TITLES,
+    PaperCell,
+    PaperRow,
+    PaperTable,
+    Printed,
+)
 from mavfi_cli.reproduction.flights import (
     EVERY_STAGE,
     STAGES,
@@ -30,23 +35,14 @@ from mavfi_cli.reproduction.flights import (
     faulty,
     golden,
     ratios,
+    share,
 )
 from mavfi_cli.reproduction.items import BY_NAME, printed
-from mavfi_cli.reproduction.measures import (
-    PERCENT,
-    increases,
-    maximum,
-    mean,
-    mean_cell,
-    recovered,
-    share_cell,
-    success,
-    worst_mean,
-)
-from mavfi_cli.vpm.model import schemes_with
-from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.vehicle import ModelVehicle
+from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.paired import OWN, worst_case
+from mavfi_cli.stats.shares import Share
 
+PERCENT = 100.0
 WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
 _GOLDEN = "golden"  # begins the labels of rows of golden flights
@@ -75,19 +71,6 @@ def _row(*labels: object, cells: Iterable[PaperCell]) -> PaperRow:
     return PaperRow(labels=tuple(map(str, labels)), cells=tuple(cells))
 
 
-def _told(table: PaperTable, row: PaperRow, place: int, unit: str = " %") -> str:
-    """Our number, with the paper's in brackets if it prints one."""
-    column, cell = table.columns[place], row.cells[place]
-    paper = column.printed(cell.paper)
-    return f"{column.told(cell.value)}{unit}" + (f" (paper {paper}{unit})" if paper else "")
-
-
-def _filled(table: PaperTable, place: int) -> list[PaperRow]:
-    """The rows with a number in a column, the largest first."""
-    rows = [row for row in table.rows if not math.isnan(row.cells[place].value)]
-    return sorted(rows, key=lambda row: -row.cells[place].value)
-
-
 def worlds_of(flights: pa.Table) -> list[str]:
     """The worlds that were flown, the paper's first."""
     found = set(flights["world"].to_pylist())
@@ -110,8 +93,8 @@ _PLANNERS = {"rrtstar": "RRT*", "rrt": "RRT", "rrtconnect": "RRTConnect"}
 
 def _effects(flights: pa.Table) -> list[PaperCell]:
     """Success, mean time, and the longest flight of those with a fault."""
-    longest = maximum(increases(faulty(flights)))
-    return [success(flights), mean(flights, "flight_time_s"), longest]
+    longest = _maximum(increases(faulty(flights)))
+    return [_success(flights), _mean(flights, "flight_time_s"), longest]
 
 
 def _fig7(flights: pa.Table) -> Iterator[PaperRow]:
@@ -125,7 +108,7 @@ def _fig7(flights: pa.Table) -> Iterator[PaperRow]:
     }
     for title, those in groups.items():
         if those.num_rows:
-            energy = mean(those, "energy_regression_j", scale=_JOULES)
+            energy = _mean(those, "energy_regression_j", scale=_JOULES)
             yield _row(title, cells=[*_effects(those), energy])
 
 
@@ -150,13 +133,13 @@ def _by_value(name: str, column: str) -> Callable[[pa.Table], Iterator[PaperRow]
 def _worst_told(table: PaperTable) -> str:
     """The row with the longest flight, and the one with the lowest success."""
     struck = [row for row in table.rows if not row.labels[0].startswith(_GOLDEN)]
-    longest = _filled(table, 2)
+    longest = table.ranked(2)
     if not longest:
         return _NOTHING
     lowest = min(struck, key=lambda row: row.cells[0].value)
     return (
-        f"longest flight {_told(table, longest[0], 2)} over its own golden one "
-        f"({longest[0].labels[0]}); lowest success {_told(table, lowest, 0)} ({lowest.labels[0]})"
+        f"longest flight {table.told(longest[0], 2)} over its own golden one "
+        f"({longest[0].labels[0]}); lowest success {table.told(lowest, 0)} ({lowest.labels[0]})"
     )
 
 
@@ -175,16 +158,16 @@ def _table3(flights: pa.Table) -> Iterator[PaperRow]:
     groups |= {bits: faults[bits,] for (bits,) in sorted(faults)}
     for bits, those in groups.items():
         means = [
-            mean(those, column, printed("table3", paper, bits), scale)
+            _mean(those, column, printed("table3", paper, bits), scale)
             for paper, (column, scale) in _QUALITY.items()
         ]
-        won = success(those, printed("table3", "success_percent", bits))
+        won = _success(those, printed("table3", "success_percent", bits))
         yield _row(bits or f"0 ({_GOLDEN})", cells=[*means, won])
 
 
 def _table3_told(table: PaperTable) -> str:
     most = table.rows[-1]
-    time_s, won = _told(table, most, 0, " s"), _told(table, most, -1)
+    time_s, won = table.told(most, 0, " s"), table.told(most, -1)
     return f"{most.labels[0]} bits: flight time {time_s}, success {won}"
 
 
@@ -197,7 +180,7 @@ def _table4(flights: pa.Table) -> Iterator[PaperRow]:
     settings += [(f"{told}-based", x, faulty(flights, x)) for x, told in DETECTOR_TITLES.items()]
     for title, key, those in settings:
         cells = (
-            success(chosen(those, world=world), printed("table4", "success_percent", key, world))
+            _success(chosen(those, world=world), printed("table4", "success_percent", key, world))
             for world in worlds_of(flights)
         )
         yield _row(title, cells=cells)
@@ -205,7 +188,7 @@ def _table4(flights: pa.Table) -> Iterator[PaperRow]:
 
 def _table4_told(table: PaperTable) -> str:
     world = table.columns[-1].title if table.columns else "no world"
-    told = (f"{row.labels[0]} {_told(table, row, -1)}" for row in table.rows if row.cells)
+    told = (f"{row.labels[0]} {table.told(row, -1)}" for row in table.rows if row.cells)
     return f"{world}: {', '.join(told)}"
 
 
@@ -216,9 +199,9 @@ def _fig12(flights: pa.Table) -> Iterator[PaperRow]:
         bare, struck = golden(here), faulty(here)
         increase = printed("fig12", "worst_increase_percent", world)
         yield _row(world, cells=[
-            mean(bare, "flight_time_s"),
-            maximum(increases(struck), increase),
-            worst_mean(bare, struck, increase),
+            _mean(bare, "flight_time_s"),
+            _maximum(increases(struck), increase),
+            _worst_mean(bare, struck, increase),
             *_recovered(here, "fig12", "recovered_points", world),
         ])  # fmt: skip
 
@@ -227,13 +210,13 @@ def _recovered(flights: pa.Table, item: str, unit: str, place: str) -> Iterator[
     """What each detector recovers of the worst flight, beside the paper's numbers in this unit."""
     measure = "recovered" if unit == "recovered_points" else "recovered_share"
     for name in DETECTOR_TITLES:
-        yield recovered(faulty(flights, name), measure, printed(item, unit, name, place))
+        yield _recovery(faulty(flights, name), measure, printed(item, unit, name, place))
 
 
 def _fig12_told(table: PaperTable) -> str:
-    if not (worst := _filled(table, 1)):
+    if not (worst := table.ranked(1)):
         return _NOTHING
-    longest, gad, aad = (_told(table, worst[0], *each) for each in ((1,), (3, ""), (4, "")))
+    longest, gad, aad = (table.told(worst[0], *each) for each in ((1,), (3, ""), (4, "")))
     world = worst[0].labels[0]
     return f"worst flight {longest} in {world}, GAD recovers {gad} and AAD {aad} points"
 
@@ -244,7 +227,7 @@ def _fig14(flights: pa.Table) -> Iterator[PaperRow]:
         for stages in PROTECTED:
             paper = ("fig14", "recovered_percent", detector)
             cells = (
-                recovered(
+                _recovery(
                     faulty(flights, detector, protect=stages, world=world),
                     "recovered_share",
                     printed(*paper, world, stages),
@@ -257,7 +240,7 @@ def _fig14(flights: pa.Table) -> Iterator[PaperRow]:
 def _fig14_told(table: PaperTable) -> str:
     protected = [row for row in table.rows if row.labels[1] == EVERY_STAGE and row.cells]
     return "all stages, " + "; ".join(
-        f"{row.labels[0]} recovers {_told(table, row, 0)} in {table.columns[0].title}"
+        f"{row.labels[0]} recovers {table.told(row, 0)} in {table.columns[0].title}"
         for row in protected
     )
 
@@ -279,7 +262,7 @@ def _table5(flights: pa.Table) -> Iterator[PaperRow]:
 def _table5_told(table: PaperTable) -> str:
     sums = [row for row in table.rows if row.labels[1] == "sum" and row.cells]
     return "detection and recovery, " + "; ".join(
-        f"{row.labels[0]} {_told(table, row, -1)} in {table.columns[-1].title}" for row in sums
+        f"{row.labels[0]} {table.told(row, -1)} in {table.columns[-1].title}" for row in sums
     )
 
 
@@ -346,7 +329,7 @@ def _fig11(flights: pa.Table) -> Iterator[PaperRow]:
 
 
 def _fig11_told(table: PaperTable) -> str:
-    told = (f"{_told(table, row, 2)} ({row.labels[0]})" for row in table.rows)
+    told = (f"{table.told(row, 2)} ({row.labels[0]})" for row in table.rows)
     return f"range reduced by {', '.join(told)}"
 
 
@@ -366,15 +349,15 @@ def _fig13(flights: pa.Table) -> Iterator[PaperRow]:
     """The flight that a fault prolongs most, of each stage, and the same with the autoencoder."""
     for (stage,), struck in by_value(faulty(flights), "fault_target").items():
         yield _row(stage, cells=[
-            maximum(increases(struck), printed("fig13", "increase_percent", stage)),
-            maximum(_with(struck, faulty(flights, "aad", fault_target=stage))),
+            _maximum(increases(struck), printed("fig13", "increase_percent", stage)),
+            _maximum(_with(struck, faulty(flights, "aad", fault_target=stage))),
             mean_cell(increases(struck)),
         ])  # fmt: skip
 
 
 def _fig13_told(table: PaperTable) -> str:
     return "; ".join(
-        f"{row.labels[0]}: {_told(table, row, 0)}, with AAD {_told(table, row, 1)}"
+        f"{row.labels[0]}: {table.told(row, 0)}, with AAD {table.told(row, 1)}"
         for row in table.rows
     ) or _NOTHING  # fmt: skip
 
@@ -395,17 +378,17 @@ def _fig16(flights: pa.Table) -> Iterator[PaperRow]:
     for (platform,), here in by_value(flights, "platform").items():
         struck = faulty(here)
         yield _row(platform, cells=[
-            mean(golden(here), "flight_time_s"),
-            success(struck),
-            maximum(ratios(struck), printed("fig16", "worst_ratio", platform)),
+            _mean(golden(here), "flight_time_s"),
+            _success(struck),
+            _maximum(ratios(struck), printed("fig16", "worst_ratio", platform)),
             *_recovered(here, "fig16", "recovered_percent", platform),
         ])  # fmt: skip
 
 
 def _fig16_told(table: PaperTable) -> str:
     return "; ".join(
-        f"{row.labels[0]}: worst x {_told(table, row, 2, '')}, GAD recovers "
-        f"{_told(table, row, 3)}, AAD {_told(table, row, 4)}"
+        f"{row.labels[0]}: worst x {table.told(row, 2, '')}, GAD recovers "
+        f"{table.told(row, 3)}, AAD {table.told(row, 4)}"
         for row in table.rows
     ) or _NOTHING  # fmt: skip
 
@@ -421,55 +404,76 @@ _RESULTS: Mapping[str, Callable[[PaperTable], str]] = {
     "table3": _table3_told, "table4": _table4_told, "table5": _table5_told,
 }  # fmt: skip
 
-# Isolated kernels: Fig. 6 ------------------------------------------------------------------------
 
-_OUTCOMES = ("benign", "sdc", "crash", "hang")
-_PAPER_KERNELS = {"control": "pid"}  # the paper's name where it is another
+# Cells --------------------------------------------------------------------------------------------
 
 
-def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
-    """The table of Fig. 6.
+def share_cell(share: Share, paper: Printed = None) -> PaperCell:
+    """A share as per cent."""
+    if not share.total:
+        return PaperCell(paper=paper)
+    return PaperCell(
+        value=PERCENT * share.share,
+        low=PERCENT * share.low,
+        high=PERCENT * share.high,
+        count=share.total,
+        paper=paper,
+    )
+
+
+def _success(flights: pa.Table, paper: Printed = None) -> PaperCell:
+    """Success rate of all flown missions, in per cent, as the paper counts."""
+    return share_cell(share(flights, value=False), paper)
+
+
+def mean_cell(values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
+    """A mean with its bootstrap interval."""
+    found = interval(values, resamples=RESAMPLES)
+    return PaperCell(
+        value=found.value, low=found.low, high=found.high, count=found.count, paper=paper
+    )
+
+
+def _mean(flights: pa.Table, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
+    """Mean of a measure over the successful missions."""
+    return mean_cell(scale * _of_successes(flights, name), paper)
+
+
+def _of_successes(flights: pa.Table, name: str) -> FloatArray:
+    """A measure of the successful missions that have it."""
+    return known(numbers(chosen(flights, lost=False), name))
+
+
+def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
+    """The largest value; it has no interval."""
+    if not len(values):
+        return PaperCell(paper=paper)
+    return PaperCell(value=float(np.max(values)), count=len(values), paper=paper)
+
+
+def increases(flights: pa.Table) -> FloatArray:
+    """Flight times beyond those of the own golden flights, in per cent, where both succeed."""
+    return PERCENT * (ratios(flights) - 1.0)
+
+
+def _worst_mean(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> PaperCell:
+    """The longest flight over the mean golden one, as increase in per cent."""
+    golden_s, times_s = (_of_successes(each, "flight_time_s") for each in (bare, flights))
+    if not (len(golden_s) and len(times_s)):
+        return PaperCell(paper=paper)
+    increase = float(times_s.max() / golden_s.mean()) - 1.0
+    return PaperCell(value=PERCENT * increase, count=len(times_s), paper=paper)
+
+
+def _recovery(protected: pa.Table, measure: str, paper: Printed) -> PaperCell:
+    """What a protection recovers of the worst case, in per cent or in points.
+
+    The worst case is that of the faults that were flown with the protection, too: of more flights
+    the longest is longer.
 
     Args:
-        summary: `kernels.json` of `mavfi kernels`.
+        measure: field of `WorstCase`.
     """
-    rows = []
-    for kernel in summary["kernels"]:
-        name = kernel["kernel"]
-        paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(name, name))
-        shares = [outcome_share(kernel, outcome) for outcome in _OUTCOMES]
-        cells = [share_cell(shares[0], paper), *map(share_cell, shares[1:])]
-        rows.append(_row(kernel["title"], cells=cells))
-    table = BY_NAME["fig6"].table(rows)
-    most = _filled(table, 1)
-    told = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""
-    return replace(table, result=f"{told} (paper: OctoMap)" if most else "no runs")
-
-
-# Performance model: Fig. 15 ----------------------------------------------------------------------
-
-
-def of_model() -> PaperTable:
-    """The table of Fig. 15, of the performance model with the paper's overheads."""
-    item = BY_NAME["fig15"]
-    vehicles = [ModelVehicle.load(column.title) for column in item.columns]
-    told = report(vehicles, Choices(), schemes_with({}))["vehicles"]
-    ratio_of = {
-        (row["scheme"], one["vehicle"]): row["flight_time_ratio"]
-        for one in told
-        for row in one["schemes"]
-    }
-    rows = [
-        _row(scheme, cells=(
-            PaperCell(
-                value=math.nan if (ratio := ratio_of[scheme, name]) is None else float(ratio),
-                paper=printed("fig15", "time_ratio", scheme, name),
-            )
-            for name in (column.title for column in item.columns)
-        ))
-        for scheme in dict.fromkeys(scheme for scheme, _ in ratio_of)
-    ]  # fmt: skip
-    table = item.table(rows)
-    (tmr,) = (row for row in rows if row.labels[0] == "tmr")
-    times = (f"{x.title} {_told(table, tmr, place, '')}" for place, x in enumerate(table.columns))
-    return replace(table, result=f"flight time with TMR: x {', x '.join(times)}")
+    bare, own = known(numbers(protected, "bare_over_own")), ratios(protected)
+    value = PERCENT * getattr(worst_case(OWN, bare.tolist(), own.tolist()), measure)
+    return PaperCell(value=value, count=0 if math.isnan(value) else len(own), paper=paper)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.groups import METRICS, Group, groups
-from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary, outcome_share
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import presets
@@ -20,29 +22,59 @@ from mavfi_cli.core.errors import RecordError, UnknownName
 from mavfi_cli.report.tables.campaign import SettingColumns
 from mavfi_cli.report.tables.paper_table import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.reproduction.flights import beside_golden, flown_missions
-from mavfi_cli.reproduction.items import ITEMS, Item, Source, items_named
-from mavfi_cli.reproduction.layouts import of_flights, of_kernels, of_model
-from mavfi_cli.reproduction.measures import mean_cell, share_cell
-from mavfi_cli.reproduction.plan import KERNELS_FOLDER, FlightsPlan, numbers_of, stored_plan
+from mavfi_cli.reproduction.items import (
+    BY_NAME,
+    ITEMS,
+    KERNELS_FOLDER,
+    FlightsPlan,
+    Item,
+    Source,
+    items_named,
+    printed,
+)
+from mavfi_cli.reproduction.layouts import mean_cell, of_flights, share_cell
 from mavfi_cli.stats.shares import rate
+from mavfi_cli.vpm.model import schemes_with
+from mavfi_cli.vpm.report import Choices, report
+from mavfi_cli.vpm.vehicle import ModelVehicle
 
-ROWS = 14  # of a table on one screen
-WIDE = 2  # columns of settings on one screen
-SETTINGS = "settings"  # name of the table of a user's own campaign
+_ROWS = 14  # of a table on one screen
+_WIDE = 2  # columns of settings on one screen
+_SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
-# Items --------------------------------------------------------------------------------------------
+def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, pa.Table | None]:
+    """The one table of a campaign, and the flights that its figure needs; None if it needs none.
 
+    It is the table of the named item, or of the preset's item. Without one, a reproduction has the
+    table of its items, and another campaign that of its settings.
 
-def item_flights(item: Item | None, ledger: Ledger) -> pa.Table | None:
-    """The flights of an item in a campaign: a reproduction, or one with the item's missions.
-
-    None if the item is not flown, or if there is none.
+    Raises:
+        UnknownName: the campaign flies no item of this name.
+        ConfigError: the paper has it, but it is no experiment.
+        RecordError: the kernels were not run.
     """
-    if item is None or item.source is not Source.FLIGHTS:
-        return None
-    table, plan = beside_golden(flown_missions(flights(ledger))), stored_plan(ledger)
-    return table if plan is None else _flights_of(item, plan, table)
+    item, plan = _item_of(ledger, name), FlightsPlan.stored(ledger)
+    if item is None:
+        return _settings_table(ledger) if plan is None else _progress_table(ledger, plan), None
+    if item.source is not Source.FLIGHTS:
+        return _unflown(item, ledger.folder.parent), None
+    table = beside_golden(flown_missions(flights(ledger)))
+    mine = table if plan is None else _flights_of(item, plan, table)
+    return of_flights(item.name, mine), mine
+
+
+def _item_of(ledger: Ledger, name: str | None) -> Item | None:
+    """The named item of a campaign, or the one of its preset; None if the paper has none."""
+    preset = (ledger.meta("name") or "").partition("-")[0]  # with or without changes
+    own = [item for item in ITEMS if item.preset == preset] if preset in presets() else []
+    if name is None:
+        return min(own, key=lambda item: item.name != preset, default=None)
+    (found,) = items_named([name])
+    known = own if FlightsPlan.stored(ledger) is None else ITEMS
+    if found not in known:
+        raise UnknownName("item of this campaign", name, [each.name for each in known] or ["none"])
+    return found
 
 
 def _flights_of(item: Item, plan: FlightsPlan, table: pa.Table) -> pa.Table:
@@ -68,6 +100,12 @@ def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
         yield of_flights(item.name, _flights_of(item, plan, table))
 
 
+# Items that are not flown: Figs. 6 and 15 --------------------------------------------------------
+
+_OUTCOMES = ("benign", "sdc", "crash", "hang")
+_PAPER_KERNELS = {"control": "pid"}  # the paper's name where it is another
+
+
 def _unflown(item: Item, out: Path) -> PaperTable:
     if item.source is Source.MODEL:
         return of_model()
@@ -77,54 +115,53 @@ def _unflown(item: Item, out: Path) -> PaperTable:
     return of_kernels(kernel_summary(path))
 
 
-def _preset_of(ledger: Ledger) -> str | None:
-    """The preset that a campaign was begun from, with or without changes; None of others."""
-    name = ledger.meta("name") or ""
-    found = name.partition("-")[0]
-    return found if found in presets() else None
-
-
-def item_of(ledger: Ledger) -> Item | None:
-    """The paper's item of a campaign; None if the paper has none."""
-    preset = _preset_of(ledger)
-    found = [item for item in ITEMS if preset and item.preset == preset]
-    return min(found, key=lambda item: item.name != preset, default=None)
-
-
-def asked_item(ledger: Ledger, name: str | None) -> Item | None:
-    """The named item of a campaign, or the one of its preset.
-
-    Raises:
-        UnknownName: the campaign flies no such item.
-        ConfigError: the paper has it, but it is no experiment.
-    """
-    if name is None:
-        return item_of(ledger)
-    preset = _preset_of(ledger)
-    whole = stored_plan(ledger) is not None
-    known = [each.name for each in ITEMS if whole or (each.preset and each.preset == preset)]
-    (found,) = items_named([name])
-    if found.name not in known:
-        raise UnknownName("item of this campaign", name, known or ["none"])
-    return found
-
-
-def table_of(ledger: Ledger, item: Item | None, flights: pa.Table | None) -> PaperTable:
-    """The one table of a campaign: an item's, the items of a reproduction, or the settings.
+def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
+    """The table of Fig. 6.
 
     Args:
-        flights: as `item_flights`.
-
-    Raises:
-        RecordError: the kernels were not run.
+        summary: `kernels.json` of `mavfi kernels`.
     """
-    if item is not None and flights is not None:
-        return of_flights(item.name, flights)
-    if item is not None:
-        return _unflown(item, ledger.folder.parent)
-    if stored_plan(ledger) is not None:
-        return _progress_table(ledger)
-    return _settings_table(ledger)
+    rows = []
+    for kernel in summary["kernels"]:
+        name = kernel["kernel"]
+        paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(name, name))
+        shares = [outcome_share(kernel, outcome) for outcome in _OUTCOMES]
+        cells = (share_cell(shares[0], paper), *map(share_cell, shares[1:]))
+        rows.append(PaperRow(labels=(kernel["title"],), cells=cells))
+    table = BY_NAME["fig6"].table(rows)
+    most = table.ranked(1)
+    told = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""
+    return replace(table, result=f"{told} (paper: OctoMap)" if most else "no runs")
+
+
+def of_model() -> PaperTable:
+    """The table of Fig. 15, of the performance model with the paper's overheads."""
+    item = BY_NAME["fig15"]
+    vehicles = [ModelVehicle.load(column.title) for column in item.columns]
+    told = report(vehicles, Choices(), schemes_with({}))["vehicles"]
+    ratio_of = {
+        (row["scheme"], one["vehicle"]): row["flight_time_ratio"]
+        for one in told
+        for row in one["schemes"]
+    }
+    rows = {
+        scheme: PaperRow(labels=(scheme,), cells=tuple(
+            PaperCell(
+                value=math.nan if (ratio := ratio_of[scheme, name]) is None else float(ratio),
+                paper=printed("fig15", "time_ratio", scheme, name),
+            )
+            for name in (column.title for column in item.columns)
+        ))
+        for scheme, _ in ratio_of
+    }  # fmt: skip
+    table = item.table([*rows.values()])
+    times = (
+        f"{x.title} {table.told(rows['tmr'], place, '')}" for place, x in enumerate(table.columns)
+    )
+    return replace(table, result=f"flight time with TMR: x {', x '.join(times)}")
+
+
+# Campaigns that are no item's --------------------------------------------------------------------
 
 
 def _settings_table(ledger: Ledger) -> PaperTable:
@@ -135,7 +172,7 @@ def _settings_table(ledger: Ledger) -> PaperTable:
     found = groups(ledger)
     settings = SettingColumns.of([group.labels for group in found])
     return PaperTable(
-        name=SETTINGS,
+        name=_SETTINGS,
         title=f"{ledger.meta('name') or ledger.folder.name}: settings",
         labels=settings.heads,
         columns=(
@@ -165,15 +202,13 @@ def _success(group: Group) -> PaperCell:
     return share_cell(rate(int(won.sum()), len(won)))
 
 
-def _progress_table(ledger: Ledger) -> PaperTable:
+def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
     """How much of each item of a reproduction is flown."""
-    plan = stored_plan(ledger)
-    assert plan is not None
     over = {number for number, _ in ledger.fates()}
     rows = []
     for item in plan.items:
         if item.preset:
-            numbers = numbers_of(ledger, plan.keys(item))
+            numbers = plan.numbers(ledger, item)
             done = sum(number in over for number in numbers)
             counts = (float(done), 100.0 * done / len(numbers))
             cells = tuple(PaperCell(value=value, count=len(numbers)) for value in counts)
@@ -190,15 +225,15 @@ def _progress_table(ledger: Ledger) -> PaperTable:
 
 def short(table: PaperTable) -> PaperTable:
     """The table cut to one screen: its first rows, and of settings the first columns."""
-    wide = len(table.columns) if table.name != SETTINGS else WIDE
+    wide = len(table.columns) if table.name != _SETTINGS else _WIDE
     left = [column.title.partition(",")[0] for column in table.columns[wide:]]
-    left += [f"{len(table.rows) - ROWS} more rows"] if len(table.rows) > ROWS else []
+    left += [f"{len(table.rows) - _ROWS} more rows"] if len(table.rows) > _ROWS else []
     if not left:
         return table
     return replace(
         table,
         columns=table.columns[:wide],
-        rows=tuple(replace(row, cells=row.cells[:wide]) for row in table.rows[:ROWS]),
+        rows=tuple(replace(row, cells=row.cells[:wide]) for row in table.rows[:_ROWS]),
         notes=(f"mavfi campaign report has {', '.join(left)}", *table.notes),
     )
 

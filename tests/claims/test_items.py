@@ -9,10 +9,10 @@ from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.claims import items
 from mavfi_cli.claims.sources import STACKS
 from mavfi_cli.reproduction.flights import flown_missions, pooled
-from mavfi_cli.reproduction.items import BY_NAME
-from mavfi_cli.reproduction.plan import kinds_of
+from mavfi_cli.reproduction.items import BY_NAME, FlightsPlan
 
 FIG13 = BY_NAME["fig13"]
+KINDS = FlightsPlan(items=[FIG13], stack="mavbench").kinds()
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def shown(monkeypatch):
 def export(seed, folder=None):
     """The missions of Fig. 13 with a seed, whose run folders are this one."""
     rows = []
-    for place, mission in enumerate(kinds_of([FIG13], "mavbench")):
+    for place, mission in enumerate(KINDS):
         changes = {**changes_of(mission.config), "seed": seed}
         level = "instruction" if mission.config.instruction else None
         rows.append(
@@ -51,9 +51,8 @@ def export(seed, folder=None):
 
 
 def test_the_campaign_that_kept_its_runs_is_drawn(shown, tmp_path):
-    kinds = len(kinds_of([FIG13], "mavbench"))
     found = shown(export(1), export(2, tmp_path))
-    assert found.figure == [str(tmp_path)] * kinds
+    assert found.figure == [str(tmp_path)] * len(KINDS)
     assert found.table is not None
 
 

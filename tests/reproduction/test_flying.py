@@ -14,9 +14,8 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.reproduction import flying
-from mavfi_cli.reproduction.items import BY_NAME, items_named
-from mavfi_cli.reproduction.plan import FlightsPlan, missions_of, stored_plan
-from mavfi_cli.reproduction.status import item_flights, table_of
+from mavfi_cli.reproduction.items import FlightsPlan, items_named
+from mavfi_cli.reproduction.status import shown
 from mavfi_cli.spec.mission import MissionConfig
 
 TASK = Options(jobs=2, task="fake_task")
@@ -51,15 +50,14 @@ def over(asked):
 
 def test_only_the_missions_of_the_named_items_are_flown(tmp_path):
     asked = plan(tmp_path, "fig9")
-    assert flown(asked).missions == len(missions_of(asked.items, "mavbench", SCALE)) == 8
+    assert flown(asked).missions == len(asked.missions()) == 8
     with Ledger(asked.folder) as ledger:
         assert (ledger.over(), ledger.planned()) == (8, 356)
-        assert stored_plan(ledger).scale == SCALE
-        fig9 = BY_NAME["fig9"]
-        assert item_flights(fig9, ledger).num_rows == 8
-        assert item_flights(BY_NAME["fig6"], ledger) is None
-        assert item_flights(BY_NAME["table3"], ledger).num_rows == 2  # the golden ones, shared
-        assert table_of(ledger, fig9, item_flights(fig9, ledger)).rows[0].cells[0].count == 2
+        assert FlightsPlan.stored(ledger).scale == SCALE
+        table, flights = shown(ledger, "fig9")
+        assert (table.rows[0].cells[0].count, flights.num_rows) == (2, 8)
+        assert shown(ledger, "fig15")[1] is None
+        assert shown(ledger, "table3")[1].num_rows == 2  # the golden ones, shared
     more = flown(plan(tmp_path, "table3"))
     assert (more.missions, more.over) == (8, 2)
     assert over(asked) == 14
@@ -79,12 +77,13 @@ def test_the_forecast_comes_from_missions_that_count(tmp_path):
 
 
 def test_run_folders_are_kept_for_the_pictures(tmp_path):
-    asked = plan(tmp_path, "fig13", "fig9")
+    asked = plan(tmp_path, "fig11", "fig13", "fig9")
     flown(asked)
     with Ledger(asked.folder) as ledger:
         kept = [each.number for each in ledger.results() if each.path is not None]
-        drawn = item_flights(BY_NAME["fig13"], ledger)["number"].to_pylist()
-    assert kept == drawn != []
+        drawn = [shown(ledger, name)[1]["number"].to_pylist() for name in ("fig11", "fig13")]
+        assert kept == sorted({*drawn[0], *drawn[1]}) == asked.kept(ledger)
+    assert all(drawn)
 
 
 class _Killer(Spectator):
@@ -149,7 +148,7 @@ def test_other_versions_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="begun with other versions"):
         flown(plan(tmp_path, "fig9", scale=0.03))
     with Ledger(asked.folder) as ledger:
-        assert stored_plan(ledger).scale == SCALE  # nothing was changed
+        assert FlightsPlan.stored(ledger).scale == SCALE  # nothing was changed
 
 
 def test_a_full_disk_is_told_before_the_flights(tmp_path, monkeypatch):

@@ -8,7 +8,8 @@ import pytest
 from made_flights import flight, struck, table
 
 from mavfi_cli.reproduction.items import ITEMS, Source, printed
-from mavfi_cli.reproduction.layouts import OF_FLIGHTS, of_flights, of_kernels, of_model
+from mavfi_cli.reproduction.layouts import OF_FLIGHTS, of_flights
+from mavfi_cli.reproduction.status import of_kernels, of_model
 
 KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
 

@@ -2,24 +2,37 @@
 
 import pytest
 
+from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.campaigns.specification_file import load_spec
 from mavfi_cli.core.errors import ConfigError, UnknownName
-from mavfi_cli.reproduction.items import BY_NAME, ITEMS, LEFT_OUT, Source, items_named
-from mavfi_cli.reproduction.plan import kept_keys, key_of, missions_of
+from mavfi_cli.reproduction.items import (
+    BY_NAME,
+    ITEMS,
+    LEFT_OUT,
+    FlightsPlan,
+    Source,
+    items_named,
+)
 
 SCALE = 0.02
-WHOLE = missions_of(ITEMS, "mavbench", SCALE)
+
+
+def missions(items=ITEMS, stack="mavbench", scale=SCALE):
+    return FlightsPlan(items=items, stack=stack, scale=scale).missions()
+
+
+WHOLE = missions()
 
 
 def keys(missions):
-    return [key_of(each) for each in missions]
+    return [canonical(changes_of(each.config)) for each in missions]
 
 
 @pytest.mark.parametrize("item", [each for each in ITEMS if each.preset], ids=lambda i: i.name)
 def test_the_whole_list_has_the_missions_of_each_preset(item):
     flown = load_spec(item.preset).scaled(SCALE).missions()
     assert set(keys(flown)) <= set(keys(WHOLE))
-    assert sorted(keys(missions_of([item], "mavbench", SCALE))) == sorted(keys(flown))
+    assert sorted(keys(missions([item]))) == sorted(keys(flown))
 
 
 def test_shared_missions_stand_once():
@@ -30,20 +43,14 @@ def test_shared_missions_stand_once():
 
 
 def test_a_larger_scale_flies_the_smaller_one_as_well():
-    larger = missions_of(ITEMS, "mavbench", 2 * SCALE)
+    larger = missions(scale=2 * SCALE)
     assert set(keys(WHOLE)) < set(keys(larger))
 
 
 def test_another_stack_flies_the_same_missions():
-    ours = missions_of(ITEMS, "hardened", SCALE)
+    ours = missions(stack="hardened")
     assert {each.config.stack for each in ours} == {"hardened"}
     assert [each.config.seed for each in ours] == [each.config.seed for each in WHOLE]
-
-
-def test_run_folders_are_kept_where_an_item_draws_flights():
-    kept = kept_keys(ITEMS, "mavbench", SCALE)
-    drawn = missions_of([BY_NAME["fig11"], BY_NAME["fig13"]], "mavbench", SCALE)
-    assert kept == set(keys(drawn))
 
 
 def test_an_item_has_a_preset_or_another_source():

@@ -9,7 +9,6 @@ from test_flying import TASK, flown, no_vehicle, plan  # noqa: F401
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.run import run_campaign
 from mavfi_cli.campaigns.specification_file import load_spec
-from mavfi_cli.cli.reproduce import forecast_line
 from mavfi_cli.reproduction.flying import Forecast
 
 
@@ -56,14 +55,14 @@ def test_one_item_is_shown_whole(tmp_path, mavfi):
 
 
 def test_the_forecast_is_one_line():
-    told = forecast_line(
-        Forecast(missions=100, over=10, seconds=3700, disk_bytes=2.5e6, measured=10, jobs=2, runs=7)
+    forecast = Forecast(
+        missions=100, over=10, seconds=3700, disk_bytes=2.5e6, measured=10, jobs=2, runs=7
     )
-    assert told == (
+    assert forecast.told == (
         "100 missions, 10 of them flown; 7 runs of kernels; what is left takes about 1:01:40 h on "
         "this machine (2 at a time, from 10 missions) and 2 MB"
     )
-    assert forecast_line(Forecast(missions=8, over=8)) == "8 missions, 8 of them flown"
+    assert Forecast(missions=8, over=8).told == "8 missions, 8 of them flown"
 
 
 def test_unknown_items_are_usage_errors(mavfi, tmp_path):

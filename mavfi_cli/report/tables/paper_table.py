@@ -99,6 +99,17 @@ class PaperTable:
         """Whether the paper prints anything in a column."""
         return any(row.cells[place].paper is not None for row in self.rows)
 
+    def told(self, row: PaperRow, place: int, unit: str = " %") -> str:
+        """Our number in a row and a column, with the paper's in brackets if it prints one."""
+        column, cell = self.columns[place], row.cells[place]
+        paper = column.printed(cell.paper)
+        return f"{column.told(cell.value)}{unit}" + (f" (paper {paper}{unit})" if paper else "")
+
+    def ranked(self, place: int) -> list[PaperRow]:
+        """The rows with a number in a column, the largest first."""
+        rows = [row for row in self.rows if not math.isnan(row.cells[place].value)]
+        return sorted(rows, key=lambda row: -row.cells[place].value)
+
 
 def _ours(column: PaperColumn, cell: PaperCell) -> str:
     value = column.told(cell.value)
