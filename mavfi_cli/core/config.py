@@ -9,7 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import cattrs
 from cattrs import AttributeValidationNote, IterableValidationNote
@@ -186,11 +186,19 @@ def _strict(kind: type, *accepted: type) -> Any:
     return hook
 
 
-def _shaped(accepted: Any, wanted: str, structured: Any, known: Sequence[str] = ()) -> Any:
+def _shaped(
+    accepted: Any,
+    wanted: str,
+    structured: Any,
+    known: Sequence[str] = (),
+    length: int | None = None,
+) -> Any:
     def hook(value: Any, cls: Any) -> Any:
         """Raise TypeError for another shape (text is an array of letters), _Extra for its keys."""
         if not isinstance(value, accepted):
             raise TypeError(f"expected {wanted}, got {value!r}")
+        if length is not None and len(value) != length:
+            raise TypeError(f"expected {length} values, got {len(value)}")
         if known and (extra := [key for key in value if key not in known]):
             raise _Extra(extra[0], known)
         return structured(value, cls)
@@ -224,7 +232,9 @@ def _converter() -> cattrs.Converter:
         arrays.add(cls)
         structured = converter.get_structure_hook(cls, cache_result=False)
         arrays.remove(cls)
-        return _shaped((list, tuple), "an array", structured)
+        items = get_args(cls)
+        length = len(items) if _origin(cls) is tuple and ... not in items else None
+        return _shaped((list, tuple), "an array", structured, length=length)
 
     return converter
 
@@ -246,23 +256,35 @@ def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
 
 
 def _line_of(text: str, key: str) -> int | None:
-    """Find the line that sets the last part of a dotted key, by a search of the text."""
-    parts = [part for part in key.replace("[", ".[").split(".") if part and part[0] != "["]
-    if not text or not parts:
-        return None
-    section = ".".join(parts[:-1])
-    current, fallback = "", None
+    """Find the line that sets a dotted key, or the head of its table, by a search of the text."""
+    section, _, last = key.rpartition(".")
+    last = last.partition("[")[0]
+    current, head = "", None
+    counts: dict[str, int] = {}  # tables so far of each array of tables
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()
         if stripped.startswith("["):
-            current = stripped.strip("[] ").split("]")[0]
+            current = _table_of(stripped, counts)
             if current == key:
                 return number
-        elif stripped.split("=")[0].strip().strip('"') == parts[-1]:
-            if current == section:
-                return number
-            fallback = fallback or number
-    return fallback
+            head = number if current == section else head
+        elif current == section and stripped.split("=")[0].strip().strip('"') == last:
+            return number
+    return head
+
+
+def _table_of(head: str, counts: dict[str, int]) -> str:
+    """Return the name of the table that a head opens, with its place in an array of tables."""
+    parts = head.strip("[ ").split("]")[0].split(".")
+    names = [".".join(parts[: end + 1]).strip() for end in range(len(parts))]
+    if head.startswith("[["):
+        counts[names[-1]] = counts.get(names[-1], -1) + 1
+        for inner in [name for name in counts if name.startswith(f"{names[-1]}.")]:
+            del counts[inner]
+    return ".".join(
+        f"{part.strip()}[{counts[name]}]" if name in counts else part.strip()
+        for part, name in zip(parts, names, strict=True)
+    )
 
 
 def require_distinct(names: Sequence[str], key: str) -> None:

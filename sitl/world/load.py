@@ -19,13 +19,13 @@ of a fixed scene thus gives a different mission.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.core.config import read_toml, structure, toml_text
-from mavfi_cli.core.errors import ConfigError, UnknownName, WorldError
+from mavfi_cli.core.config import load_toml, toml_text
+from mavfi_cli.core.errors import UnknownName, WorldError
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream, generator
 from sitl.world.world import (
@@ -127,24 +127,31 @@ def _pair_of_spec(text: str) -> GeneratorParams | None:
     return GeneratorParams(density=density, size_m=size)
 
 
+_Triple = tuple[float, float, float]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Box:
     """One obstacle with its corners in ENU, m."""
 
-    min_enu_m: list[float]
-    max_enu_m: list[float]
+    min_enu_m: _Triple
+    max_enu_m: _Triple
+
+    def __post_init__(self) -> None:
+        if any(high <= low for low, high in zip(self.min_enu_m, self.max_enu_m, strict=True)):
+            raise ValueError("max_enu_m must be beyond min_enu_m along each axis")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Scene:
-    bounds_enu_m: list[float]
+    bounds_enu_m: tuple[float, float, float, float, float, float]
     name: str = ""
     description: str = ""
-    start_enu_m: list[float] | None = None
-    goal_enu_m: list[float] | None = None
+    start_enu_m: _Triple | None = None
+    goal_enu_m: _Triple | None = None
     flight_height_m: float = 5.0
-    goal_distance_m: list[float] | None = None  # horizontal limits, start to goal
-    box: list[_Box] | None = None
+    goal_distance_m: tuple[float, float] = (45.0, 55.0)  # horizontal limits, start to goal
+    box: list[_Box] = field(default_factory=list)
 
 
 def read_scene(path: Path) -> _Scene:
@@ -155,43 +162,7 @@ def read_scene(path: Path) -> _Scene:
             of coordinates is wrong, or the max of a box is not beyond its min. Names file, line and
             key.
     """
-    data, text = read_toml(path)
-    scene = structure(data, _Scene, path=path, text=text)
-    _refuse_bad_lengths(scene, path, text)
-    return scene
-
-
-def _refuse_bad_lengths(scene: _Scene, path: Path, text: str) -> None:
-    lengths = {"bounds_enu_m": 6, "start_enu_m": 3, "goal_enu_m": 3, "goal_distance_m": 2}
-    for key, length in lengths.items():
-        value = getattr(scene, key)
-        if value is not None and len(value) != length:
-            line = _line_of_key(text, key)
-            problem = f"expected {length} numbers, got {len(value)}"
-            raise ConfigError(problem, path=path, line=line, key=key)
-    for index, box in enumerate(scene.box or []):
-        line = _line_of_box(text, index)
-        for key in ("min_enu_m", "max_enu_m"):
-            count = len(getattr(box, key))
-            if count != 3:
-                problem = f"expected 3 numbers, got {count}"
-                raise ConfigError(problem, path=path, line=line, key=f"box[{index}].{key}")
-        if any(high <= low for low, high in zip(box.min_enu_m, box.max_enu_m, strict=True)):
-            problem = "must be beyond min_enu_m along each axis"
-            raise ConfigError(problem, path=path, line=line, key=f"box[{index}].max_enu_m")
-
-
-def _line_of_key(text: str, key: str) -> int | None:
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.split("=")[0].strip() == key:
-            return number
-    return None
-
-
-def _line_of_box(text: str, index: int) -> int | None:
-    lines = enumerate(text.splitlines(), start=1)
-    headers = [number for number, line in lines if line.replace(" ", "").startswith("[[box]]")]
-    return headers[index] if index < len(headers) else None
+    return load_toml(path, _Scene)
 
 
 def _world_of_scene(
@@ -202,7 +173,7 @@ def _world_of_scene(
     Raises:
         WorldError: Start or goal is unusable, or the seed finds no clear position for it.
     """
-    boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box or []]).reshape(-1, 6)
+    boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box]).reshape(-1, 6)
     bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
     if (bounds[3:] <= bounds[:3]).any():
         raise WorldError(f"world {name!r}: bounds_enu_m has max <= min")
@@ -234,7 +205,7 @@ def _choose(
 ) -> tuple[Vector, Vector]:
     """Draw missing start and goal until they are clear and at the scene's distance."""
     stream = generator(seed, Stream.WORLD, "places", scene.name)
-    least, most = scene.goal_distance_m or [45.0, 55.0]
+    least, most = scene.goal_distance_m
     low, high = bounds[:2] + CLEAR_RADIUS_M, bounds[3:5] - CLEAR_RADIUS_M
     for _ in range(_TRIES):
         plan = np.round(stream.uniform(low, np.maximum(low, high), size=(2, 2)), 1)

@@ -57,6 +57,12 @@ def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
     [
         ("name = 3\nbox = []", r"file\.toml:1: name: expected text, got 3"),
         ('name = "x"\n[[box]]\na = "k"', r"file\.toml:3: box\[0\]\.a: expected a number, got 'k'"),
+        (
+            'name = "x"\n[[box]]\na = 1\n[[box]]\na = "k"',
+            r"file\.toml:5: box\[1\]\.a: expected a number, got 'k'",
+        ),
+        ('name = "x"\n[[box]]\na = 1\n[[box]]\nb = 1', r"file\.toml:4: box\[1\]\.a: is missing"),
+        ('name = "x"\nbox = []\npair = [1]', r"file\.toml:3: pair: expected 2 values, got 1"),
         ('name = "x"\nbox = []\npair = [1, true]', r"pair\[1\]: expected a number, got True"),
         ('name = "x"\n[[box]]\na = nan', "expected a finite number"),
         ('name = "x"\nbox = []\n[sub]\nb = 1', r"sub\.a: is missing"),

@@ -120,9 +120,9 @@ def test_unusable_places_say_why_in_one_line(arguments: dict[str, tuple[float]],
         ("[20, 20, 5]", "[20, 20,, 5]", 4, "Invalid value"),
         ("goal_enu_m", "gaol_enu_m", 4, "did you mean 'goal_enu_m'"),
         ("max_enu_m", "maximum", 8, "maximum"),
-        ("[8, 9, 10]", "[8, 4, 10]", 6, r"box\[0\]\.max_enu_m: must be beyond"),
-        ("[8, 9, 10]", "[8, 9]", 6, "expected 3 numbers, got 2"),
-        ("[20, 20, 5]", "[20, 20]", 4, "expected 3 numbers, got 2"),
+        ("[8, 9, 10]", "[8, 4, 10]", 6, r"box\[0\]: max_enu_m must be beyond"),
+        ("[8, 9, 10]", "[8, 9]", 8, "expected 3 values, got 2"),
+        ("[20, 20, 5]", "[20, 20]", 4, "expected 3 values, got 2"),
         ("[20, 20, 5]", "[20, 20, nan]", 4, "finite"),
         ("[5, 5, 0]", '["a", 5, 0]', None, "expected a number"),
     ],
@@ -138,9 +138,13 @@ def test_a_malformed_file_says_where(
     assert "\n" not in text
 
 
-def test_a_second_bad_box_is_found_on_its_own_line(yard: Path) -> None:
-    yard.write_text(YARD + "\n[[box]]\nmin_enu_m = [1, 1, 1]\nmax_enu_m = [1, 2, 2]\n")
-    with pytest.raises(ConfigError, match=r"yard\.toml:10: box\[1\]"):
+@pytest.mark.parametrize(
+    ("most", "line"), [("[1, 2, 2]", 10), ('["a", 2, 2]', 12), ("[2, 2]", 12), (None, 10)]
+)
+def test_a_second_bad_box_is_found_on_its_own_line(yard: Path, most: str, line: int) -> None:
+    end = f"max_enu_m = {most}\n" if most else ""  # else it is missing
+    yard.write_text(f"{YARD}\n[[box]]\nmin_enu_m = [1, 1, 1]\n{end}")
+    with pytest.raises(ConfigError, match=rf"yard\.toml:{line}: box\[1\]"):
         load_world(str(yard), seed=0)
 
 
