@@ -6,6 +6,7 @@ worker with n threads flies n missions at a time.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import json
 import queue
@@ -203,8 +204,9 @@ def _workers(task: str) -> LocalWorkers:
 
 @cache
 def _scratch() -> Path:
-    """A folder of this worker; profiles of instruction-level faults stay in it."""
+    """A folder of this worker, until it ends; profiles of instruction-level faults stay in it."""
     folder = Path(tempfile.mkdtemp(prefix="mavfi-worker-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     (folder / "profiles").mkdir()
     return folder
 

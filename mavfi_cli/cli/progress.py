@@ -101,7 +101,7 @@ class _MissionsView(Spectator):
 
     def on_progress(self, progress: Progress) -> None:
         last = progress.over == progress.total
-        self._screen.update(progress_line(progress), progress.elapsed_s, last=last)
+        self._screen.update(_progress_line(progress), progress.elapsed_s, last=last)
 
     def on_end(self, progress: Progress) -> None:
         if line := _end_line(progress):
@@ -114,7 +114,7 @@ class _MissionsView(Spectator):
         self._screen.update(text, elapsed_s)
 
 
-class RunsView:
+class _RunsView:
     """Runs of isolated kernels: which kernel, how many runs, and the time left."""
 
     def __init__(self, screen: _Lines, kernels: Sequence[str], runs: int) -> None:
@@ -146,10 +146,10 @@ class RunsView:
 
 
 @contextmanager
-def runs_view(kernels: Sequence[str], runs: int) -> Iterator[RunsView]:
+def runs_view(kernels: Sequence[str], runs: int) -> Iterator[_RunsView]:
     """The view of runs of isolated kernels for stderr."""
     with _screen(PLAIN_EVERY_S) as screen:
-        yield RunsView(screen, kernels, runs)
+        yield _RunsView(screen, kernels, runs)
 
 
 @contextmanager
@@ -181,7 +181,7 @@ def _flight_line(progress: FlightProgress) -> str:
     )
 
 
-def progress_line(progress: Progress) -> str:
+def _progress_line(progress: Progress) -> str:
     """One line: missions, rate, remaining time, success rates so far."""
     parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
     if progress.eta_s is not None:

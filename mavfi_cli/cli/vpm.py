@@ -96,8 +96,7 @@ def vpm(
     """
     from mavfi_cli.core.config import require_distinct
     from mavfi_cli.core.files import plain
-    from mavfi_cli.report.tables.model import model_csv, model_lines
-    from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
+    from mavfi_cli.report.tables.model import model_csv, model_lines, redundancy_csv
     from mavfi_cli.vpm.model import schemes_with
     from mavfi_cli.vpm.report import report
     from mavfi_cli.vpm.vehicle import ModelVehicle
@@ -128,10 +127,8 @@ def vpm(
     elif as_csv:
         click.echo(redundancy_csv(told["flights"]) if fly else model_csv(told), nl=False)
     else:
-        lines = [*model_lines(told), *(redundancy_lines(told["flights"]) if fly else [])]
-        if files:
-            lines += ["", f"Files  {out}: {', '.join(files)}"]
-        click.echo("\n".join(lines))
+        written = ["", f"Files  {out}: {', '.join(files)}"] if files else []
+        click.echo("\n".join([*model_lines(told), *written]))
 
 
 def overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
@@ -219,8 +216,7 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
         draw_redundancy_plot,
         draw_roofline_plot,
     )
-    from mavfi_cli.report.tables.model import model_csv
-    from mavfi_cli.report.tables.redundancy import redundancy_csv
+    from mavfi_cli.report.tables.model import model_csv, redundancy_csv
 
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)

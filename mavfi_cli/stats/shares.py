@@ -10,6 +10,8 @@ from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
 
+_LEAST = 1e-6  # margins and differences below take more missions than anybody flies
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Share:
@@ -89,10 +91,12 @@ def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: flo
         expected: expected rate; 0.5 is the worst case.
 
     Raises:
-        ConfigError: the margin is not between 0 and 0.5, or the rate not within 0 and 1.
+        ConfigError: the margin is below a millionth or not below 0.5, or the rate is not within 0
+            and 1.
     """
-    if not 0.0 < margin < 0.5:
-        raise ConfigError(f"must be between 0 and 0.5, got {margin:g}", key="margin")
+    if not _LEAST <= margin < 0.5:
+        told = f"must be at least {_LEAST:g} and below 0.5, got {margin:g}"
+        raise ConfigError(told, key="margin")
     if not 0.0 <= expected <= 1.0:
         raise ConfigError(f"must be within 0 and 1, got {expected:g}", key="expected")
     z2 = z_of(confidence) ** 2
@@ -110,12 +114,13 @@ def pairs_for_difference(
     the difference (R. J. Connor, Biometrics 43, 1987).
 
     Raises:
-        ConfigError: the difference is 0, or the share of differing pairs does not allow it.
+        ConfigError: the difference is below a millionth, or the share of differing pairs does not
+            allow it.
     """
-    if not 0.0 < abs(difference) <= discordant <= 1.0:
+    if not _LEAST <= abs(difference) <= discordant <= 1.0:
         raise ConfigError(
-            "a difference d and a share q of pairs that differ need 0 < d <= q <= 1, got "
-            f"d = {difference:g}, q = {discordant:g}"
+            f"a difference d and a share q of pairs that differ need {_LEAST:g} <= d <= q <= 1, "
+            f"got d = {difference:g}, q = {discordant:g}"
         )
     if not 0.0 < power < 1.0:
         raise ConfigError(f"must be between 0 and 1, got {power:g}", key="power")

@@ -13,7 +13,7 @@ from mavfi_cli.core.files import plain
 from mavfi_cli.mission.record.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model_plots import draw_flight_plot
-from mavfi_cli.report.tables.redundancy import redundancy_csv, redundancy_lines
+from mavfi_cli.report.tables.model import model_lines, redundancy_csv
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.model import SCHEMES
@@ -145,7 +145,7 @@ def test_only_successes_count(spark):
 def test_a_scheme_that_is_not_flown_says_why(spark):
     told = spark(refused=("tmr",))
     assert rows_of(told)["tmr"]["problem"] == "too heavy to fly"
-    lines = redundancy_lines(told["flights"])
+    lines = model_lines(told)
     assert "tmr: not flown: too heavy to fly" in lines
     rows = redundancy_csv(told["flights"]).splitlines()
     assert len(rows) == 6
@@ -153,7 +153,7 @@ def test_a_scheme_that_is_not_flown_says_why(spark):
 
 
 def test_the_table_tells_overheads_side_by_side(spark):
-    text = "\n".join(redundancy_lines(spark()["flights"]))
+    text = "\n".join(model_lines(spark()))
     assert "aad       0.1 %     0.1 %         0.0062 %  9 in 3 flights  5 %" in text
     assert "none: flown with acceleration 8 m/s² instead of 9.171 m/s²" in text
     assert "no detector" in text
@@ -162,7 +162,8 @@ def test_the_table_tells_overheads_side_by_side(spark):
 
 
 def test_what_has_no_number_has_none_in_the_table(spark):
-    lines = redundancy_lines(spark({"dmr": {"outcome": "collision"}}, count=1)["flights"])
+    lines = model_lines(spark({"dmr": {"outcome": "collision"}}, count=1))
+    lines = lines[next(n for n, line in enumerate(lines) if line.startswith("Flights in")) :]
     text = "\n".join(lines)
     assert "nan" not in text
     assert max(map(len, lines)) <= 100
@@ -171,7 +172,7 @@ def test_what_has_no_number_has_none_in_the_table(spark):
 
 
 def test_a_detector_that_does_not_know_these_flights(spark):
-    text = "\n".join(redundancy_lines(spark({"aad": {"alarms": 683}})["flights"]))
+    text = "\n".join(model_lines(spark({"aad": {"alarms": 683}})))
     assert "aad: 683 alarms in a flight without a fault: its model was fitted to other" in text
 
 

@@ -130,6 +130,21 @@ def test_a_cluster_that_loses_a_worker_has_the_results_of_the_local_run(
 
 
 @pytest.mark.slow
+def test_a_worker_that_ends_leaves_no_folder_behind(cluster, monkeypatch, tmp_path):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    worker = cluster.worker()
+    runner = start(tmp_path / "remote", cluster, "fly")
+    _, err = runner.communicate(timeout=START_S)
+    assert runner.returncode == 0, err
+    assert list(scratch.glob("mavfi-worker-*"))
+    worker.terminate()
+    worker.wait(START_S)
+    assert not list(scratch.glob("mavfi-worker-*"))
+
+
+@pytest.mark.slow
 def test_a_worker_of_another_version_is_named_and_refused(cluster, tmp_path):
     cluster.worker(("-c", OTHER_BUILD))
     runner = start(tmp_path / "remote", cluster, "fly")

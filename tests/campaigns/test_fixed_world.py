@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.campaigns import begin as beginning
-from mavfi_cli.campaigns.begin import begin, stored_spec
+from mavfi_cli.campaigns.begin import SEARCH, begin, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.specification import FixedWorld
 from mavfi_cli.campaigns.specification_file import parse_spec, replaced, to_toml
-from mavfi_cli.campaigns.world_search import SEARCH
 from mavfi_cli.core.errors import ConfigError, UnknownKey
 
 SPEC = """

@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 
 from mavfi_cli.campaigns.progress import Progress
-from mavfi_cli.cli.progress import missions_view, progress_line
+from mavfi_cli.cli.progress import missions_view
 
 
 def progress(over, outcomes, **changes):
@@ -17,28 +17,38 @@ def progress(over, outcomes, **changes):
     return Progress(**(values | changes))
 
 
-def test_the_line_tells_missions_rate_time_left_and_the_success_of_each_setting():
+@pytest.fixture
+def line_of(capsys):
+    def shown(progress):
+        with missions_view(quiet=False) as spectator:
+            spectator.on_progress(progress)
+        return capsys.readouterr().err.rstrip("\n")
+
+    return shown
+
+
+def test_the_line_tells_missions_rate_time_left_and_the_success_of_each_setting(line_of):
     outcomes = {
         "golden": Counter(success=10),
         "FI": Counter(success=7, collision=1),
         "D&R(G)": Counter(success=1, timeout=1),
         "D&R(A)": Counter(),
     }
-    assert progress_line(progress(20, outcomes)) == (
+    assert line_of(progress(20, outcomes)) == (
         "20/100 missions, 2 flying, 2000 an hour, 2:24 min to go, "
         "90.0 % success (golden 100.0, FI 87.5, D&R(G) 50.0)"
     )
 
 
 @pytest.mark.parametrize("settings", [1, 7])
-def test_one_setting_or_many_are_told_by_one_rate(settings):
+def test_one_setting_or_many_are_told_by_one_rate(line_of, settings):
     outcomes = {f"s{n}": Counter(success=1, collision=1) for n in range(settings)}
-    line = progress_line(progress(2 * settings, outcomes))
+    line = line_of(progress(2 * settings, outcomes))
     assert line.endswith(", 50.0 % success")
 
 
-def test_before_the_first_mission_is_over_there_is_no_rate():
-    assert progress_line(progress(0, {"golden": Counter()})) == "0/100 missions, 2 flying"
+def test_before_the_first_mission_is_over_there_is_no_rate(line_of):
+    assert line_of(progress(0, {"golden": Counter()})) == "0/100 missions, 2 flying"
 
 
 def test_plain_lines_come_every_ten_seconds_and_at_the_end(capsys):

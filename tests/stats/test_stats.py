@@ -50,7 +50,7 @@ def test_the_planned_number_of_a_known_case():
     assert enough.high - enough.low <= 2 * 0.05 < less.high - less.low
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.5, -1.0, math.nan])
+@pytest.mark.parametrize("margin", [0.0, 1e-200, 0.5, -1.0, math.nan])
 def test_an_impossible_margin_is_refused(margin):
     with pytest.raises(ConfigError, match="margin"):
         missions_for_margin(margin)
