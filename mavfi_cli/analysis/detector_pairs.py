@@ -50,7 +50,7 @@ class Harm(Enum):
     OTHERWISE = "otherwise"  # both failed, in different ways
 
 
-def harm_of(golden: Flight, flown: Flight) -> Harm:
+def _harm_of(golden: Flight, flown: Flight) -> Harm:
     """Effect of a treatment on a mission, compared with its golden flight.
 
     A mission that succeeds although its golden flight failed is not harmed.
@@ -95,22 +95,14 @@ def _first_alarm(flown: Flight, from_s: float | None) -> Mapping[str, Any] | Non
     return next((alarm for alarm in flown["alarms"] if alarm["stamp_s"] >= from_s - 1e-9), None)
 
 
-def error_free_pair(
-    world: str, seed: int, detector: str, golden: Flight, watched: Flight
-) -> dict[str, Any]:
-    """A golden flight and the same with a detector, as a row of SCHEMA."""
-    labels = {"world": world, "seed": seed, "detector": detector}
-    return {**labels, **_common(ERROR_FREE, golden, watched), "golden_path": golden["path"]}
-
-
-def fault_pair(
+def _fault_pair(
     labels: Mapping[str, Any],
     golden: Flight,
     faulty: Flight,
     watched: Flight,
     protected: Flight,
     *,
-    complete: bool = True,
+    complete: bool,
 ) -> dict[str, Any]:
     """A golden flight, the same with a fault, and with fault and detector, as a row of SCHEMA.
 
@@ -125,7 +117,7 @@ def fault_pair(
             harmful ones are.
     """
     active = faulty["injected"] in (Injected.ACTIVE.value, Injected.UNREAD.value)
-    harm, remaining = harm_of(golden, faulty), harm_of(golden, protected)
+    harm, remaining = _harm_of(golden, faulty), _harm_of(golden, protected)
     struck_s = protected["struck_s"]
     alarm = _first_alarm(protected, struck_s)
     return {
@@ -175,11 +167,13 @@ def pairs_of(
         if detector not in detectors or golden is None:
             continue
         if kind == ERROR_FREE:
-            free.append(error_free_pair(key[0], key[1], detector, golden, flight))
+            labels = {"world": key[0], "seed": key[1], "detector": detector}
+            told = _common(ERROR_FREE, golden, flight)
+            free.append({**labels, **told, "golden_path": golden["path"]})
         elif watched is not None and faulty is not None:
             labels = {**dict(zip(KEY, key, strict=True)), "detector": detector}
             whole = complete(key[1])
-            struck.append(fault_pair(labels, golden, faulty, watched, flight, complete=whole))
+            struck.append(_fault_pair(labels, golden, faulty, watched, flight, complete=whole))
     return pa.Table.from_pylist(free, SCHEMA), pa.Table.from_pylist(struck, SCHEMA)
 
 

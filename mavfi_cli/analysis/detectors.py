@@ -50,7 +50,7 @@ def found(
     """
     return {
         "error_free": [
-            {"by": by, "value": value, "detector": detector, **error_free_metrics(part)}
+            {"by": by, "value": value, "detector": detector, **_error_free_metrics(part)}
             for by, value, detector, part in _grouped(detectors, error_free, (ALL, "world"))
         ],
         "faults": [
@@ -58,7 +58,7 @@ def found(
                 "by": by,
                 "value": value,
                 "detector": detector,
-                **fault_metrics(_part(faults, by, value, NONE), part),
+                **_fault_metrics(_part(faults, by, value, NONE), part),
             }
             for by, value, detector, part in _grouped(detectors, faults, GROUPS)
         ],
@@ -85,7 +85,7 @@ def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[dict[str, A
     """Compare every two detectors on the same faults, with p-values corrected over all."""
     rows: list[dict[str, Any]] = []
     for first, second in itertools.combinations(detectors, 2):
-        tests = recoveries_compared(*(chosen(faults, detector=name) for name in (first, second)))
+        tests = _recoveries_compared(*(chosen(faults, detector=name) for name in (first, second)))
         row: dict[str, Any] = {"first": first, "second": second}
         for what, test in zip(("recovered", "undone"), tests, strict=True):
             row[what] = {**asdict(test), "difference": test.difference}
@@ -111,7 +111,7 @@ def _curves(scores: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
 # Without faults -------------------------------------------------------------------------------
 
 
-def error_free_metrics(pairs: pa.Table) -> dict[str, Any]:
+def _error_free_metrics(pairs: pa.Table) -> dict[str, Any]:
     """A detector on flights without faults, compared with the same flights without it.
 
     Returns:
@@ -154,7 +154,7 @@ def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
 # With faults ----------------------------------------------------------------------------------
 
 
-def fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
+def _fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
     """A detector on flights with faults.
 
     Args:
@@ -225,7 +225,7 @@ def fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
+def _recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
     """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
     there, here = paired(second, chosen(first, active=True), KEY)
     harm = here["harm"]

@@ -85,7 +85,7 @@ class _Match:
         return found
 
 
-def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+def _against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
     """Compare each setting with faults with the golden setting that shares most pairs.
 
     Returns:
@@ -104,11 +104,11 @@ def against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[di
     return _compared(found, confidence)
 
 
-def protection(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+def _protection(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
     """Compare each protected setting with the unprotected one that has the same faults.
 
     Returns:
-        As `against_golden`; the worst cases include what protection recovers.
+        As `_against_golden`; the worst cases include what protection recovers.
     """
     bare = {
         untreated(group.labels): group for group in groups if not (group.watched or group.golden)
@@ -170,8 +170,9 @@ def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) 
         by: labels by which settings are grouped; empty means all.
 
     Returns:
-        Plain values. `cells`: one row per setting. `faults`: as of `against_golden`. `protection`:
-        as of the function of that name.
+        Plain values. `cells`: one row per setting. `faults`: each setting with faults against the
+        golden one, as of `_against_golden`. `protection`: each protected setting against the
+        unprotected one, as of `_protection`.
 
     Raises:
         UnknownName: no setting has such a label.
@@ -184,8 +185,8 @@ def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) 
         "over": over,
         "confidence": confidence,
         "cells": [_cell(group, confidence) for group in found],
-        "faults": against_golden(found, confidence),
-        "protection": protection(found, confidence),
+        "faults": _against_golden(found, confidence),
+        "protection": _protection(found, confidence),
         "missing": missions - over,
     }
 
@@ -234,7 +235,7 @@ def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[st
         to the golden flights of the same missions, with its bootstrap interval; None of golden
         settings.
     """
-    beside = {each["name"]: each["differences"] for each in against_golden(groups, confidence)}
+    beside = {each["name"]: each["differences"] for each in _against_golden(groups, confidence)}
     rows = []
     for metric in METRICS:
         for group in groups:

@@ -30,16 +30,16 @@ _SAME_S = 1e-9
 
 def timelines(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     """Timelines of the platforms that answered, one row each, over the same time."""
-    alone = {name: timeline_of(run) for name, run in runs.items()}
+    alone = {name: _timeline_of(run) for name, run in runs.items()}
     longest_s = max((row["shown_s"][1] for row in alone.values() if row), default=LEAST_S)
     return [
         {"platform": name, **row}
         for name, run in runs.items()
-        if (row := timeline_of(run, longest_s)) is not None
+        if (row := _timeline_of(run, longest_s)) is not None
     ]
 
 
-def timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any] | None:
+def _timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any] | None:
     """The second of a flight after a typical depth frame; longer if the answer takes longer.
 
     If a verdict made the vehicle slow down or stop, the frame is one with such a verdict, and the

@@ -2,7 +2,7 @@
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.detector_pairs import SCHEMA, error_free_pair, fault_pair
+from mavfi_cli.analysis.detector_pairs import KEY, SCHEMA, pairs_of
 from mavfi_cli.campaigns.missions import Injected
 
 
@@ -33,21 +33,49 @@ def struck(outcome="success", time_s=100.0, *, at_s=20.0, injected=Injected.ACTI
     )  # fmt: skip
 
 
+def labelled(flight, **labels):
+    """A row of a ledger's table."""
+    return {f"label_{name}": labels.get(name) for name in ("kind", "detector", *KEY)} | flight
+
+
+def paired(rows, detector, complete=lambda seed: True):
+    """The pairs of flights: without faults, and with one."""
+    found = pairs_of([pa.Table.from_pylist(rows)], [detector], complete)
+    return [table.to_pylist() for table in found]
+
+
 def error_free(golden=None, watched=None, *, world="dense", seed=1, detector="gad"):
     golden = golden or flown()
-    return error_free_pair(world, seed, detector, golden, watched or golden)
+    mission = {"kind": "error-free", "world": world, "seed": seed}
+    rows = [labelled(golden, detector="none", **mission)]
+    if detector != "none":
+        rows.append(labelled(watched or golden, detector=detector, **mission))
+    (found,), _ = paired(rows, detector)
+    return found
 
 
-def pair(faulty, protected=None, *, golden=None, watched=None, seed=1, complete=True, **more):
+def pair(
+    faulty, protected=None, *, golden=None, watched=None, world="dense", seed=1, detector="gad",
+    complete=True,
+):  # fmt: skip
     """A fault pair; without a protected flight that of the detector `none`."""
-    labels = {
-        "world": "dense", "seed": seed, "level": "source", "stage": "control", "target": "control",
-        "field": "exponent", "detector": "none" if protected is None else "gad", **more,
-    }  # fmt: skip
     golden = golden or flown()
-    return fault_pair(
-        labels, golden, faulty, watched or golden, protected or faulty, complete=complete
-    )
+    mission = {"kind": "error-free", "world": world, "seed": seed}
+    fault = {
+        **mission, "kind": "fault", "level": "source", "stage": "control", "target": "control",
+        "field": "exponent",
+    }  # fmt: skip
+    rows = [
+        labelled(golden, detector="none", **mission),
+        labelled(faulty, detector="none", **fault),
+    ]
+    if protected is None:
+        detector = "none"
+    else:
+        rows.append(labelled(watched or golden, detector=detector, **mission))
+        rows.append(labelled(protected, detector=detector, **fault))
+    _, (found,) = paired(rows, detector, lambda _: complete)
+    return found
 
 
 def table(pairs):

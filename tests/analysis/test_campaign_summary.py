@@ -9,7 +9,7 @@ from plain_values import named
 
 from mavfi_cli.analysis.failures import failures
 from mavfi_cli.analysis.groups import METRICS, groups
-from mavfi_cli.analysis.summary import against_golden, protection, qualities, summarise
+from mavfi_cli.analysis.summary import qualities, summarise
 from mavfi_cli.campaigns.begin import stopped
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
@@ -67,7 +67,7 @@ def test_errors_are_counted_nowhere_else(book):
 
 def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
     fill(book)
-    faulty, saved = named(against_golden(groups(book.ledger)))
+    faulty, saved = named(summarise(book.ledger)).faults
     assert (faulty.first, faulty.second) == ({"setting": "golden"}, FI)
     assert (faulty.success.pairs, faulty.success.only_first) == (10, 3)
     assert faulty.success.difference == pytest.approx(-0.3)
@@ -83,7 +83,7 @@ def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
 
 def test_protection_is_held_against_the_same_faults_without_it(book):
     fill(book)
-    (saved,) = named(protection(groups(book.ledger)))
+    (saved,) = named(summarise(book.ledger)).protection
     assert (saved.first, saved.second) == (FI, SAVED)
     assert (saved.success.only_second, saved.success.neither) == (2, 1)
     assert saved.differences["flight_time_s"].value == pytest.approx(-8.0)
@@ -99,7 +99,7 @@ def test_the_worst_case_is_no_missions_own_length(book):
         book.add({"setting": "golden"}, seed, time_s, injected=GOLDEN)
         book.add(FI, seed, time_s)
     book.add({"setting": "golden"}, 2, 100.0, injected=GOLDEN)
-    (faulty,) = named(against_golden(groups(book.ledger)))
+    (faulty,) = named(summarise(book.ledger)).faults
     assert faulty.over_own.increase == 0.0
     assert faulty.over_mean.golden == 20.0
     told = campaign_lines(summarise(book.ledger))
@@ -119,7 +119,7 @@ def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
     book.add({"setting": "golden"}, 3, 20.0, injected=GOLDEN)
     book.add(FI, 3, 20.0, outcome="collision")  # a flight of its protection is still a pair
     book.add(SAVED, 3, 26.0)
-    (saved,) = named(protection(groups(book.ledger)))
+    (saved,) = named(summarise(book.ledger)).protection
     assert saved.over_own.increase == pytest.approx(1.0)
     assert saved.over_own.protected_worst == pytest.approx(1.3)
     assert saved.over_own.recovered_share == pytest.approx(0.7)
@@ -182,7 +182,7 @@ def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothi
             fate = Injected.NOT_INJECTED if idle else ACTIVE
             book.add({"setting": "FI", "stage": stage}, seed, time_s, injected=fate)
             book.add({"setting": "D&R", "stage": stage, "detector": "gad"}, seed, time_s)
-    (saved,) = named(protection(groups(book.ledger, ["setting"])))
+    (saved,) = named(summarise(book.ledger, ["setting"])).protection
     assert (saved.first, saved.second) == ({"setting": "FI"}, {"setting": "D&R"})
     assert saved.success.pairs == 9
     time = saved.differences["flight_time_s"]
@@ -194,7 +194,7 @@ def test_the_detector_none_watches_nothing(book):
     for seed in range(4):
         book.add({"kind": "golden", "detector": "none"}, seed, 20.0, injected=GOLDEN)
         book.add({"kind": "fault", "detector": "none"}, seed, 22.0)
-    (faulty,) = named(against_golden(groups(book.ledger)))
+    (faulty,) = named(summarise(book.ledger)).faults
     assert faulty.success.pairs == 4
 
 
@@ -215,7 +215,7 @@ def test_settings_are_gathered_by_labels(book):
 def test_a_faulty_mission_pairs_with_no_golden_flight_of_another_seed(book):
     book.add({"setting": "golden"}, 1, 20.0, injected=GOLDEN)
     book.add(FI, 2, 30.0)
-    assert against_golden(groups(book.ledger)) == []
+    assert summarise(book.ledger)["faults"] == []
 
 
 def test_the_text_tells_the_numbers_and_json_has_no_nan(book):

@@ -2,6 +2,7 @@
 
 import math
 
+import pyarrow as pa
 import pytest
 from evaluation_flights import error_free, flown, pair, struck, table
 from plain_values import named
@@ -9,17 +10,26 @@ from plain_values import named
 from mavfi_cli.analysis import detectors as question
 from mavfi_cli.campaigns.missions import Injected
 
+NO_SCORES = pa.table({"stage": [], "field": [], "score": []})
+
+
+def answers(error_free, faults, *detectors):
+    """What is found of pairs whose flights have no score."""
+    free, struck = table(error_free), table(faults)
+    return named(question.found(detectors, free, struck, lambda _: (NO_SCORES, [])))
+
+
+def row(rows):
+    (found,) = [row for row in rows if (row.by, row.detector) == ("all", "gad")]
+    return found
+
 
 def error_free_metrics(pairs):
-    return named(question.error_free_metrics(table(pairs)))
+    return row(answers(pairs, [], "gad").error_free)
 
 
 def fault_metrics(bare, pairs):
-    return named(question.fault_metrics(table(bare), table(pairs)))
-
-
-def recoveries_compared(first, second):
-    return question.recoveries_compared(table(first), table(second))
+    return row(answers([], [*bare, *pairs], "none", "gad").faults)
 
 
 def test_false_alarms_a_flight_hour():
@@ -132,8 +142,9 @@ def test_harmless_faults_of_incomplete_missions_count_by_their_number_only():
     assert found.success.pairs == 2  # of the complete missions
 
 
-def test_without_any_fault_nothing_is_known():
-    nothing = fault_metrics([], [])
+def test_without_an_active_fault_nothing_is_known():
+    nothing = fault_metrics([pair(ABSENT)], [pair(ABSENT, ABSENT)])
+    assert (nothing.planned, nothing.active) == (1, 0)
     assert math.isnan(nothing.harmful.share)
     assert math.isnan(nothing.latency_s.value)
     assert math.isnan(nothing.worst.recovered_share)
@@ -142,8 +153,10 @@ def test_without_any_fault_nothing_is_known():
 
 def test_two_detectors_on_the_same_faults():
     first = [pair(LOST, struck(), seed=seed) for seed in range(3)]
-    second = [pair(LOST, struck("collision"), seed=seed) for seed in (2, 1, 5)]
-    longer = [pair(LONGER, struck(time_s=150.0), seed=9)], [pair(LONGER, struck(), seed=9)]
-    recovered, undone = recoveries_compared([*first, *longer[0]], [*longer[1], *second])
-    assert (recovered.only_first, recovered.only_second, recovered.pairs) == (2, 0, 2)
-    assert (undone.only_first, undone.only_second, undone.pairs) == (2, 1, 3)
+    second = [pair(LOST, struck("collision"), seed=seed, detector="aad") for seed in (2, 1, 5)]
+    first.append(pair(LONGER, struck(time_s=150.0), seed=9))
+    second.append(pair(LONGER, struck(), seed=9, detector="aad"))
+    (compared,) = answers([], [*first, *second], "gad", "aad").comparisons
+    kinds = ("both", "only_first", "only_second", "neither")
+    assert [compared.recovered[kind] for kind in kinds] == [0, 2, 0, 0]
+    assert [compared.undone[kind] for kind in kinds] == [0, 2, 1, 0]

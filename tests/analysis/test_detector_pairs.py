@@ -1,10 +1,9 @@
 """What a fault did, and whether it was seen."""
 
-import pyarrow as pa
 import pytest
-from evaluation_flights import flown, pair, struck
+from evaluation_flights import flown, labelled, pair, paired, struck
 
-from mavfi_cli.analysis.detector_pairs import WANTED, Harm, harm_of, pairs_of
+from mavfi_cli.analysis.detector_pairs import WANTED, Harm
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.mission.record.measures import measures_of
 
@@ -18,18 +17,18 @@ FAULT = {
 @pytest.mark.parametrize(
     ("golden", "treated", "harm"),
     [
-        (flown(), flown(time_s=104.9), Harm.NONE),
-        (flown(), flown(time_s=105.1), Harm.LONGER),
-        (flown(), flown(time_s=90.0), Harm.NONE),
-        (flown(), flown("collision", 10.0), Harm.LOST),
-        (flown(), flown("crash", None), Harm.LOST),
-        (flown("collision"), flown("timeout", 300.0), Harm.OTHERWISE),
-        (flown("collision"), flown("collision", 300.0), Harm.NONE),
-        (flown("collision"), flown(), Harm.NONE),  # a fault that saved the mission
+        (flown(), struck(time_s=104.9), Harm.NONE),
+        (flown(), struck(time_s=105.1), Harm.LONGER),
+        (flown(), struck(time_s=90.0), Harm.NONE),
+        (flown(), struck("collision", 10.0), Harm.LOST),
+        (flown(), struck("crash", None), Harm.LOST),
+        (flown("collision"), struck("timeout", 300.0), Harm.OTHERWISE),
+        (flown("collision"), struck("collision", 300.0), Harm.NONE),
+        (flown("collision"), struck(), Harm.NONE),  # a fault that saved the mission
     ],
 )
 def test_harm_is_a_lost_mission_or_more_than_five_per_cent(golden, treated, harm):
-    assert harm_of(golden, treated) is harm
+    assert pair(treated, golden=golden)["harm"] == harm.value
 
 
 def test_an_alarm_before_the_strike_detects_nothing():
@@ -66,30 +65,21 @@ def test_activity_is_that_of_the_unprotected_flight(injected, active):
     assert pair(struck(injected=injected), withheld)["active"] is active
 
 
-def labelled(labels, flight):
-    """A row of a ledger's table."""
-    return {**{f"label_{name}": value for name, value in labels.items()}, **flight}
-
-
 def test_pairs_need_all_of_their_flights():
     rows = [
-        labelled({**FAULT, "detector": "gad"}, struck()),
-        labelled({**FAULT, "detector": "none"}, struck("collision")),
-        labelled({**GOLDEN, "detector": "none"}, flown()),
+        labelled(struck(), **FAULT, detector="gad"),
+        labelled(struck("collision"), **FAULT, detector="none"),
+        labelled(flown(), **GOLDEN, detector="none"),
     ]
-
-    def pairs(*detectors, complete=lambda _: True):
-        return [t.to_pylist() for t in pairs_of([pa.Table.from_pylist(rows)], detectors, complete)]
-
-    assert pairs("gad")[1] == []
-    rows.append(labelled({**GOLDEN, "detector": "gad"}, flown(alarms_s=(3.0,))))
-    (free,), (found,) = pairs("gad", complete=lambda seed: seed != 7)
+    assert paired(rows, "gad")[1] == []
+    rows.append(labelled(flown(alarms_s=(3.0,)), **GOLDEN, detector="gad"))
+    (free,), (found,) = paired(rows, "gad", complete=lambda seed: seed != 7)
     told = [found[name] for name in ("world", "seed", "stage", "field")]
     assert told == ["farm", 7, "planning", "sign"]
     assert (found["faulty_outcome"], found["outcome"]) == ("collision", "success")
     assert not found["complete"]
     assert free["alarms"] == 1
-    _, (bare,) = pairs("none")
+    _, (bare,) = paired(rows, "none")
     assert bare["outcome"] == bare["faulty_outcome"] == "collision"
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.analysis.timeline import chain_of, timeline_of, timelines, typical
+from mavfi_cli.analysis.timeline import chain_of, timelines, typical
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import Invocation, Reaction
 from mavfi_cli.mission.record.run_folder import load_run
@@ -61,7 +61,7 @@ def test_the_typical_reaction_is_near_the_median_and_one_that_did_something():
 
 def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_flight):
     run = load_run(troubled_flight.path)
-    told = timeline_of(run)
+    (told,) = timelines({"x86": run})
     stamp_s = told["frame_stamp_s"] + told["response_s"]
     acted = {round(e["stamp_s"], 6): e["text"] for e in run.result["events"]
              if e["kind"] in ("slow", "stop")}  # fmt: skip
