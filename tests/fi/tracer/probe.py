@@ -211,21 +211,19 @@ def random_state(probe, rng, instruction):
 
 
 def _aim(probe, rng, use, values):
-    from mavfi_cli.fi.tracer.arch.x86_64.operands import general_part
-
-    base = use.base and general_part(use.base)
-    index = use.index and general_part(use.index)
+    base = use.base if use.base in GENERAL else None
+    index = use.index if use.index in GENERAL else None
     goal = probe.target - use.displacement
-    if base and index and base[0] == index[0]:
-        values[base[0]] = goal // (1 + use.scale)
+    if base and index and base == index:
+        values[base] = goal // (1 + use.scale)
     elif base:
         offset = 0
         if index:
-            values[index[0]] = int(rng.integers(0, 32))
-            offset = values[index[0]] * use.scale
-        values[base[0]] = goal - offset
+            values[index] = int(rng.integers(0, 32))
+            offset = values[index] * use.scale
+        values[base] = goal - offset
     elif index:
-        values[index[0]] = goal // use.scale
+        values[index] = goal // use.scale
 
 
 def _disassembled(code, slot=0):

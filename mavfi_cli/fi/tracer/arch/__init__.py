@@ -27,14 +27,20 @@ from mavfi_cli.fi.tracer.arch.interface import (
 SUPPORTED = platform.system() == "Linux" and platform.machine() == "x86_64"
 
 if SUPPORTED or TYPE_CHECKING:
-    from mavfi_cli.fi.tracer.arch.x86_64.calls import asked, call_name, lacks_memory
+    from mavfi_cli.fi.tracer.arch.x86_64.calls import (
+        asked,
+        call_name,
+        lacks_memory,
+        prepare_system_call,
+    )
     from mavfi_cli.fi.tracer.arch.x86_64.decode import address_of, decode
-    from mavfi_cli.fi.tracer.arch.x86_64.detour import detour_code, flow, prepare_system_call
-    from mavfi_cli.fi.tracer.arch.x86_64.jumps import JUMP_FLAGS, inverting_bits
+    from mavfi_cli.fi.tracer.arch.x86_64.detour import detour_code, flow
     from mavfi_cli.fi.tracer.arch.x86_64.registers import (
+        JUMP_FLAGS,
         TRAITS,
         Registers,
         all_registers,
+        inverting_bits,
         register_kind,
         widest_vector,
         width_of,

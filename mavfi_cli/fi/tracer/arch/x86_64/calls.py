@@ -1,4 +1,4 @@
-"""What a system call of Linux on x86-64 asks for, as far as an attack cares."""
+"""System calls of Linux on x86-64: what one asks for, as far as an attack cares, and making one."""
 
 from __future__ import annotations
 
@@ -53,6 +53,12 @@ def lacks_memory(registers: Registers) -> bool:
 def call_name(registers: Registers) -> str:
     """Name of the system call in which the thread is stopped, where it starts something."""
     return _NAMES.get(registers.system_call or 0, "a system call")
+
+
+def prepare_system_call(registers: Registers, number: int, *arguments: int) -> None:
+    """Set the registers for a system call instruction at the instruction pointer."""
+    names = ("rax", *_ARGUMENTS[: len(arguments)])
+    registers.write_together(dict(zip(names, (number, *arguments), strict=True)))
 
 
 def _signed(value: int, bits: int) -> int:

@@ -1,26 +1,41 @@
 """Decoder of x86-64 instructions to the register bits and memory bytes that they read and write.
 
-Capstone decodes, `operands` says which bits count. This module adds the stack slots of push, pop,
-call and ret, and what the tracer has to know of an instruction to step over it.
+A bit is *read* if its value can change a result elsewhere: another bit of a register, memory, an
+address or the flow of control. It is *written* if it holds part of the result; a 32-bit write also
+clears the upper half, a VEX-encoded one the whole rest (Intel SDM volume 1, sections 3.4.1.1 and
+14.1.1). Those bits are replaced, but no part of the result.
+
+Capstone decodes. `vectors` knows which bits of vector instructions count; here is what the others
+have of their own, the stack slots of push, pop, call and ret, and what the tracer has to know of an
+instruction to step over it. tests/fi/tracer/test_operands.py executes them.
 """
 
 from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import capstone
 from capstone import x86
 
-from mavfi_cli.fi.tracer.arch.interface import Instruction, MemoryUse
-from mavfi_cli.fi.tracer.arch.x86_64.jumps import branches
-from mavfi_cli.fi.tracer.arch.x86_64.operands import Operands, general_part, operands_of
+from mavfi_cli.fi.tracer.arch.interface import Instruction, MemoryUse, RegisterUse
+from mavfi_cli.fi.tracer.arch.x86_64.registers import FLAG_BITS, GENERAL, widest_vector
+from mavfi_cli.fi.tracer.arch.x86_64.vectors import (
+    ALL,
+    VECTOR,
+    Touched,
+    is_vector,
+    low,
+    vector_bits,
+)
 
-_FULL = (1 << 64) - 1
-
-_engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
-_engine.detail = True
+engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
+engine.detail = True
+_BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
+_FULL = low(64)
 
 
 def decode(code: bytes, address: int) -> Instruction | None:
@@ -30,10 +45,10 @@ def decode(code: bytes, address: int) -> Instruction | None:
 
 @functools.lru_cache(maxsize=65536)
 def _decode(code: bytes, address: int) -> Instruction | None:
-    found = next(_engine.disasm(code, address, 1), None)
+    found = next(engine.disasm(code, address, 1), None)
     if found is None:
         return None
-    operands = operands_of(found)
+    operands = _operands_of(found)
     return Instruction(
         address=address,
         raw=code[: found.size],
@@ -47,6 +62,11 @@ def _decode(code: bytes, address: int) -> Instruction | None:
         branches=branches(found),
         run_over=_run_over(found),
     )
+
+
+def branches(found: Any) -> bool:
+    """True for a jump, a call or a return, as capstone decodes it."""
+    return bool(_BRANCHES.intersection(found.groups))
 
 
 def _run_over(found: Any) -> bool:
@@ -73,7 +93,7 @@ def _elements(mnemonic: str) -> tuple[str | None, str | None]:
     return element, element
 
 
-def _memory(found: Any, operands: Operands) -> list[MemoryUse]:
+def _memory(found: Any, operands: _Operands) -> list[MemoryUse]:
     if found.mnemonic == "lea":
         return []
 
@@ -138,8 +158,301 @@ def address_of(use: MemoryUse, instruction: Instruction, read: Any) -> int:
 
 
 def _part(name: str | None, read: Any) -> int:
-    part = general_part(name) if name else None
+    part = _general_part(name) if name else None
     if part is None:
         return 0
     full, mask = part
     return int(read(full)) & mask
+
+
+# -- registers by their names
+
+
+_X87 = re.compile(r"st\((\d)\)$")
+
+
+@dataclass(frozen=True, slots=True)
+class _Named:
+    """A register as an operand names it: bits `shift` to `shift` + `width` of the full one."""
+
+    full: str
+    shift: int
+    width: int
+
+
+def _general_names() -> dict[str, _Named]:
+    table = {name: _Named(name, 0, 64) for name in GENERAL}
+    for letter in "abcd":
+        full = f"r{letter}x"
+        table |= {f"e{letter}x": _Named(full, 0, 32), f"{letter}x": _Named(full, 0, 16)}
+        table |= {f"{letter}l": _Named(full, 0, 8), f"{letter}h": _Named(full, 8, 8)}
+    for pair in ("si", "di", "bp", "sp"):
+        full = f"r{pair}"
+        table |= {f"e{pair}": _Named(full, 0, 32), pair: _Named(full, 0, 16)}
+        table |= {f"{pair}l": _Named(full, 0, 8)}
+    for full in GENERAL[8:]:
+        table |= {
+            f"{full}{end}": _Named(full, 0, 8 * n) for end, n in (("d", 4), ("w", 2), ("b", 1))
+        }
+    return table
+
+
+_GENERAL = _general_names()
+
+
+def _general_part(name: str) -> tuple[str, int] | None:
+    """Full register and mask of a general register's name; None for another name."""
+    if (named := _GENERAL.get(name)) is None:
+        return None
+    return named.full, low(named.width) << named.shift
+
+
+@functools.cache
+def _named(name: str) -> _Named | None:
+    """None for flags, which are named bit by bit, and for segments and control words."""
+    if name in _GENERAL:
+        return _GENERAL[name]
+    if match := VECTOR.match(name):
+        return _Named(f"{widest_vector()}{match[2]}", 0, {"x": 128, "y": 256, "z": 512}[match[1]])
+    if match := _X87.match(name):
+        return _Named(f"st{match[1]}", 0, 80)
+    return _Named(name, 0, 64) if re.match(r"(k|mm)\d$", name) else None
+
+
+@dataclass(slots=True)
+class _Operands:
+    """All operands of one instruction."""
+
+    reads: dict[str, RegisterUse] = field(default_factory=dict)
+    writes: dict[str, RegisterUse] = field(default_factory=dict)
+    explicit: tuple[Touched, ...] = ()  # of each operand that the assembler names
+
+    def touch(self, name: str, bits: Touched, *, explicit: bool = False) -> None:
+        """Note bits of a register, counted from the lowest that the name covers."""
+        named = _named(name)
+        if named is None:
+            return
+        shift = named.shift
+        if bits.reads:
+            self._add(self.reads, name, named.full, bits.reads << shift, 0, explicit)
+        if bits.writes or bits.clears:
+            written, cleared = bits.writes << shift, bits.clears << shift
+            self._add(self.writes, name, named.full, written, cleared, explicit)
+
+    def flag(self, name: str, *, reads: bool, defined: bool, clears: bool) -> None:
+        """Note a flag; one that the manual leaves undefined has no mask."""
+        bit = 1 << FLAG_BITS[name]
+        (self.reads if reads else self.writes)[name] = RegisterUse(
+            register="rflags", mask=bit * defined, clears=bit * clears, explicit=False, operand=name
+        )
+
+    @staticmethod
+    def _add(
+        uses: dict[str, RegisterUse], name: str, full: str, mask: int, clears: int, explicit: bool
+    ) -> None:
+        if before := uses.get(full):
+            mask, clears = mask | before.mask, clears | before.clears
+            name = name if name == before.operand else full
+            explicit = explicit or before.explicit
+        uses[full] = RegisterUse(
+            register=full, mask=mask, clears=clears, explicit=explicit, operand=name
+        )
+
+
+def _operands_of(found: Any) -> _Operands:
+    """What an instruction, as capstone decodes it, reads and writes."""
+    all_of = _Operands(explicit=vector_bits(found) if is_vector(found) else _bits(found))
+    for op, bits in zip(found.operands, all_of.explicit, strict=True):
+        if op.type == x86.X86_OP_REG:
+            all_of.touch(found.reg_name(op.reg), bits, explicit=True)
+        elif op.type == x86.X86_OP_MEM and not found.mnemonic.startswith(_NO_ADDRESS):
+            _address(found, op, all_of)
+    for name, bits in _implicit(found):
+        all_of.touch(name, bits)
+    if x86.X86_GRP_FPU not in found.groups:
+        _flags(found, all_of)
+    return all_of
+
+
+_NO_ADDRESS = ("nop", "prefetch")
+
+
+def _address(found: Any, op: Any, all_of: _Operands) -> None:
+    """Base and index; what the scale or a short result cuts off of them is not read."""
+    width = 8 * found.operands[0].size if found.mnemonic == "lea" else 64
+    if op.mem.base and not (op.mem.index == op.mem.base and op.mem.scale == 1):
+        all_of.touch(found.reg_name(op.mem.base), Touched(reads=_kept(found, op.mem.base, width)))
+    if op.mem.index:
+        twice = op.mem.index == op.mem.base and op.mem.scale == 1
+        shift = op.mem.scale.bit_length() - 1 + twice
+        mask = _kept(found, op.mem.index, width, shift)
+        all_of.touch(found.reg_name(op.mem.index), Touched(reads=mask))
+
+
+def _kept(found: Any, register: int, width: int, shift: int = 0) -> int:
+    named = _named(found.reg_name(register))
+    if named is None or VECTOR.match(found.reg_name(register)):
+        return ALL if named is None else low(named.width)
+    return low(min(width, named.width) - shift)
+
+
+# -- operands that the assembler names
+
+
+_ZEROING = ("xor", "sub", "sbb")
+_SHIFTS = ("shl", "sal", "shr", "sar", "rol", "ror", "rcl", "rcr", "shld", "shrd")
+_MASK_OPERATION = re.compile(
+    r"k(add|andn?|mov|not|x?n?or|ortest|shift[lr]|test|unpck[bwd])([bwdq])$"
+)
+_COUNTED = {"shlx": 0, "shrx": 0, "sarx": 0, "bextr": 16, "bzhi": 8}  # bits of the last operand
+_BIT_TESTS = ("bt", "bts", "btr", "btc")
+
+
+def _bits(found: Any) -> tuple[Touched, ...]:
+    if found.mnemonic.startswith(_NO_ADDRESS):
+        return tuple(Touched() for _ in found.operands)
+    touched = tuple(_default(op, 8 * op.size) for op in found.operands)
+    _except(found, touched)
+    return touched
+
+
+def _default(op: Any, width: int) -> Touched:
+    """Capstone's access; an operand is as wide as it is named."""
+    mask = low(width)
+    reads, writes = bool(op.access & capstone.CS_AC_READ), bool(op.access & capstone.CS_AC_WRITE)
+    whole = mask if width < 32 else low(max(64, width))
+    return Touched(reads=mask * reads, writes=mask * writes, clears=whole * writes)
+
+
+def _except(found: Any, touched: tuple[Touched, ...]) -> None:
+    """Change what capstone's access flags do not say."""
+    name = found.mnemonic.split()[-1]  # without lock or rep
+    names = [found.reg_name(op.reg) for op in found.operands if op.type == x86.X86_OP_REG]
+    width = 8 * found.operands[0].size if found.operands else 0
+    if name in _ZEROING and len(names) == 2 and names[0] == names[1]:
+        touched[0].reads = touched[1].reads = 0
+    elif name.startswith("cmov"):  # it may not write, but clears the upper half anyway
+        touched[0].reads, touched[0].clears = 0, _FULL & ~low(32) if width == 32 else 0
+    elif name.startswith("set"):  # capstone has it read its memory
+        touched[0].reads, touched[0].writes, touched[0].clears = 0, low(8), low(8)
+    elif name in ("bsf", "bsr"):  # it does not write if the source is zero
+        touched[0].clears = 0
+    elif name in _SHIFTS and names[-1:] == ["cl"]:
+        touched[-1].reads = low(6 if width == 64 else 5)
+    elif name in _COUNTED:
+        touched[-1].reads = low(_COUNTED[name] or (6 if width == 64 else 5))
+    elif name in _BIT_TESTS and len(names) == 2:
+        touched[1].reads = low(width.bit_length() - 1)
+    elif name == "cmpxchg":
+        touched[0].reads = touched[0].writes = low(width)
+        touched[0].clears = 0
+    elif name.startswith(("cmps", "scas")):  # capstone has them read nothing
+        for each in touched:
+            each.reads |= low(width)
+    elif match := _MASK_OPERATION.match(name):
+        _opmask(found, touched, match[1], {"b": 8, "w": 16, "d": 32, "q": 64}[match[2]])
+
+
+def _opmask(found: Any, touched: tuple[Touched, ...], name: str, width: int) -> None:
+    """Capstone gives all masks 16 bits; the suffix says how many count."""
+    for op, bits in zip(found.operands, touched, strict=True):
+        if op.type == x86.X86_OP_REG:
+            read = width // 2 if name.startswith("unpck") else width
+            bits.reads = bits.reads and low(read)
+            bits.writes, bits.clears = bits.writes and low(width), bits.writes and _FULL
+
+
+# -- operands that it does not name
+
+
+_SIGN_COPIES = {"cwd": ("ax", "dx"), "cdq": ("eax", "edx"), "cqo": ("rax", "rdx")}
+_CALL_READS = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9")
+
+
+def _implicit(found: Any) -> Iterator[tuple[str, Touched]]:
+    name = found.mnemonic
+    if pair := _SIGN_COPIES.get(name):
+        width = _GENERAL[pair[0]].width
+        yield pair[0], Touched(reads=1 << width - 1)
+        yield pair[1], _whole(pair[1])
+        return
+    named = {op.reg for op in found.operands if op.type == x86.X86_OP_REG}
+    for register in [each for each in found.regs_read if each not in named]:
+        if not (name == "leave" and found.reg_name(register) == "rsp"):
+            yield found.reg_name(register), Touched(reads=_whole(found.reg_name(register)).writes)
+    for register in found.regs_write:
+        yield found.reg_name(register), _written(name, found.reg_name(register))
+    yield from _hidden(found)
+
+
+def _whole(name: str) -> Touched:
+    named = _named(name)
+    if named is None:
+        return Touched()
+    mask = low(named.width)
+    return Touched(writes=mask, clears=_FULL if named.width == 32 else mask)
+
+
+def _written(mnemonic: str, name: str) -> Touched:
+    if mnemonic in ("vzeroupper", "vzeroall"):
+        return Touched(clears=ALL & ~low(128) if mnemonic == "vzeroupper" else ALL)
+    return _whole(name)
+
+
+def _hidden(found: Any) -> Iterator[tuple[str, Touched]]:
+    """Registers that capstone does not name: of a system call, the x87 stack top, cmpxchg."""
+    name = found.mnemonic.split()[-1]
+    if name == "syscall":
+        for register in _CALL_READS:
+            yield register, Touched(reads=_FULL)
+        for register in ("rax", "rcx", "r11"):
+            yield register, _whole(register)
+    elif name == "cmpxchg":
+        accumulator = {1: "al", 2: "ax", 4: "eax", 8: "rax"}[found.operands[0].size]
+        yield accumulator, Touched(writes=_whole(accumulator).writes)
+    elif x86.X86_GRP_FPU in found.groups:
+        if not name.startswith(("fld", "fild", "fbld")):
+            yield "st(0)", Touched(reads=low(80))
+        if not name.startswith(("fst", "fist", "fcom", "fucom", "ftst", "fxam")):
+            yield "st(0)", _whole("st(0)")
+
+
+# -- flags
+
+
+_VECTOR_TESTS = re.compile(r"v?u?comis|v?p?test(p[sd])?$|v?pcmp[ei]str|kortest|ktest")
+_ARITHMETIC_FLAGS = tuple(name for name in FLAG_BITS if name != "df")
+_STRINGS = re.compile(r"(movs|stos|lods|scas|cmps|ins|outs)[bwdq]$|pushf")
+_DIRECTIONS = ("cld", "std", "popf")
+# What capstone's tables lack: flags that are read, and written.
+_LACKING_READS = {
+    **dict.fromkeys(("rcl", "rcr", "cmc"), ("cf",)), "lahf": ("cf", "pf", "af", "zf", "sf"),
+}  # fmt: skip
+_LACKING_WRITES = {**dict.fromkeys(("lzcnt", "tzcnt", "cmc"), ("cf",))}
+_HOW = ("TEST", "MODIFY", "RESET", "SET", "UNDEFINED")
+_FLAGS = {
+    (name, how): getattr(x86, f"X86_EFLAGS_{how}_{name.upper()}", 0)
+    for name in FLAG_BITS
+    for how in _HOW
+}
+_FLAGS["of", "RESET"] |= x86.X86_EFLAGS_RESET_0F  # capstone spells it with a zero
+
+
+def _flags(found: Any, all_of: _Operands) -> None:
+    mnemonic = found.mnemonic.split()[-1]
+    if is_vector(found) or mnemonic.startswith("k"):  # capstone has the flags of a namesake
+        for name in _ARITHMETIC_FLAGS if _VECTOR_TESTS.match(mnemonic) else ():
+            all_of.flag(name, reads=False, defined=True, clears=True)
+        return
+    by_count = mnemonic in _SHIFTS and found.op_str.endswith("cl")  # zero changes no flag
+    if _STRINGS.match(mnemonic):
+        all_of.flag("df", reads=True, defined=True, clears=False)
+    elif mnemonic.startswith(_DIRECTIONS):
+        all_of.flag("df", reads=False, defined=True, clears=True)
+    for name in _ARITHMETIC_FLAGS:
+        how = {each for each in _HOW if found.eflags & _FLAGS[name, each]}
+        if "TEST" in how or name in _LACKING_READS.get(mnemonic, ()):
+            all_of.flag(name, reads=True, defined=True, clears=False)
+        if how - {"TEST"} or name in _LACKING_WRITES.get(mnemonic, ()):
+            defined = "UNDEFINED" not in how or name in _LACKING_WRITES.get(mnemonic, ())
+            all_of.flag(name, reads=False, defined=defined, clears=not by_count)

@@ -13,20 +13,15 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
-import capstone
 from capstone import x86
 
 from mavfi_cli.fi.tracer.arch.interface import Flow
-from mavfi_cli.fi.tracer.arch.x86_64.jumps import branches
-from mavfi_cli.fi.tracer.arch.x86_64.registers import TRAITS, Registers
+from mavfi_cli.fi.tracer.arch.x86_64.decode import branches, engine
+from mavfi_cli.fi.tracer.arch.x86_64.registers import TRAITS
 
 _PAGE = 4096
 _SAVED, _COUNTER, _RETURN = 0, 8, 16  # offsets of the data
-_SYSTEM_CALL_ARGUMENTS = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
 _FIXED = frozenset(("syscall", "sysenter", "int", "int3", "hlt", "ud2", "xbegin", "xabort", "xend"))
-
-_engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
-_engine.detail = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +36,7 @@ class _DetourCode:
 @functools.lru_cache(maxsize=65536)
 def flow(code: bytes, address: int) -> Flow | None:
     """How control flows through one instruction; None if the bytes are not an instruction."""
-    found = next(_engine.disasm(code[:16], address, 1), None)
+    found = next(engine.disasm(code[:16], address, 1), None)
     if found is None:
         return None
     leaves = branches(found)
@@ -74,7 +69,7 @@ def detour_code(code: bytes, address: int, pages: int, count: int, via: int) -> 
     moved = _rcx(b"\x8b", pages + _SAVED, start + 27)
     at = address
     returns_to = address + len(code)
-    for found in _engine.disasm(code, address):
+    for found in engine.disasm(code, address):
         piece = _moved(found, start + 27 + len(moved), pages + _RETURN)
         if piece is None:
             return None
@@ -134,9 +129,3 @@ def _moved(found: Any, at: int, return_slot: int) -> bytes | None:
             return None
         return raw[:place] + struct.pack("<i", there) + raw[place + 4 :]
     return raw
-
-
-def prepare_system_call(registers: Registers, number: int, *arguments: int) -> None:
-    """Set the registers for a system call instruction at the instruction pointer."""
-    names = ("rax", *_SYSTEM_CALL_ARGUMENTS[: len(arguments)])
-    registers.write_together(dict(zip(names, (number, *arguments), strict=True)))

@@ -292,3 +292,34 @@ def all_registers() -> tuple[str, ...]:
     if OPMASK in components:
         names += [f"k{i}" for i in range(8)]
     return tuple(names)
+
+
+# -- conditional jumps
+
+
+# The flags whose flip inverts a jump (Intel SDM volume 2, Jcc).
+JUMP_FLAGS = {
+    jump: tuple(FLAG_BITS[flag] for flag in flags.split())
+    for jumps, flags in (
+        ("jo jno", "of"), ("js jns", "sf"), ("jp jnp", "pf"), ("je jne", "zf"), ("jb jae", "cf"),
+        ("jl jge", "sf"), ("jbe ja", "cf zf"), ("jle jg", "zf sf"),
+    )
+    for jump in jumps.split()
+}  # fmt: skip
+
+
+def inverting_bits(jump: str, flags: int) -> tuple[int, ...]:
+    """The flags to flip so that a conditional jump goes the other way, given all flags.
+
+    Where it tests two conditions ("below" or "equal"), each that holds is undone; if none does,
+    "equal" is made to hold.
+    """
+    if len(JUMP_FLAGS[jump]) == 1:
+        return JUMP_FLAGS[jump]
+    carry, zero, sign, overflow = (FLAG_BITS[flag] for flag in ("cf", "zf", "sf", "of"))
+    less = carry if carry in JUMP_FLAGS[jump] else sign
+    below = flags >> less & 1 if less == carry else (flags >> sign ^ flags >> overflow) & 1
+    equal = flags >> zero & 1
+    if not (below or equal):
+        return (zero,)
+    return tuple(sorted([less] * below + [zero] * equal))
